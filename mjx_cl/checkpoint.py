@@ -1,0 +1,65 @@
+"""Checkpoints by orbax: written to a temporary name and renamed, two kept, never unpickled."""
+from __future__ import annotations
+
+import logging
+import pathlib
+
+import jax
+import orbax.checkpoint as ocp
+
+from mjx_cl.errors import FileError
+
+logging.getLogger("absl").setLevel(logging.ERROR)
+
+
+def _is_key(x) -> bool:
+  return isinstance(x, jax.Array) and jax.numpy.issubdtype(x.dtype, jax.dtypes.prng_key)
+
+
+def pack(tree):
+  """Typed random keys -> their uint32 data, everything else unchanged."""
+  return jax.tree.map(lambda x: jax.random.key_data(x) if _is_key(x) else x, tree)
+
+
+def unpack(tree, like):
+  """Inverse of `pack`, for a tree of the same structure as `like`."""
+  return jax.tree.map(lambda x, l: jax.random.wrap_key_data(x) if _is_key(l) else x, tree, like)
+
+
+class Checkpoints:
+  """Numbered checkpoints of one run in FOLDER, each an array tree and a JSON dict."""
+
+  def __init__(self, folder):
+    self.folder = pathlib.Path(folder).absolute()
+    options = ocp.CheckpointManagerOptions(max_to_keep=2, enable_async_checkpointing=False, create=True)
+    self._manager = ocp.CheckpointManager(self.folder, options=options)
+
+  def latest(self) -> int | None:
+    """Number of the newest complete checkpoint."""
+    return self._manager.latest_step()
+
+  def save(self, number: int, tree, meta: dict) -> None:
+    """Writes one; a kill at any moment leaves the earlier ones whole."""
+    try:
+      self._manager.save(number, args=ocp.args.Composite(tree=ocp.args.StandardSave(pack(tree)), meta=ocp.args.JsonSave(meta)), force=True)
+      self._manager.wait_until_finished()
+    except (OSError, ValueError) as e:
+      raise FileError(f"cannot write checkpoint {number} in {self.folder}: {e}; the earlier ones are intact") from e
+
+  def load(self, like):
+    """Newest checkpoint that fits `like`: (tree, meta)."""
+    number = self.latest()
+    if number is None:
+      raise FileError(f"no checkpoint in {self.folder}")
+    packed = pack(like)
+    try:
+      out = self._manager.restore(number, args=ocp.args.Composite(tree=ocp.args.StandardRestore(packed), meta=ocp.args.JsonRestore()))
+    except Exception as e:  # orbax raises many kinds for a broken or foreign folder
+      raise FileError(f"cannot read checkpoint {number} in {self.folder}: {str(e).splitlines()[0]}") from None
+    same = jax.tree.map(lambda a, b: a.shape == b.shape, out["tree"], packed)
+    if not all(jax.tree.leaves(same)):
+      raise FileError(f"checkpoint {number} in {self.folder} belongs to another size or robot")
+    return unpack(out["tree"], like), out["meta"]
+
+  def close(self) -> None:
+    self._manager.close()

@@ -1,0 +1,148 @@
+"""What can be chosen: frozen dataclasses, presets, and all validation. Free of JAX, so that `--help` is quick."""
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass, field
+
+from mjx_cl.dreamer.sizes import SIZES
+from mjx_cl.errors import UserError, choose
+
+
+@dataclass(frozen=True)
+class DreamerConfig:
+  """The learner. Defaults are the authors' (facts of danijar/dreamerv3 at e3f0224) except `size`.
+
+  Attributes:
+    size: row of the size table.
+    batch, length: sequences and trained steps of one update.
+    context: leading records of a window that only give the initial state; 1, as the authors'.
+    imagine: imagined steps from each start.
+    last_starts: imagination starts are the last k states of each sequence; 0 means all.
+    horizon: the discount is 1 - 1 / horizon.
+    lr, warmup: learning rate and updates of its linear warm-up.
+    bins: classes of the two-hot heads.
+    entropy: weight of the policy's entropy.
+  """
+  size: str = "size12m"
+  batch: int = 16
+  length: int = 64
+  context: int = 1
+  imagine: int = 15
+  last_starts: int = 0
+  horizon: int = 333
+  lam: float = 0.95
+  lr: float = 4e-5
+  warmup: int = 1000
+  agc: float = 0.3
+  bins: int = 255
+  entropy: float = 3e-4
+  free_nats: float = 1.0
+  rep_scale: float = 0.1
+  repval_scale: float = 0.3
+  range_rate: float = 0.01
+  slow_rate: float = 0.02
+
+  def __post_init__(self):
+    choose("size", self.size, SIZES)
+    positive(self, "batch", "length", "imagine", "horizon", "lr", "bins")
+    if self.context != 1:
+      raise UserError(f"context must be 1, as in the authors' code; got {self.context}")
+    if not 0 <= self.last_starts <= self.length:
+      raise UserError(f"last_starts must lie in 0..length={self.length}; got {self.last_starts}")
+    if self.bins % 2 == 0:
+      raise UserError(f"bins must be odd; got {self.bins}")
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+  """Pretraining.
+
+  Attributes:
+    envs: robots that act side by side.
+    updates: gradient steps in all.
+    ratio: replayed steps per collected record (1,024 = one update per record at batch 16 x 64).
+    capacity: records kept per robot.
+    repeat: control steps for which an action is held.
+    lr_end: learning rate at the last update, reached linearly over the last `pure` updates (None: constant).
+    demonstrator: path of a demonstrator policy, or None.
+    demo_share: share of the robots that the demonstrator drives until the pure phase.
+    demo_noise: deviation of the noise on the demonstrator's actions.
+    clone: at most so many updates with cloning alone (the policy's own gradient off).
+    clone_until: cloning alone ends when the agent's own return reaches this share of the demonstrator's.
+    clone_weight, clone_std: weight of KL(N(demonstrator's action, clone_std^2) || policy), and that deviation.
+    fade: updates over which the weight falls to 0 after that.
+    pure: least number of last updates with neither the demonstrator's data nor its term.
+  """
+  envs: int = 16
+  updates: int = 500_000
+  ratio: float = 1024.0
+  capacity: int = 62_500
+  repeat: int = 1
+  lr_end: float | None = None
+  demonstrator: str | None = None
+  demo_share: float = 0.5
+  demo_noise: float = 0.2
+  clone: int = 4000
+  clone_until: float = 0.85
+  clone_weight: float = 0.3
+  clone_std: float = 0.2
+  fade: int = 2000
+  pure: int = 6000
+
+  def __post_init__(self):
+    positive(self, "envs", "updates", "ratio", "capacity", "repeat")
+    fraction(self, "demo_share", "clone_until")
+    if self.demonstrator and self.clone + self.fade + self.pure > self.updates:
+      raise UserError(f"clone + fade + pure = {self.clone + self.fade + self.pure} exceeds updates = {self.updates}")
+
+
+def positive(config, *names: str) -> None:
+  """Raises unless every named field is a finite number above 0."""
+  for name in names:
+    value = getattr(config, name)
+    if not (math.isfinite(value) and value > 0):
+      raise UserError(f"{name} must be above 0; got {value}")
+
+
+def fraction(config, *names: str) -> None:
+  """Raises unless every named field lies in [0, 1]."""
+  for name in names:
+    value = getattr(config, name)
+    if not 0.0 <= value <= 1.0:  # also false for nan
+      raise UserError(f"{name} must lie in [0, 1]; got {value}")
+
+
+@dataclass(frozen=True)
+class Preset:
+  """A learner with the way it is pretrained."""
+  dreamer: DreamerConfig
+  train: TrainConfig
+  about: str = field(default="")
+
+
+PRESETS = {
+    "paper": Preset(
+        DreamerConfig(size="size12m"), TrainConfig(envs=16, updates=250_000, ratio=512.0, repeat=2),
+        "size12m, published protocol: action repeat 2, train ratio 512, 16 environments, all 1,024 imagination starts"),
+    "cpu": Preset(
+        DreamerConfig(size="size1m", last_starts=16, lr=3e-4, warmup=200),
+        TrainConfig(envs=32, updates=16_000, ratio=4.0, capacity=4096, lr_end=1e-4),
+        "what 2 cores train in a few hours. Departures from the paper: size1m instead of size12m; imagination from the last 16 states of each "
+        "sequence (256 starts instead of 1,024); learning rate 3e-4 falling to 1e-4, warm-up 200, instead of 4e-5 and 1,000; 32 environments at "
+        "train ratio 4 (fresh data is cheap, updates are not) instead of 16 at 512; replay of 131,072 records; action repeat 1; optionally a "
+        "demonstrator, which the agent's card then names"),
+    "tiny": Preset(
+        DreamerConfig(size="tiny", batch=8, length=16, imagine=8, lr=1e-3, warmup=20, bins=63),
+        TrainConfig(envs=8, updates=200, ratio=16.0, capacity=512),
+        "for tests: a few thousand parameters, seconds per run"),
+}
+
+
+def replace(config, **changes):
+  """dataclasses.replace that names the valid fields when it is given an unknown one."""
+  known = {f.name for f in dataclasses.fields(config)}
+  for name in changes:
+    if name not in known:
+      raise UserError(f"unknown setting {name!r}; choose from: {', '.join(sorted(known))}")
+  return dataclasses.replace(config, **changes)

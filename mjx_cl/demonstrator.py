@@ -1,0 +1,154 @@
+"""A model-free policy that shows the way: brax PPO on this package's environments.
+
+Used by the `cpu` preset alone (the agent's card names it); `paper` does without. `BraxEnv` adapts one of our environments to
+`brax.envs.Env`. The trained policy is kept as a plain .npz of its layers, so that using one needs no brax.
+"""
+from __future__ import annotations
+
+import argparse
+import functools
+import json
+import os
+import pathlib
+import sys
+import time
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_cl.errors import FileError, UserError
+
+
+class Policy(NamedTuple):
+  """Deterministic tanh policy: observation normaliser and dense layers.
+
+  Attributes:
+    mean, std: float32 (obs,), running statistics of the observation.
+    layers: ((kernel (in, out), bias (out,)), ...); the last layer gives means and raw deviations, (2 * act,).
+  """
+  mean: jax.Array
+  std: jax.Array
+  layers: tuple[tuple[jax.Array, jax.Array], ...]
+
+  def __call__(self, obs: jax.Array) -> jax.Array:
+    """Action in [-1, 1], float32 (..., act), for obs (..., obs): the mode of the squashed normal."""
+    x = (obs - self.mean) / self.std
+    for kernel, bias in self.layers[:-1]:
+      x = jax.nn.swish(x @ kernel + bias)
+    kernel, bias = self.layers[-1]
+    return jnp.tanh((x @ kernel + bias)[..., :kernel.shape[1] // 2])
+
+
+def save(path: str | os.PathLike, policy: Policy) -> None:
+  """Writes an .npz, to a temporary name first."""
+  path = pathlib.Path(path)
+  arrays = {"mean": policy.mean, "std": policy.std}
+  for i, (kernel, bias) in enumerate(policy.layers):
+    arrays |= {f"kernel{i}": kernel, f"bias{i}": bias}
+  tmp = path.with_suffix(".tmp.npz")
+  np.savez(tmp, **{k: np.asarray(v, np.float32) for k, v in arrays.items()})
+  os.replace(tmp, path)
+
+
+def load(path: str | os.PathLike) -> Policy:
+  """Reads what `save` wrote."""
+  try:
+    with np.load(path, allow_pickle=False) as z:
+      layers = tuple((jnp.asarray(z[f"kernel{i}"]), jnp.asarray(z[f"bias{i}"])) for i in range(sum(k.startswith("kernel") for k in z)))
+      return Policy(jnp.asarray(z["mean"]), jnp.asarray(z["std"]), layers)
+  except (OSError, KeyError, ValueError) as e:
+    raise FileError(f"cannot read demonstrator {path}: {e}") from None
+
+
+def brax_env(env):
+  """Our environment as a `brax.envs.Env` on the nominal model.
+
+  brax's own wrappers do the vmap, the time limit and the autoreset; its autoreset restarts every robot from its own first state.
+  """
+  try:
+    from brax.envs import base
+  except ImportError:
+    raise UserError("the demonstrator needs brax: pip install 'mjx-cl[brax]'") from None
+
+  class BraxEnv(base.Env):
+    def reset(self, rng):
+      state, obs = env.init(env.model, rng)
+      zero = jnp.float32(0)
+      return base.State(state, obs, zero, zero, {})
+
+    def step(self, state, action):
+      inner, out = env.step(env.model, state.pipeline_state, action)
+      return state.replace(pipeline_state=inner, obs=out.final_obs, reward=out.reward, done=out.terminated.astype(jnp.float32))
+
+    @property
+    def observation_size(self):
+      return len(env.spec.obs)
+
+    @property
+    def action_size(self):
+      return len(env.spec.act)
+
+    @property
+    def backend(self):
+      return "mjx_cl"
+  return BraxEnv()
+
+
+def _to_policy(params) -> Policy:
+  normalizer, network = params[0], params[1]
+  layers = network["params"]
+  names = sorted(layers, key=lambda n: int(n.rsplit("_", 1)[1]))
+  return Policy(normalizer.mean, normalizer.std, tuple((layers[n]["kernel"], layers[n]["bias"]) for n in names))
+
+
+def train(env, out: str | os.PathLike, steps: int, seed: int = 0, evals: int = 12, progress=lambda row: None) -> list[dict]:
+  """Trains PPO and keeps one policy per evaluation as OUT/policy_NN.npz, with OUT/curve.json.
+
+  Settings: 256 environments, unroll 30, 16 minibatches of 256 x 30, 6 epochs, lr 1e-3, entropy 1e-2, discount 0.995, reward x 10,
+  observations normalised, policy and value 3 x 128.
+
+  Returns:
+    Rows {step, return, seconds}, return = mean over 128 episodes of the stochastic policy.
+  """
+  adapter = brax_env(env)
+  from brax.training.agents.ppo import networks, train as ppo
+  out = pathlib.Path(out)
+  out.mkdir(parents=True, exist_ok=True)
+  rows: list[dict] = []
+  start = time.monotonic()
+
+  def on_progress(step, metrics):
+    rows.append({"step": int(step), "return": float(metrics["eval/episode_reward"]), "seconds": round(time.monotonic() - start, 1)})
+    tmp = out / "curve.json.tmp"
+    tmp.write_text(json.dumps(rows, indent=1))
+    os.replace(tmp, out / "curve.json")
+    progress(rows[-1])
+
+  def on_params(step, _, params):
+    save(out / f"policy_{step:09d}.npz", _to_policy(params))
+
+  ppo.train(
+      environment=adapter, num_timesteps=steps, episode_length=env.spec.episode_steps, num_envs=256, unroll_length=30, num_minibatches=16,
+      batch_size=256, num_updates_per_batch=6, learning_rate=1e-3, entropy_cost=1e-2, discounting=0.995, reward_scaling=10.0,
+      normalize_observations=True, seed=seed, num_evals=evals, progress_fn=on_progress, policy_params_fn=on_params,
+      network_factory=functools.partial(networks.make_ppo_networks, policy_hidden_layer_sizes=(128,) * 3, value_hidden_layer_sizes=(128,) * 3))
+  return rows
+
+
+def main() -> None:
+  """python -m mjx_cl.demonstrator ENV --out DIR --steps N --seed N"""
+  from mjx_cl import envs, runtime
+  runtime.setup()
+  parser = argparse.ArgumentParser(prog="python -m mjx_cl.demonstrator", description="Train the demonstrator of the cpu preset with brax PPO.")
+  parser.add_argument("env", choices=sorted(envs.ENVS))
+  parser.add_argument("--out", required=True)
+  parser.add_argument("--steps", type=int, default=8_000_000)
+  parser.add_argument("--seed", type=int, default=0)
+  args = parser.parse_args()
+  train(envs.make(args.env), args.out, args.steps, args.seed, progress=lambda row: print(json.dumps(row), file=sys.stderr, flush=True))
+
+
+if __name__ == "__main__":
+  main()

@@ -1,0 +1,320 @@
+"""DreamerV3 as pure functions over one seed: `init`, `act`, `update`, `evaluate`, `open_loop`.
+
+Loss (all terms means over their elements; section numbers of the facts are the authors' code at e3f0224):
+  L = dyn + 0.1 rep + rec + rew + con + policy + value + 0.3 repval
+"""
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from mjx_cl.config import DreamerConfig
+from mjx_cl.dreamer import heads, losses, nets, optim, rssm
+from mjx_cl.dreamer.sizes import SIZES
+
+sg = jax.lax.stop_gradient
+
+
+class Carry(NamedTuple):
+  """What acting remembers of one robot: deter (D,), stoch (stoch * classes,), last sampled action (A,). Zeros at an episode's start."""
+  deter: jax.Array
+  stoch: jax.Array
+  action: jax.Array
+
+
+class TrainState(NamedTuple):
+  """Everything that training one seed changes, replay apart.
+
+  Attributes:
+    params: enc, dyn, dec, rew, con, pol, val -> flax parameters.
+    slow: slow copy of params["val"].
+    opt: optax state (RMS and momentum moments, counters).
+    range: float32 (2,), EMA of the returns' 5th and 95th percentile.
+    updates: int32 (), gradient steps taken.
+  """
+  params: dict[str, Any]
+  slow: Any
+  opt: Any
+  range: jax.Array
+  updates: jax.Array
+
+
+class Batch(NamedTuple):
+  """Windows from replay, batch-major (B, 1 + T, ...); index 0 is context.
+
+  Attributes:
+    obs (O,), action (A,) chosen after obs, reward () of arriving at obs, first, last, terminal: bool ().
+    deter (D,), stoch: int (stoch,) class indices, latents as stored.
+    demo (A,): the demonstrator's action at obs; has_demo: bool ().
+  """
+  obs: jax.Array
+  action: jax.Array
+  reward: jax.Array
+  first: jax.Array
+  last: jax.Array
+  terminal: jax.Array
+  deter: jax.Array
+  stoch: jax.Array
+  demo: jax.Array
+  has_demo: jax.Array
+
+
+class Weights(NamedTuple):
+  """Traced weights of the terms that a demonstrator needs; the defaults are plain DreamerV3.
+
+  Attributes:
+    clone: weight of KL(N(demo, clone_std^2) || policy) on replayed states.
+    policy: weight of the imagined policy loss.
+    lr: factor on the learning rate.
+  """
+  clone: jax.Array | float = 0.0
+  policy: jax.Array | float = 1.0
+  lr: jax.Array | float = 1.0
+
+
+class Agent:
+  """DreamerV3 for `obs_size` observations and `act_size` actions.
+
+  Args:
+    config: DreamerConfig.
+    clone_std: deviation of the demonstrator's action in the cloning term, or None: the term is not compiled.
+  """
+
+  def __init__(self, config: DreamerConfig, obs_size: int, act_size: int, clone_std: float | None = None):
+    self.config, self.obs_size, self.act_size, self.clone_std = config, obs_size, act_size, clone_std
+    self.size = s = SIZES[config.size]
+    self.bins = jnp.asarray(nets.two_hot_bins(config.bins))
+    self.enc, self.dyn = heads.Encoder(s.units), rssm.RSSM(s)
+    self.dec = heads.Decoder(s.units, obs_size)
+    self.rew, self.con = heads.Head(1, s.units, config.bins, 0.0), heads.Head(1, s.units, 1, 1.0)
+    self.pol, self.val = heads.PolicyHead(s.units, act_size), heads.Head(3, s.units, config.bins, 0.0)
+    self.optimizer = optim.laprop(config.lr, config.warmup, config.agc)
+    self.stoch_size = s.stoch * s.classes
+
+  # ---- parameters ----------------------------------------------------------------------------------------------------------------
+
+  def init(self, key: jax.Array) -> TrainState:
+    """Fresh parameters, moments and counters from `key`."""
+    keys = jax.random.split(key, 7)
+    deter, stoch = jnp.zeros((1, self.size.deter)), jnp.zeros((1, self.stoch_size))
+    action, tokens = jnp.zeros((1, self.act_size)), jnp.zeros((1, self.size.units))
+    params = {"enc": self.enc.init(keys[0], jnp.zeros((1, self.obs_size)))["params"],
+              "dyn": self.dyn.init(keys[1], deter, stoch, action, tokens)["params"]}
+    for key, name in zip(keys[2:], ("dec", "rew", "con", "pol", "val")):
+      params[name] = getattr(self, name).init(key, deter, stoch)["params"]
+    return TrainState(params, jax.tree.map(jnp.copy, params["val"]), self.optimizer.init(params), jnp.zeros(2), jnp.int32(0))
+
+  def _apply(self, params, name, *args, **kwargs):
+    return getattr(self, name).apply({"params": params[name]}, *args, **kwargs)
+
+  def _core(self, params, deter, stoch, action):
+    return self._apply(params, "dyn", deter, stoch, action, method="core")
+
+  def hot(self, index: jax.Array) -> jax.Array:
+    """Class indices (..., stoch) -> flat one-hot (..., stoch * classes)."""
+    return jax.nn.one_hot(index, self.size.classes).reshape(index.shape[:-1] + (self.stoch_size,))
+
+  # ---- acting --------------------------------------------------------------------------------------------------------------------
+
+  def carry(self) -> Carry:
+    """The carry at an episode's start."""
+    return Carry(jnp.zeros(self.size.deter), jnp.zeros(self.stoch_size), jnp.zeros(self.act_size))
+
+  def act(self, params, carry: Carry, obs: jax.Array, key: jax.Array, deterministic: bool = False):
+    """One posterior step and an action for one robot.
+
+    Args:
+      obs: float32 (O,).
+    Returns:
+      (carry', action (A,), unclipped; the environment clips). carry'.deter and .stoch are the posterior latent at obs.
+    """
+    key_z, key_a = jax.random.split(key)
+    deter = self._core(params, carry.deter[None], carry.stoch[None], carry.action[None])
+    logits = self._apply(params, "dyn", deter, self._apply(params, "enc", obs[None]), method="posterior")
+    stoch = rssm.sample(logits, jax.random.uniform(key_z, (1, self.size.stoch))).reshape(1, -1)
+    mean, std = nets.normal(*self._apply(params, "pol", deter, stoch))
+    action = mean if deterministic else mean + std * jax.random.normal(key_a, mean.shape)
+    return Carry(deter[0], stoch[0], action[0]), action[0]
+
+  # ---- world model ---------------------------------------------------------------------------------------------------------------
+
+  def observe(self, params, batch: Batch, key: jax.Array):
+    """Posterior states of the T trained steps, time-major: deter (T, B, D), stoch (T, B, S), posterior logits (T, B, stoch, classes)."""
+    length, rows = batch.obs.shape[1] - 1, batch.obs.shape[0]
+    tokens = self._apply(params, "enc", batch.obs[:, 1:].swapaxes(0, 1))
+    uniform = jax.random.uniform(key, (length, rows, self.size.stoch))
+
+    def step(state, x):
+      deter, stoch = state
+      action, first, tokens, uniform = x
+      keep = 1.0 - first[:, None]
+      deter = self._core(params, deter * keep, stoch * keep, action * keep)
+      logits = self._apply(params, "dyn", deter, tokens, method="posterior")
+      stoch = rssm.sample(logits, uniform).reshape(rows, -1)
+      return (deter, stoch), (deter, stoch, logits)
+    start = (batch.deter[:, 0].astype(jnp.float32), self.hot(batch.stoch[:, 0]))
+    xs = (batch.action[:, :-1].swapaxes(0, 1), batch.first[:, 1:].swapaxes(0, 1).astype(jnp.float32), tokens, uniform)
+    return jax.lax.scan(step, start, xs)[1]
+
+  def imagine(self, params, deter, stoch, key: jax.Array, steps: int):
+    """Policy and prior from rows (N, D), (N, S), no gradient.
+
+    Returns:
+      deter (steps + 1, N, D), stoch (steps + 1, N, S), action (steps + 1, N, A); index 0 is the start.
+    """
+    params = sg(params)
+    key_z, key_a = jax.random.split(key)
+    rows = deter.shape[0]
+    uniform = jax.random.uniform(key_z, (steps, rows, self.size.stoch))
+    noise = jax.random.normal(key_a, (steps + 1, rows, self.act_size))
+
+    def choose(deter, stoch, noise):
+      mean, std = nets.normal(*self._apply(params, "pol", deter, stoch))
+      return mean + std * noise
+
+    def step(state, x):
+      deter, stoch = state
+      noise, uniform = x
+      action = choose(deter, stoch, noise)
+      deter = self._core(params, deter, stoch, action)
+      stoch = rssm.sample(self._apply(params, "dyn", deter, method="prior"), uniform).reshape(rows, -1)
+      return (deter, stoch), (deter, stoch, action)
+    start = (sg(deter), sg(stoch))
+    end, (deters, stochs, actions) = jax.lax.scan(step, start, (noise[:-1], uniform))
+    last = choose(*end, noise[-1])
+    deters = jnp.concatenate([start[0][None], deters])
+    stochs = jnp.concatenate([start[1][None], stochs])
+    return sg((deters, stochs, jnp.concatenate([actions, last[None]])))
+
+  def value(self, value_params, deter, stoch):
+    """Value logits (..., bins) of a (fast or slow) critic."""
+    return self.val.apply({"params": value_params}, deter, stoch)
+
+  def loss(self, params, slow, range_, batch: Batch, key: jax.Array, weights: Weights = Weights()):
+    """The joint objective.
+
+    Returns:
+      (L, (metrics, new range (2,), deter (B, T, D), stoch indices (B, T, stoch))). metrics: name -> float32 (); `loss/*` are unscaled.
+    """
+    c = self.config
+    key_observe, key_imagine = jax.random.split(key)
+    obs, reward, last, terminal = (x[:, 1:].swapaxes(0, 1) for x in (batch.obs, batch.reward, batch.last, batch.terminal))
+    last, terminal = last.astype(jnp.float32), terminal.astype(jnp.float32)
+    length, rows = reward.shape
+    gamma = 1.0 - 1.0 / c.horizon
+
+    # world model
+    deter, stoch, logits = self.observe(params, batch, key_observe)
+    prior = self._apply(params, "dyn", deter, method="prior")
+    dyn = jnp.maximum(c.free_nats, rssm.kl(sg(logits), prior))
+    rep = jnp.maximum(c.free_nats, rssm.kl(logits, sg(prior)))
+    rec = jnp.sum(jnp.square(self._apply(params, "dec", deter, stoch) - nets.symlog(obs)), -1)
+    rew = nets.two_hot_loss(self._apply(params, "rew", deter, stoch), reward, self.bins)
+    con_logit = self._apply(params, "con", deter, stoch)[..., 0]
+    con_target = (1.0 - terminal) * gamma
+    con = -con_target * jax.nn.log_sigmoid(con_logit) - (1.0 - con_target) * jax.nn.log_sigmoid(-con_logit)
+
+    # imagination from the last `starts` states of each sequence; states are stopped, so no gradient passes through the dynamics
+    starts = c.last_starts or length
+    flat = lambda x: x[length - starts:].reshape((starts * rows,) + x.shape[2:])
+    img_deter, img_stoch, img_action = self.imagine(params, flat(deter), flat(stoch), key_imagine, c.imagine)
+    frozen = sg(params)
+    img_rew = nets.two_hot_mean(self._apply(frozen, "rew", img_deter[1:], img_stoch[1:]), self.bins)
+    img_con = jax.nn.sigmoid(self._apply(frozen, "con", img_deter, img_stoch)[..., 0])
+    val_logits = self.value(params["val"], img_deter, img_stoch)
+    val = sg(nets.two_hot_mean(val_logits, self.bins))
+    slow_val = nets.two_hot_mean(self.value(slow, img_deter[:-1], img_stoch[:-1]), self.bins)
+    ret = losses.lambda_return(img_rew, img_con[1:], val[1:], c.lam)
+    omega = sg(jnp.cumprod(img_con, 0))[:-1]
+    range_, scale = losses.update_range(range_, ret, c.range_rate)
+    adv = (ret - val[:-1]) / scale
+    mean, std = nets.normal(*self._apply(params, "pol", img_deter[:-1], img_stoch[:-1]))
+    logp, entropy = nets.normal_logp(mean, std, img_action[:-1]), nets.normal_entropy(std)
+    policy = -omega * (logp * sg(adv) + c.entropy * entropy)
+    value = omega * (nets.two_hot_loss(val_logits[:-1], ret, self.bins) + nets.two_hot_loss(val_logits[:-1], slow_val, self.bins))
+
+    # replay value over the last `starts` replayed states; its features are not stopped
+    tail = slice(length - starts, None)
+    boot = ret[0].reshape(starts, rows)
+    target = losses.replay_return(reward[tail], terminal[tail], last[tail], boot, c.lam, gamma)
+    rep_deter, rep_stoch = deter[tail][:-1], stoch[tail][:-1]
+    rep_logits = self.value(params["val"], rep_deter, rep_stoch)
+    rep_slow = nets.two_hot_mean(self.value(slow, sg(rep_deter), sg(rep_stoch)), self.bins)
+    repval = (1.0 - last[tail][:-1]) * (nets.two_hot_loss(rep_logits, target, self.bins) + nets.two_hot_loss(rep_logits, rep_slow, self.bins))
+
+    terms = {"dyn": dyn, "rep": rep, "rec": rec, "rew": rew, "con": con, "policy": policy, "value": value, "repval": repval}
+    terms = {k: jnp.mean(v) for k, v in terms.items()}
+    total = (terms["dyn"] + c.rep_scale * terms["rep"] + terms["rec"] + terms["rew"] + terms["con"]
+             + weights.policy * terms["policy"] + terms["value"] + c.repval_scale * terms["repval"])
+    if self.clone_std is not None:
+      terms["clone"] = self._clone_loss(params, sg(deter), sg(stoch), batch)
+      total = total + weights.clone * terms["clone"]
+    metrics = {f"loss/{k}": v for k, v in terms.items()} | {
+        "opt/loss": total, "adv": adv.mean(), "adv_std": adv.std(), "adv_mag": jnp.abs(adv).mean(), "ret": ((ret - range_[0]) / scale).mean(),
+        "val": val.mean(), "tar": ret.mean(), "rew": img_rew.mean(), "con": img_con.mean(), "weight": omega.mean(),
+        "ent/action": entropy.mean(), "ret_scale": scale,
+        "dyn_ent": categorical_entropy(prior), "rep_ent": categorical_entropy(logits)}
+    stoch = jnp.argmax(stoch.reshape(length, rows, self.size.stoch, self.size.classes), -1)
+    return total, (metrics, range_, sg(deter).swapaxes(0, 1), stoch.swapaxes(0, 1))
+
+  def _clone_loss(self, params, deter, stoch, batch):
+    """Mean over labelled replayed states of KL(N(demo, clone_std^2) || policy) [nats]."""
+    mean, std = nets.normal(*self._apply(params, "pol", deter, stoch))
+    demo, has = batch.demo[:, 1:].swapaxes(0, 1), batch.has_demo[:, 1:].swapaxes(0, 1).astype(jnp.float32)
+    var = self.clone_std ** 2
+    kl = jnp.sum(jnp.log(std / self.clone_std) + (var + jnp.square(mean - demo)) / (2 * jnp.square(std)) - 0.5, -1)
+    return jnp.sum(kl * has) / jnp.maximum(1.0, jnp.sum(has))
+
+  def update(self, state: TrainState, batch: Batch, key: jax.Array, weights: Weights = Weights()):
+    """One gradient step.
+
+    Returns:
+      (state', metrics, (deter (B, T, D), stoch indices (B, T, stoch)) for the latent refresh).
+    """
+    grad = jax.grad(self.loss, has_aux=True)
+    grads, (metrics, range_, deter, stoch) = grad(state.params, state.slow, state.range, batch, key, weights)
+    steps, opt = self.optimizer.update(grads, state.opt, state.params)
+    steps = jax.tree.map(lambda x: weights.lr * x, steps)
+    params = optax.apply_updates(state.params, steps)
+    slow = jax.tree.map(lambda s, p: (1.0 - self.config.slow_rate) * s + self.config.slow_rate * p, state.slow, params["val"])
+    metrics["opt/grad_norm"] = optax.global_norm(grads)
+    return TrainState(params, slow, opt, range_, state.updates + 1), metrics, (deter, stoch)
+
+  # ---- prediction ----------------------------------------------------------------------------------------------------------------
+
+  def open_loop(self, params, deter, stoch, actions, key: jax.Array):
+    """Predictions of the next n steps from rows, actions given, one prior sample each; never looks at an observation.
+
+    Args:
+      deter, stoch: posterior at t, (N, D), (N, S).
+      actions: a_t .. a_{t+n-1}, (n, N, A).
+    Returns:
+      xhat_{t+1..t+n} (n, N, O) in raw units (symexp applied) and rhat (n, N).
+    """
+    rows, steps = deter.shape[0], actions.shape[0]
+    uniform = jax.random.uniform(key, (steps, rows, self.size.stoch))
+
+    def step(state, x):
+      deter, stoch = state
+      action, uniform = x
+      deter = self._core(params, deter, stoch, action)
+      stoch = rssm.sample(self._apply(params, "dyn", deter, method="prior"), uniform).reshape(rows, -1)
+      return (deter, stoch), (deter, stoch)
+    _, (deters, stochs) = jax.lax.scan(step, (deter, stoch), (actions, uniform))
+    obs = nets.symexp(self._apply(params, "dec", deters, stochs))
+    return obs, nets.two_hot_mean(self._apply(params, "rew", deters, stochs), self.bins)
+
+
+def categorical_entropy(logits):
+  """Mean entropy [nats] summed over the categorical variables."""
+  p = rssm.probs(logits)
+  return -jnp.mean(jnp.sum(p * jnp.log(p), (-2, -1)))
+
+
+def parameter_count(params) -> int:
+  """Trainable parameters, slow critic apart."""
+  return int(sum(np.prod(x.shape) for x in jax.tree.leaves(params)))

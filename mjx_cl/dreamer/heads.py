@@ -1,0 +1,48 @@
+"""Encoder, decoder and the four heads. Features of a state: [deter, stoch], for the decoder [stoch, deter]."""
+from __future__ import annotations
+
+import flax.linen as nn
+
+from mjx_cl.dreamer.nets import Linear, MLP, symlog
+
+
+class Encoder(nn.Module):
+  """symlog, then 3 hidden layers: observation (..., obs) -> tokens (..., units)."""
+  units: int
+
+  @nn.compact
+  def __call__(self, obs):
+    return MLP(3, self.units, name="mlp")(symlog(obs))
+
+
+class Decoder(nn.Module):
+  """Mean of the observation in symlog space, (..., obs)."""
+  units: int
+  obs: int
+
+  @nn.compact
+  def __call__(self, deter, stoch):
+    return Linear(self.obs, name="out")(MLP(3, self.units, name="mlp")(stoch, deter))
+
+
+class Head(nn.Module):
+  """`layers` hidden layers and one linear output: reward (1 layer, 255, outscale 0), continue (1, 1, 1), value (3, 255, 0)."""
+  layers: int
+  units: int
+  out: int
+  outscale: float
+
+  @nn.compact
+  def __call__(self, deter, stoch):
+    return Linear(self.out, self.outscale, name="out")(MLP(self.layers, self.units, name="mlp")(deter, stoch))
+
+
+class PolicyHead(nn.Module):
+  """3 hidden layers, two separate outputs: raw means and raw deviations, each (..., act)."""
+  units: int
+  act: int
+
+  @nn.compact
+  def __call__(self, deter, stoch):
+    x = MLP(3, self.units, name="mlp")(deter, stoch)
+    return Linear(self.act, 0.01, name="mean")(x), Linear(self.act, 0.01, name="std")(x)

@@ -1,0 +1,134 @@
+"""Layers of DreamerV3 as flax modules, and the two output distributions.
+
+Linear layers always have a bias (initially 0). Kernels: standard normal truncated to [-2, 2], times 1.1368 sqrt(1 / fan_in), so that the
+deviation is sqrt(1 / fan_in), times `outscale`. A hidden layer is Linear -> RMSNorm -> SiLU.
+"""
+from __future__ import annotations
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+
+def symlog(x):
+  """sign(x) ln(1 + |x|), elementwise."""
+  return jnp.sign(x) * jnp.log1p(jnp.abs(x))
+
+
+def symexp(x):
+  """sign(x) (exp|x| - 1), the inverse of `symlog`."""
+  return jnp.sign(x) * jnp.expm1(jnp.abs(x))
+
+
+def kernel_init(fan_in: int, outscale: float = 1.0):
+  """Initialiser with the deviation outscale sqrt(1 / fan_in); outscale 0 gives exact zeros."""
+  def init(key, shape, dtype=jnp.float32):
+    if outscale == 0.0:
+      return jnp.zeros(shape, dtype)
+    return 1.1368 * outscale * np.sqrt(1.0 / fan_in) * jax.random.truncated_normal(key, -2.0, 2.0, shape, dtype)
+  return init
+
+
+class Linear(nn.Module):
+  """y = x W + b over the last axis. `split` inputs, given as a tuple, are multiplied one by one and added: the product of their
+  concatenation, without building it."""
+  units: int
+  outscale: float = 1.0
+
+  @nn.compact
+  def __call__(self, *xs):
+    fan_in = sum(x.shape[-1] for x in xs)
+    kernel = self.param("kernel", kernel_init(fan_in, self.outscale), (fan_in, self.units))
+    bias = self.param("bias", nn.initializers.zeros, (self.units,))
+    start, y = 0, bias
+    for x in xs:
+      y = y + x @ kernel[start:start + x.shape[-1]]
+      start += x.shape[-1]
+    return y
+
+
+class Norm(nn.Module):
+  """RMSNorm over the last axis: x g / sqrt(mean(x^2) + 1e-4), g initially 1."""
+
+  @nn.compact
+  def __call__(self, x):
+    gain = self.param("gain", nn.initializers.ones, (x.shape[-1],))
+    return x * jax.lax.rsqrt(jnp.mean(jnp.square(x), -1, keepdims=True) + 1e-4) * gain
+
+
+class Hidden(nn.Module):
+  """Linear -> RMSNorm -> SiLU."""
+  units: int
+
+  @nn.compact
+  def __call__(self, *xs):
+    return nn.silu(Norm(name="norm")(Linear(self.units, name="linear")(*xs)))
+
+
+class MLP(nn.Module):
+  """`layers` hidden layers of width `units`; several inputs are concatenated."""
+  layers: int
+  units: int
+
+  @nn.compact
+  def __call__(self, *xs):
+    for i in range(self.layers):
+      xs = (Hidden(self.units, name=f"hidden{i}")(*xs),)
+    return xs[0]
+
+
+# ---- two-hot ---------------------------------------------------------------------------------------------------------------------
+
+def two_hot_bins(num: int = 255) -> np.ndarray:
+  """Bin centres, float32 (num,), num odd: symexp of an even grid on [-20, 20], mirrored so that pairs are exact opposites."""
+  half = np.linspace(-20, 0, (num - 1) // 2 + 1, dtype=np.float32)
+  half = (np.sign(half) * np.expm1(np.abs(half))).astype(np.float32)
+  return np.concatenate([half, -half[:-1][::-1]])
+
+
+def two_hot(x: jax.Array, bins: jax.Array) -> jax.Array:
+  """Target distribution (..., bins) of x (...): weight on the two neighbouring bins, linear in raw distance, ends clipped."""
+  below = jnp.clip(jnp.searchsorted(bins, x, side="right") - 1, 0, len(bins) - 2)
+  low, high = bins[below], bins[below + 1]
+  weight = jnp.clip((x - low) / (high - low), 0.0, 1.0)
+  index = jnp.arange(len(bins))
+  return jnp.where(index == below[..., None], (1 - weight)[..., None], 0.0) + jnp.where(index == below[..., None] + 1, weight[..., None], 0.0)
+
+
+def two_hot_loss(logits: jax.Array, x: jax.Array, bins: jax.Array) -> jax.Array:
+  """Cross-entropy [nats] (...) of logits (..., bins) against the two-hot of x (...).
+
+  Only the two weighted entries of log-softmax are read; the target is never built.
+  """
+  x = jax.lax.stop_gradient(x)
+  below = jnp.clip(jnp.searchsorted(bins, x, side="right") - 1, 0, len(bins) - 2)
+  low, high = bins[below], bins[below + 1]
+  weight = jnp.clip((x - low) / (high - low), 0.0, 1.0)
+  pair = jnp.take_along_axis(logits, jnp.stack([below, below + 1], -1), -1)
+  return jax.nn.logsumexp(logits, -1) - (1 - weight) * pair[..., 0] - weight * pair[..., 1]
+
+
+def two_hot_mean(logits: jax.Array, bins: jax.Array) -> jax.Array:
+  """Expectation (...) of logits (..., bins), summed in opposite pairs so that equal logits give exactly 0."""
+  probs = jax.nn.softmax(logits, -1)
+  middle = len(bins) // 2
+  upper = probs[..., middle + 1:] - probs[..., :middle][..., ::-1]
+  return jnp.sum(upper * bins[middle + 1:], -1)
+
+
+# ---- the policy's normal ---------------------------------------------------------------------------------------------------------
+
+def normal(mean_raw: jax.Array, std_raw: jax.Array) -> tuple[jax.Array, jax.Array]:
+  """Mean tanh(m) and deviation 0.1 + 0.9 sigmoid(s + 2). Samples are neither squashed nor clipped."""
+  return jnp.tanh(mean_raw), 0.1 + 0.9 * jax.nn.sigmoid(std_raw + 2.0)
+
+
+def normal_logp(mean: jax.Array, std: jax.Array, x: jax.Array) -> jax.Array:
+  """Log-density (...) of x (..., act), summed over action dimensions."""
+  return jnp.sum(-0.5 * jnp.square((x - mean) / std) - jnp.log(std) - 0.5 * np.log(2 * np.pi), -1)
+
+
+def normal_entropy(std: jax.Array) -> jax.Array:
+  """Differential entropy [nats] (...), summed over action dimensions."""
+  return jnp.sum(jnp.log(std) + 0.5 * np.log(2 * np.pi * np.e), -1)

@@ -1,0 +1,115 @@
+"""Recurrent state-space model: block GRU core, categorical latents with straight-through gradients.
+
+State of one robot: deter (D,) and stoch (stoch, classes), one-hot rows, both zero at an episode's start.
+"""
+from __future__ import annotations
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from mjx_cl.dreamer.nets import Hidden, Linear, MLP, Norm, kernel_init
+from mjx_cl.dreamer.sizes import Size
+
+UNIMIX = 0.01
+
+
+class BlockLinear(nn.Module):
+  """Block-diagonal linear layer on (blocks, rows, in), plus inputs shared by all blocks (rows, shared).
+
+  kernel (blocks, in + shared, out): block g sees [own chunk, shared]. The shared part is one dense product. fan_in of the initialiser is
+  the width of the whole concatenated input, blocks (in + shared), as in the authors' code.
+  """
+  units: int  # outputs per block
+
+  @nn.compact
+  def __call__(self, x, shared=None):
+    blocks, rows, own = x.shape
+    extra = 0 if shared is None else shared.shape[-1]
+    kernel = self.param("kernel", kernel_init(blocks * (own + extra)), (blocks, own + extra, self.units))
+    bias = self.param("bias", nn.initializers.zeros, (blocks * self.units,))
+    y = jnp.einsum("gni,gio->gno", x, kernel[:, :own]) + bias.reshape(blocks, 1, self.units)
+    if shared is not None:
+      dense = kernel[:, own:].transpose(1, 0, 2).reshape(extra, blocks * self.units)
+      y = y + (shared @ dense).reshape(rows, blocks, self.units).transpose(1, 0, 2)
+    return y
+
+
+class BlockNorm(nn.Module):
+  """RMSNorm over the whole concatenated vector of (blocks, rows, width)."""
+
+  @nn.compact
+  def __call__(self, x):
+    blocks, _, width = x.shape
+    gain = self.param("gain", nn.initializers.ones, (blocks * width,)).reshape(blocks, 1, width)
+    return x * jax.lax.rsqrt(jnp.mean(jnp.square(x), (0, 2), keepdims=True) + 1e-4) * gain
+
+
+def clip_action(action):
+  """a / sg(max(1, |a|)): outside [-1, 1] the bound, inside the identity."""
+  return action / jax.lax.stop_gradient(jnp.maximum(1.0, jnp.abs(action)))
+
+
+class RSSM(nn.Module):
+  """Core, prior and posterior on rows: deter (N, D), stoch (N, stoch * classes), action (N, A).
+
+    x0, x1, x2 = hidden(deter), hidden(stoch), hidden(clip(action))
+    h  = silu(norm(block([chunk_g(deter), x0, x1, x2])));   r, c, u = block(h), cut per block in this order
+    deter' = sigmoid(u - 1) tanh(sigmoid(r) c) + (1 - sigmoid(u - 1)) deter
+  """
+  size: Size
+
+  def setup(self):
+    s = self.size
+    self.in_deter, self.in_stoch, self.in_action = (Hidden(s.hidden, name=n) for n in ("in_deter", "in_stoch", "in_action"))
+    self.core_hidden, self.core_norm = BlockLinear(s.deter // s.blocks, name="core_hidden"), BlockNorm(name="core_norm")
+    self.core_gates = BlockLinear(3 * s.deter // s.blocks, name="core_gates")
+    self.prior_mlp, self.prior_out = MLP(2, s.hidden, name="prior_mlp"), Linear(s.stoch * s.classes, name="prior_out")
+    self.post_hidden, self.post_out = Hidden(s.hidden, name="post_hidden"), Linear(s.stoch * s.classes, name="post_out")
+
+  def __call__(self, deter, stoch, action, tokens):  # touches every parameter, for initialisation
+    deter = self.core(deter, stoch, action)
+    return self.prior(deter), self.posterior(deter, tokens)
+
+  def core(self, deter, stoch, action):
+    rows, width = deter.shape
+    blocks = self.size.blocks
+    shared = jnp.concatenate([self.in_deter(deter), self.in_stoch(stoch), self.in_action(clip_action(action))], -1)
+    chunks = deter.reshape(rows, blocks, width // blocks).transpose(1, 0, 2)
+    h = nn.silu(self.core_norm(self.core_hidden(chunks, shared)))
+    r, c, u = jnp.split(self.core_gates(h), 3, -1)
+    update = jax.nn.sigmoid(u - 1.0)
+    chunks = update * jnp.tanh(jax.nn.sigmoid(r) * c) + (1.0 - update) * chunks
+    return chunks.transpose(1, 0, 2).reshape(rows, width)
+
+  def prior(self, deter):
+    """Logits (N, stoch, classes) of p(z | deter)."""
+    return self.prior_out(self.prior_mlp(deter)).reshape(deter.shape[:-1] + (self.size.stoch, self.size.classes))
+
+  def posterior(self, deter, tokens):
+    """Logits (N, stoch, classes) of q(z | deter, tokens), tokens (N, units) from the encoder."""
+    return self.post_out(self.post_hidden(deter, tokens)).reshape(deter.shape[:-1] + (self.size.stoch, self.size.classes))
+
+
+def probs(logits: jax.Array) -> jax.Array:
+  """0.99 softmax(logits) + 0.01 / classes over the last axis."""
+  return (1.0 - UNIMIX) * jax.nn.softmax(logits, -1) + UNIMIX / logits.shape[-1]
+
+
+def sample(logits: jax.Array, uniform: jax.Array) -> jax.Array:
+  """One-hot rows (..., stoch, classes) by inverse CDF of `probs`, straight-through gradient.
+
+  Args:
+    logits: (..., stoch, classes).
+    uniform: numbers in [0, 1), (..., stoch).
+  """
+  p = probs(logits)
+  index = jnp.sum(jnp.cumsum(p, -1)[..., :-1] <= uniform[..., None], -1)
+  hot = jax.nn.one_hot(index, logits.shape[-1])
+  return hot + p - jax.lax.stop_gradient(p)
+
+
+def kl(logits_q: jax.Array, logits_p: jax.Array) -> jax.Array:
+  """KL(q || p) [nats] (...), summed over the categorical variables, both with the 1 % uniform mixture."""
+  q, p = probs(logits_q), probs(logits_p)
+  return jnp.sum(q * (jnp.log(q) - jnp.log(p)), (-2, -1))

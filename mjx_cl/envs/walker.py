@@ -1,0 +1,115 @@
+"""Walker-walk: a planar walker of seven capsules keeps upright and walks at 1 m/s.
+
+Model, observation, reward and reset follow DeepMind Control Suite's walker-walk (Tassa et al. 2018; figures from dm_control 1.0.50).
+"""
+from __future__ import annotations
+
+import importlib.resources
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from mjx_cl import physics as physics_lib
+from mjx_cl.types import EnvState, Model, Spec, Step, Var
+
+STAND_HEIGHT = 1.2  # [m]
+WALK_SPEED = 1.0    # [m/s]
+BODIES = ("torso", "right_thigh", "right_leg", "right_foot", "left_thigh", "left_leg", "left_foot")
+JOINTS = ("right_hip", "right_knee", "right_ankle", "left_hip", "left_knee", "left_ankle")
+
+
+def load_model() -> mujoco.MjModel:
+  """The walker as mujoco.MjModel (28.540 kg, 6 motors, physics step 0.0025 s)."""
+  return mujoco.MjModel.from_xml_string(importlib.resources.files("mjx_cl.envs").joinpath("assets/walker.xml").read_text())
+
+
+def angles(qpos: jax.Array) -> jax.Array:
+  """Angle of each body about +y [rad], (7,) in tree order, from qpos (9,) = rootz, rootx, rooty, right leg, left leg."""
+  root = qpos[2]
+  right = root - jnp.cumsum(qpos[3:6])  # leg hinges turn about -y
+  left = root - jnp.cumsum(qpos[6:9])
+  return jnp.concatenate([root[None], right, left])
+
+
+def center_x(qpos: jax.Array, mass: jax.Array) -> jax.Array:
+  """Position of the centre of mass along x [m], (), for body masses (7,) [kg].
+
+  Chain of each leg: hip 0.3 m below the torso's centre, thigh centre 0.225 below the hip, knee 0.45 below the hip, leg centre 0.25 below
+  the knee, ankle 0.5 below the knee, foot centre 0.06 ahead of the ankle. A point (dx, dz) of a body at angle a lies at
+  x + cos(a) dx + sin(a) dz.
+  """
+  sin, cos = jnp.sin(angles(qpos)), jnp.cos(angles(qpos))
+  torso = qpos[1]
+  hip = torso - 0.3 * sin[0]
+  xs = [torso]
+  for thigh, leg, foot in ((1, 2, 3), (4, 5, 6)):
+    knee = hip - 0.45 * sin[thigh]
+    xs += [hip - 0.225 * sin[thigh], knee - 0.25 * sin[leg], knee - 0.5 * sin[leg] + 0.06 * cos[foot]]
+  return jnp.dot(jnp.stack(xs), mass) / jnp.sum(mass)
+
+
+def observe(qpos: jax.Array, qvel: jax.Array) -> jax.Array:
+  """Observation, float32 (24,): (cos, sin) of each body's angle (14), torso height [m] (1), qvel [m/s, rad/s] (9)."""
+  a = angles(qpos)
+  orientation = jnp.stack([jnp.cos(a), jnp.sin(a)], -1).reshape(-1)  # xmat xx and xz
+  return jnp.concatenate([orientation, 1.3 + qpos[:1], qvel])
+
+
+def reward(qpos: jax.Array, qvel: jax.Array, mass: jax.Array) -> jax.Array:
+  """Walk reward in [0, 1], float32 ().
+
+    standing = 1 if height >= 1.2 m else 0.1 ** (((1.2 - height) / 0.6) ** 2)
+    upright  = (1 + cos(torso angle)) / 2
+    reward   = (3 standing + upright) / 4 * (5 clip(v_x, 0, 1) + 1) / 6            v_x = centre-of-mass velocity [m/s]
+  """
+  height = 1.3 + qpos[0]
+  short = jnp.maximum(STAND_HEIGHT - height, 0.0) / 0.6
+  standing = jnp.exp(jnp.log(0.1) * short * short)
+  upright = (1.0 + jnp.cos(qpos[2])) / 2.0
+  _, speed = jax.jvp(lambda q: center_x(q, mass), (qpos,), (qvel,))
+  move = jnp.clip(speed / WALK_SPEED, 0.0, 1.0)
+  return (3.0 * standing + upright) / 4.0 * (5.0 * move + 1.0) / 6.0
+
+
+class Walker:
+  """Walker-walk. No early termination; truncated after 1,000 control steps of 0.025 s (10 physics steps).
+
+  Reset (DMC's): the six leg joints uniform in their ranges, torso angle uniform in (-pi, pi), everything else 0, torso centre at 1.3 m,
+  not settled. Observation and reward use their own kinematics of qpos and qvel, so they are current and equal on both backends.
+  """
+
+  def __init__(self, physics: str = "auto"):
+    self.mj_model = load_model()
+    self.physics = physics_lib.make(physics, self.mj_model, substeps=10)
+    low, high = self.mj_model.jnt_range[3:].T
+    self._low, self._high = jnp.asarray(low, jnp.float32), jnp.asarray(high, jnp.float32)
+    self._mass = jnp.asarray(self.mj_model.body_mass[1:], jnp.float32)
+    orientation = [Var(f"{b}_{k}", "1", -1, 1) for b in BODIES for k in ("xx", "xz")]
+    speeds = [Var("vel_rootz", "m/s"), Var("vel_rootx", "m/s"), Var("vel_rooty", "rad/s")] + [Var(f"vel_{j}", "rad/s") for j in JOINTS]
+    self.spec = Spec(
+        name="walker", obs=tuple(orientation + [Var("height", "m")] + speeds), act=tuple(Var(j, "1", -1, 1) for j in JOINTS),
+        control_s=0.025, episode_steps=1000,
+        acceptance=0.6,         # mean reward per step; a walker lying still earns at most 0.17, one that stands still 0.17, one that walks 0.9
+        posture=(14, 0.9),      # mean torso height [m]; 1.2 is standing, 0.3 is lying
+        targets=JOINTS)
+    self.model = Model(mj={"actuator_gear": jnp.asarray(self.mj_model.actuator_gear, jnp.float32)}, task={})
+
+  def init(self, model: Model, key: jax.Array) -> tuple[EnvState, jax.Array]:
+    """A fresh episode drawn from `key`: state and observation (24,)."""
+    del model
+    key_leg, key_root = jax.random.split(key)
+    legs = jax.random.uniform(key_leg, (6,), minval=self._low, maxval=self._high)
+    root = jax.random.uniform(key_root, (), minval=-jnp.pi, maxval=jnp.pi)
+    qpos = jnp.concatenate([jnp.zeros(2), root[None], legs])
+    qvel = jnp.zeros(9)
+    return EnvState(self.physics.init(qpos, qvel), jnp.int32(0)), observe(qpos, qvel)
+
+  def step(self, model: Model, state: EnvState, action: jax.Array) -> tuple[EnvState, Step]:
+    """One control step with action (6,), clipped to [-1, 1]."""
+    inner, out = self.physics.step(model.mj, state.physics, jnp.clip(action, -1.0, 1.0))
+    obs = observe(out["qpos"], out["qvel"])
+    step = state.step + 1
+    result = Step(obs, reward(out["qpos"], out["qvel"], self._mass), jnp.bool_(False), step >= self.spec.episode_steps, obs)
+    return EnvState(inner, step), result

@@ -1,0 +1,19 @@
+"""Errors that reach a user as one line. The CLI prints the message and leaves with `exit_code`."""
+
+
+class UserError(Exception):
+  """Wrong arguments, names or ranges: exit code 2."""
+  exit_code = 2
+
+
+class FileError(UserError):
+  """A broken, foreign or missing file, a full disk, a numeric failure: exit code 1."""
+  exit_code = 1
+
+
+def choose(kind: str, name: str, table) -> object:
+  """table[name], or a UserError that names every valid choice."""
+  try:
+    return table[name]
+  except KeyError:
+    raise UserError(f"unknown {kind} {name!r}; choose from: {', '.join(sorted(table))}") from None

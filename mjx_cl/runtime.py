@@ -1,0 +1,79 @@
+"""What must be decided before JAX starts its first backend: XLA flags, compile cache, dispatch.
+
+Importing this module is free of JAX; `setup()` is idempotent and is called by every entry point (`mjx_cl/__init__` calls
+it when the package is imported for its API, the CLI before a command that computes).
+"""
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import pathlib
+import sys
+
+# jaxlib 0.10.x can lose a completion event in MJX programs and hang for ever (256 robots under vmap: most runs); this flag cures it.
+_SCHEDULER_FLAG = "--xla_cpu_enable_concurrency_optimized_scheduler"
+_done = False
+
+
+def xla_flags(jaxlib_version: str, user_flags: str) -> str:
+  """XLA_FLAGS for this jaxlib: the user's own flags, unchanged and in order, plus what the version needs.
+
+  Args:
+    jaxlib_version: e.g. "0.9.2".
+    user_flags: the present value of the environment variable, possibly empty.
+  Returns:
+    The value to set. A flag that the user has set to anything is left as the user set it.
+  """
+  major, minor = (int(x) for x in jaxlib_version.split(".")[:2])
+  flags = user_flags.split()
+  if (major, minor) == (0, 10) and not any(f.split("=")[0] == _SCHEDULER_FLAG for f in flags):
+    flags.append(f"{_SCHEDULER_FLAG}=false")
+  return " ".join(flags)
+
+
+def cache_dir() -> pathlib.Path:
+  """Folder of JAX's persistent compile cache: `MJX_CL_CACHE`, else the platform's user cache folder."""
+  override = os.environ.get("MJX_CL_CACHE")
+  if override:
+    return pathlib.Path(override).expanduser()
+  if sys.platform == "darwin":
+    return pathlib.Path("~/Library/Caches/mjx_cl").expanduser()
+  return pathlib.Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")).expanduser() / "mjx_cl"
+
+
+def setup() -> None:
+  """Sets XLA flags, the compile cache and synchronous CPU dispatch. Call before the first JAX computation.
+
+  Synchronous dispatch: a callback into the physics converts its arguments on a thread of the CPU client, and with
+  asynchronous dispatch that conversion can wait for itself (jax issues 24255 and 25861).
+  """
+  global _done
+  if _done:
+    return
+  _done = True
+  flags = xla_flags(importlib.metadata.version("jaxlib"), os.environ.get("XLA_FLAGS", ""))
+  if flags:
+    os.environ["XLA_FLAGS"] = flags
+  import jax
+  jax.config.update("jax_cpu_enable_async_dispatch", False)
+  folder = cache_dir()
+  try:
+    folder.mkdir(parents=True, exist_ok=True)
+  except OSError:
+    return  # a read-only home: everything works, programs are compiled anew
+  jax.config.update("jax_compilation_cache_dir", str(folder))
+  jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+  jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
+
+
+def default_physics() -> str:
+  """`native` on a CPU where mjbatch is installed, else `mjx`."""
+  import jax
+  if jax.default_backend() != "cpu":
+    return "mjx"
+  try:
+    import mjbatch  # noqa: F401
+  except ImportError:
+    print("mjx-cl: mjbatch is not available on this platform, physics runs on mjx", file=sys.stderr)
+    return "mjx"
+  return "native"

@@ -1,0 +1,246 @@
+"""Pretraining: a host loop of collect (acting and physics) and learn (updates), resumable at any chunk."""
+from __future__ import annotations
+
+import dataclasses
+import functools
+import json
+import os
+import pathlib
+import time
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_cl import checkpoint, demonstrator, faults, replay as replay_lib
+from mjx_cl.config import DreamerConfig, TrainConfig
+from mjx_cl.dreamer.agent import Agent, TrainState, Weights
+from mjx_cl.errors import FileError
+from mjx_cl.rollout import Rollout, Stream, nest, records, start
+
+CHUNK = 64  # decisions between two rounds of updates
+
+
+class Learner(NamedTuple):
+  """Arrays of a pretraining run, all with a leading seeds axis but `key`."""
+  train: TrainState
+  streams: Stream
+  replay: replay_lib.Replay
+  key: jax.Array
+
+
+def make_learn(agent: Agent, batch: int, length: int):
+  """(train, replay, key, weights, updates) -> (train, replay, metrics of the mean over updates), seeds leading, jitted.
+
+  Seeds run one after another inside the program (`lax.map`): on a CPU that is as fast as vmap or faster, and needs the memory of one.
+  """
+  def one_seed(train, replay, key, weights, updates):
+    def step(state, key):
+      train, replay = state
+      key_sample, key_update = jax.random.split(key)
+      replay, data, address = replay_lib.sample(replay, key_sample, batch, length + 1)
+      train, metrics, latents = agent.update(train, data, key_update, weights)
+      return (train, replay_lib.refresh(replay, address, latents)), metrics
+    (train, replay), metrics = jax.lax.scan(step, (train, replay), jax.random.split(key, updates))
+    return train, replay, jax.tree.map(jnp.mean, metrics)
+
+  @functools.partial(jax.jit, static_argnames=("updates",), donate_argnums=(0, 1))
+  def learn(train, replay, key, weights, updates):
+    seeds = train.updates.shape[0]
+    if seeds == 1:  # no copy of the replay
+      out = one_seed(*jax.tree.map(lambda x: x[0], (train, replay)), key, weights, updates)
+      return jax.tree.map(lambda x: x[None], out)
+    body = lambda x: one_seed(x[0], x[1], x[2], weights, updates)
+    return jax.lax.map(body, (train, replay, jax.random.split(key, seeds)))
+  return learn
+
+
+class Returns:
+  """Returns of finished episodes, per stream, from chunks of rewards."""
+
+  def __init__(self, shape):
+    self.sums = np.zeros(shape)
+
+  def add(self, rows) -> list[tuple[tuple[int, int], float]]:
+    """Rows of a chunk -> [((group, member), return)] of the episodes that ended in it."""
+    reward, done = np.asarray(rows.reward), np.asarray(rows.terminated | rows.truncated)
+    ended = []
+    for r, d in zip(reward, done):
+      self.sums += r
+      for at in zip(*np.nonzero(d)):
+        ended.append((tuple(int(i) for i in at), float(self.sums[at])))
+        self.sums[at] = 0.0
+    return ended
+
+
+class Trainer:
+  """Pretrains `seeds` agents on one environment.
+
+  Phases with a demonstrator: `clone` (its data on half the robots, the cloning term, no policy gradient) until the agent's own return
+  reaches `clone_until` of the demonstrator's; `fade` (policy gradient on, cloning weight falls to 0); `pure` (replay emptied, plain
+  DreamerV3). Without one there is only `pure`.
+  """
+
+  def __init__(self, env, dreamer: DreamerConfig, config: TrainConfig, out, seed: int = 0, seeds: int = 1):
+    self.env, self.dreamer, self.config, self.out = env, dreamer, config, pathlib.Path(out)
+    self.seeds = seeds
+    self.expert = demonstrator.load(config.demonstrator) if config.demonstrator else None
+    self.expert_return = 0.0
+    self.phase = "clone" if self.expert else "pure"
+    self.phase_start = 0
+    self.owed = 0.0
+    self.rows: list[dict] = []
+    self.own: list[float] = []
+    self.seconds = 0.0
+    spec = env.spec
+    self.plain = Agent(dreamer, len(spec.obs), len(spec.act))
+    fault = faults.make("none", spec)
+    self.collect = {"pure": Rollout(env, self.plain, fault, config.repeat)}
+    self.learn = {"pure": make_learn(self.plain, dreamer.batch, dreamer.length)}
+    if self.expert:
+      cloning = Agent(dreamer, len(spec.obs), len(spec.act), clone_std=config.clone_std)
+      rollout = Rollout(env, cloning, fault, config.repeat, expert=self.expert, expert_noise=config.demo_noise)
+      learn = make_learn(cloning, dreamer.batch, dreamer.length)
+      self.collect |= {"clone": rollout, "fade": rollout}
+      self.learn |= {"clone": learn, "fade": learn}
+    key_init, key_stream, key = jax.random.split(jax.random.key(seed), 3)
+    agent, size = self.plain, self.plain.size
+    train = jax.vmap(agent.init)(jax.random.split(key_init, seeds))
+    keys = jax.random.split(key_stream, (seeds, config.envs))
+    streams = nest(lambda k: start(env, agent, fault, k), 0, 0)(keys)
+    empty = replay_lib.init(config.envs, config.capacity, len(spec.obs), len(spec.act), size.deter, size.stoch)
+    replay = jax.tree.map(lambda x: jnp.broadcast_to(x, (seeds,) + x.shape).copy(), empty)
+    self.state = Learner(train, streams, replay, key)
+    self.returns = Returns((seeds, config.envs))
+    self._add = jax.jit(jax.vmap(replay_lib.add), donate_argnums=0)
+    self.checkpoints = checkpoint.Checkpoints(self.out / "checkpoints")
+
+  # ---- phases --------------------------------------------------------------------------------------------------------------------
+
+  @property
+  def updates(self) -> int:
+    return int(self.state.train.updates[0])
+
+  def _drive(self):
+    drive = np.zeros((self.seeds, self.config.envs), bool)
+    if self.phase != "pure":
+      drive[:, :round(self.config.demo_share * self.config.envs)] = True
+    return drive
+
+  def _weights(self) -> Weights:
+    done, c = self.updates, self.config
+    left = c.updates - done
+    lr = 1.0 if c.lr_end is None else float(np.interp(left, [0, max(1, c.pure)], [c.lr_end / self.dreamer.lr, 1.0]))
+    if self.phase == "clone":
+      return Weights(c.clone_weight, 0.0, lr)
+    if self.phase == "fade":
+      return Weights(c.clone_weight * max(0.0, 1.0 - (done - self.phase_start) / c.fade), 1.0, lr)
+    return Weights(0.0, 1.0, lr)
+
+  def _advance_phase(self) -> None:
+    c, done = self.config, self.updates
+    if self.phase == "clone":
+      good = len(self.own) >= 16 and np.mean(self.own[-16:]) >= c.clone_until * self.expert_return > 0
+      if good or done - self.phase_start >= c.clone or c.updates - done <= c.fade + c.pure:
+        self._enter("fade")
+    elif self.phase == "fade" and (done - self.phase_start >= c.fade or c.updates - done <= c.pure):
+      self._enter("pure")
+      self.state = self.state._replace(replay=jax.jit(replay_lib.clear, donate_argnums=0)(self.state.replay))
+
+  def _enter(self, phase: str) -> None:
+    self.phase, self.phase_start = phase, self.updates
+
+  # ---- one chunk -----------------------------------------------------------------------------------------------------------------
+
+  def step(self) -> dict:
+    """Collects one chunk, takes the updates that it pays for, returns a row of metrics."""
+    begin = time.monotonic()
+    drive = self._drive()
+    streams, rows = self.collect[self.phase].chunk(self.state.train.params, self.state.streams, CHUNK, drive)
+    replay = self._add(self.state.replay, *records(rows))
+    self.state = self.state._replace(streams=streams, replay=replay)
+    expert_returns, own = [], []
+    for at, value in self.returns.add(rows):
+      (expert_returns if drive[at] else own).append(value)
+    self.own = (self.own + own)[-200:]
+    if expert_returns:
+      self.expert_return = float(np.mean(expert_returns)) if not self.expert_return else 0.8 * self.expert_return + 0.2 * float(np.mean(expert_returns))
+    collected = time.monotonic()
+    row = {"updates": self.updates, "records": int(np.sum(np.asarray(self.state.streams.t))) // self.config.repeat // self.seeds, "phase": self.phase,
+           "return": float(np.mean(own)) if own else None, "episodes": len(own), "expert_return": self.expert_return or None}
+    size = self.dreamer.batch * self.dreamer.length
+    enough = int(np.min(jax.vmap(lambda r: replay_lib.windows(r, self.dreamer.length + 1))(self.state.replay))) >= size
+    if enough:
+      self.owed += CHUNK * self.config.envs * self.config.ratio / size
+      count = min(int(self.owed), self.config.updates - self.updates)
+      self.owed -= int(self.owed)
+      count = 1 << (count.bit_length() - 1) if count else 0  # few static lengths: the rest is owed
+      if count:
+        key, key_learn = jax.random.split(self.state.key)
+        train, replay, metrics = self.learn[self.phase](self.state.train, self.state.replay, key_learn, self._weights(), count)
+        self.state = self.state._replace(train=train, replay=replay, key=key)
+        row |= {k: float(np.mean(v)) for k, v in metrics.items()}
+        if not all(np.isfinite(v) for k, v in row.items() if isinstance(v, float)):
+          raise FileError(f"numeric failure at update {self.updates}: a metric is not finite; the last checkpoint is intact, --resume goes on from it")
+    end = time.monotonic()
+    self.seconds += end - begin
+    row |= {"updates": self.updates, "seconds": self.seconds, "collect_s": collected - begin, "learn_s": end - collected}
+    self.rows.append(row)
+    self._advance_phase()
+    return row
+
+  @property
+  def done(self) -> bool:
+    return self.updates >= self.config.updates
+
+  # ---- files ---------------------------------------------------------------------------------------------------------------------
+
+  def save(self) -> None:
+    """Checkpoint (arrays with replay) and metrics.parquet."""
+    meta = {"phase": self.phase, "phase_start": self.phase_start, "owed": self.owed, "own": self.own, "expert_return": self.expert_return,
+            "sums": self.returns.sums.tolist(), "seconds": self.seconds}
+    self.checkpoints.save(len(self.rows), self.state, meta)
+    self.write_metrics()
+
+  def write_metrics(self) -> None:
+    import pyarrow
+    import pyarrow.parquet
+    if self.rows:
+      names = sorted(set().union(*self.rows))
+      table = pyarrow.table({n: pyarrow.array([r.get(n) for r in self.rows]) for n in names})
+      tmp = self.out / "metrics.parquet.tmp"
+      pyarrow.parquet.write_table(table, tmp)
+      os.replace(tmp, self.out / "metrics.parquet")
+
+  def resume(self) -> None:
+    """Goes on from the newest checkpoint."""
+    import pyarrow.parquet
+    self.state, meta = self.checkpoints.load(self.state)
+    self.phase, self.phase_start, self.owed, self.own = meta["phase"], meta["phase_start"], meta["owed"], meta["own"]
+    self.expert_return, self.returns.sums, self.seconds = meta["expert_return"], np.asarray(meta["sums"]), meta["seconds"]
+    path = self.out / "metrics.parquet"
+    if path.exists():
+      self.rows = pyarrow.parquet.read_table(path).to_pylist()[:self.checkpoints.latest()]
+
+
+def write_config(out: pathlib.Path, values: dict) -> None:
+  """Writes OUT/config.json to a temporary name and renames it."""
+  out.mkdir(parents=True, exist_ok=True)
+  tmp = out / "config.json.tmp"
+  tmp.write_text(json.dumps(values, indent=1, default=lambda x: dataclasses.asdict(x) if dataclasses.is_dataclass(x) else str(x)))
+  os.replace(tmp, out / "config.json")
+
+
+def run(trainer: Trainer, progress=lambda row: None, save_every_s: float = 240.0) -> None:
+  """Trains to the end, saving every `save_every_s` seconds, at the end, and when interrupted."""
+  saved = time.monotonic()
+  try:
+    while not trainer.done:
+      progress(trainer.step())
+      if time.monotonic() - saved > save_every_s:
+        trainer.save()
+        saved = time.monotonic()
+  finally:
+    if trainer.rows and trainer.checkpoints.latest() != len(trainer.rows):
+      trainer.save()

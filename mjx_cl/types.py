@@ -1,0 +1,75 @@
+"""Values that more than one package passes around. All are pytrees of one robot, one stream; callers vmap."""
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+
+
+class Model(NamedTuple):
+  """What a fault may change.
+
+  Attributes:
+    mj: MuJoCo field name -> array in MjModel's own layout and units, e.g. `actuator_gear` (nu, 6).
+    task: whatever is no MuJoCo field (motor law, reward weights), name -> array.
+  """
+  mj: dict[str, jax.Array]
+  task: dict[str, jax.Array]
+
+
+class Step(NamedTuple):
+  """What arriving at a state brings.
+
+  Attributes:
+    obs: float32 (obs_size,), the first one of the next episode where a caller has reset the robot.
+    reward: float32 (), of arriving.
+    terminated: bool (), an end that is worth nothing from here on (a fall where the task ends on one).
+    truncated: bool (), the time limit; the value of what would have followed still counts.
+    final_obs: float32 (obs_size,), the observation arrived at, also when `obs` belongs to a new episode.
+  """
+  obs: jax.Array
+  reward: jax.Array
+  terminated: jax.Array
+  truncated: jax.Array
+  final_obs: jax.Array
+
+
+class Var(NamedTuple):
+  """One scalar of an observation or action: name, unit and bounds."""
+  name: str
+  unit: str
+  low: float = float("-inf")
+  high: float = float("inf")
+
+
+class Spec(NamedTuple):
+  """What a task is, in numbers a reader can check.
+
+  Attributes:
+    name: registry name.
+    obs, act: one Var per scalar, in the order of the arrays.
+    control_s: control period [s].
+    episode_steps: control steps until truncation.
+    acceptance: mean reward per control step from which the task counts as done well enough [reward].
+    posture: index into obs and the least mean value that counts as upright, or None where no posture is asked for.
+    targets: what a joint-wise fault can name, in actuator order.
+  """
+  name: str
+  obs: tuple[Var, ...]
+  act: tuple[Var, ...]
+  control_s: float
+  episode_steps: int
+  acceptance: float
+  posture: tuple[int, float] | None
+  targets: tuple[str, ...]
+
+
+class EnvState(NamedTuple):
+  """State of one robot.
+
+  Attributes:
+    physics: backend state; opaque.
+    step: int32 (), control steps since the reset.
+  """
+  physics: Any
+  step: jax.Array
