@@ -9,6 +9,22 @@ from mjx_cl.dreamer.sizes import SIZES
 from mjx_cl.errors import UserError, choose
 
 
+def positive(config, *names: str) -> None:
+  """Raises unless every named field is a finite number above 0."""
+  for name in names:
+    value = getattr(config, name)
+    if not (math.isfinite(value) and value > 0):
+      raise UserError(f"{name} must be above 0; got {value}")
+
+
+def fraction(config, *names: str) -> None:
+  """Raises unless every named field lies in [0, 1]."""
+  for name in names:
+    value = getattr(config, name)
+    if not 0.0 <= value <= 1.0:  # also false for nan
+      raise UserError(f"{name} must lie in [0, 1]; got {value}")
+
+
 @dataclass(frozen=True)
 class DreamerConfig:
   """The learner. Defaults are the authors' (facts of danijar/dreamerv3 at e3f0224) except `size`.
@@ -97,20 +113,101 @@ class TrainConfig:
       raise UserError(f"clone + fade + pure = {self.clone + self.fade + self.pure} exceeds updates = {self.updates}")
 
 
-def positive(config, *names: str) -> None:
-  """Raises unless every named field is a finite number above 0."""
-  for name in names:
-    value = getattr(config, name)
-    if not (math.isfinite(value) and value > 0):
-      raise UserError(f"{name} must be above 0; got {value}")
+@dataclass(frozen=True)
+class AdaptConfig:
+  """When adaptation starts, how it runs and when it ends. Chosen on seeds 100 to 109.
+
+  Attributes:
+    ratio: replayed steps per post-alarm record, 16 in the paper.
+    start_windows: windows that the post-alarm replay must hold before the first update.
+    lr: learning rate while adapting, None: the agent's own.
+    patience: length over which every signal must be settled [chunks of 64 decisions].
+    trend: largest difference of the means of the first and second half of that length [share of the level].
+    fluctuation: largest standard deviation over that length [share of the level], or
+    excess: ... that many times the nominal deviation, whichever is larger.
+    near: OPR and RPR also count as settled while at most this many times their nominal mean.
+    least: steps of adaptation before it may converge [control steps].
+    acceptance: mean reward per control step over the patience that counts as recovered, None: the task's own.
+    give_up: steps after which "no settling in sight" may be declared [control steps].
+    budget: most steps of adaptation [control steps].
+    warmup: control steps at the start of a run before alarms are acted on and nominal levels are taken.
+    refit: control steps on which the detector's reference is refitted after convergence.
+  """
+  ratio: float = 16.0
+  start_windows: int = 1024
+  lr: float | None = None
+  patience: int = 32
+  trend: float = 0.25
+  fluctuation: float = 0.5
+  excess: float = 2.0
+  near: float = 1.5
+  least: int = 4000
+  acceptance: float | None = None
+  give_up: int = 12_000
+  budget: int = 19_000
+  warmup: int = 1000
+  refit: int = 2000
+
+  def __post_init__(self):
+    positive(self, "ratio", "start_windows", "trend", "fluctuation", "excess", "near", "least", "give_up", "budget", "refit")
+    if self.patience < 4:
+      raise UserError(f"patience must be at least 4 chunks; got {self.patience}")
+    if self.lr is not None:
+      positive(self, "lr")
 
 
-def fraction(config, *names: str) -> None:
-  """Raises unless every named field lies in [0, 1]."""
-  for name in names:
-    value = getattr(config, name)
-    if not 0.0 <= value <= 1.0:  # also false for nan
-      raise UserError(f"{name} must lie in [0, 1]; got {value}")
+ARMS = {"detector": "finetuning starts on the detector's alarm", "none": "no adaptation; alarms are logged"}
+
+
+@dataclass(frozen=True)
+class RunConfig:
+  """One run of the loop: arms x seeds streams, each with its own fault.
+
+  Attributes:
+    env, fault, target, severity, onset, duration: which robot meets what, when [control steps]. target None: drawn from the stream's seed.
+    steps: control steps in all, counted from 0.
+    seeds, first_seed: streams per arm; their seeds are first_seed, first_seed + 1, ...
+    detector, settings: name and keyword settings.
+    arms: names out of ARMS.
+    agent: shipped name or folder, None: the shipped agent of the robot.
+    physics: auto, native or mjx.
+    form, actions: of the residual (monitor.Monitor).
+    deterministic: act by the policy's mean.
+  """
+  env: str
+  fault: str = "gear"
+  target: str | None = None
+  severity: float = 0.5
+  onset: int = 5000
+  duration: int | None = None
+  steps: int = 25_000
+  seeds: int = 10
+  first_seed: int = 0
+  detector: str = "rolling_sigma"
+  settings: dict = field(default_factory=dict)
+  arms: tuple[str, ...] = ("detector", "none")
+  agent: str | None = None
+  physics: str = "auto"
+  form: str = "paper"
+  actions: str = "recorded"
+  deterministic: bool = False
+  adapt: AdaptConfig = AdaptConfig()
+
+  def __post_init__(self):
+    fraction(self, "severity")
+    positive(self, "steps", "seeds")
+    if self.first_seed < 0:
+      raise UserError(f"first_seed must be at least 0; got {self.first_seed}")
+    if not 0 <= self.onset <= self.steps:
+      raise UserError(f"onset must lie in 0..steps={self.steps}; got {self.onset}")
+    if self.duration is not None:
+      positive(self, "duration")
+    for arm in self.arms:
+      choose("arm", arm, ARMS)
+    if not self.arms or len(set(self.arms)) != len(self.arms):
+      raise UserError(f"name each arm once; got {', '.join(self.arms) or 'none'}")
+    if self.physics not in ("auto", "native", "mjx"):
+      raise UserError(f"unknown physics {self.physics!r}; choose from: auto, native, mjx")
 
 
 @dataclass(frozen=True)

@@ -54,6 +54,8 @@ def setup() -> None:
   flags = xla_flags(importlib.metadata.version("jaxlib"), os.environ.get("XLA_FLAGS", ""))
   if flags:
     os.environ["XLA_FLAGS"] = flags
+  # XLA's loader prints an error of a page for each cached program over two pseudo features of the compiler that no CPU reports
+  os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
   import jax
   jax.config.update("jax_cpu_enable_async_dispatch", False)
   folder = cache_dir()

@@ -6,6 +6,7 @@ import functools
 import json
 import os
 import pathlib
+import sys
 import time
 from typing import Any, NamedTuple
 
@@ -16,10 +17,11 @@ import numpy as np
 from mjx_cl import checkpoint, demonstrator, faults, replay as replay_lib
 from mjx_cl.config import DreamerConfig, TrainConfig
 from mjx_cl.dreamer.agent import Agent, TrainState, Weights
-from mjx_cl.errors import FileError
+from mjx_cl.errors import FileError, UserError
 from mjx_cl.rollout import Rollout, Stream, nest, records, start
 
 CHUNK = 64  # decisions between two rounds of updates
+DEMONSTRATOR_STEPS = 8_000_000
 
 
 class Learner(NamedTuple):
@@ -224,12 +226,59 @@ class Trainer:
       self.rows = pyarrow.parquet.read_table(path).to_pylist()[:self.checkpoints.latest()]
 
 
-def write_config(out: pathlib.Path, values: dict) -> None:
-  """Writes OUT/config.json to a temporary name and renames it."""
-  out.mkdir(parents=True, exist_ok=True)
-  tmp = out / "config.json.tmp"
-  tmp.write_text(json.dumps(values, indent=1, default=lambda x: dataclasses.asdict(x) if dataclasses.is_dataclass(x) else str(x)))
-  os.replace(tmp, out / "config.json")
+def build(env, dreamer: DreamerConfig, config: TrainConfig, out, seed: int, seeds: int, demonstrator_name: str | None, agent_name: str | None,
+          preset: str, command: str, resume: bool) -> Trainer:
+  """A Trainer with its folder and config.json; trains the demonstrator first where `demonstrator_name` is `ppo`."""
+  from mjx_cl import agents, store
+  out = pathlib.Path(out)
+  if demonstrator_name == "ppo":
+    path = out / "demonstrator" / "policy.npz"
+    if not path.exists():
+      demonstrator.train(env, out / "demonstrator", DEMONSTRATOR_STEPS, seed, progress=lambda row: print(
+          f"demonstrator: {row['step']:,} steps, return {row['return']:.0f}", file=sys.stderr, flush=True))
+      os.replace(sorted((out / "demonstrator").glob("policy_*.npz"))[-1], path)
+    config = dataclasses.replace(config, demonstrator=str(path))
+  elif demonstrator_name:
+    config = dataclasses.replace(config, demonstrator=demonstrator_name)
+  trainer = Trainer(env, dreamer, config, out, seed, seeds)
+  trainer.about = {"env": env.spec.name, "preset": preset, "command": command, "seed": seed, "repeat": config.repeat,
+                   "dreamer": dataclasses.asdict(dreamer), "train": dataclasses.asdict(config), "started_from": agent_name}
+  values = {"command": "train", **trainer.about, **store.provenance()}
+  if resume:
+    trainer.resume()
+  else:
+    if agent_name:
+      trained = agents.load(agent_name, env.spec.name, len(env.spec.obs), len(env.spec.act))
+      if trained.agent.config.size != dreamer.size:
+        raise UserError(f"agent {agent_name!r} has size {trained.agent.config.size}, this training {dreamer.size}")
+      spread = jax.tree.map(lambda x: jnp.broadcast_to(x, (seeds,) + x.shape).copy(), trained.train)
+      trainer.state = trainer.state._replace(train=spread._replace(updates=jnp.zeros_like(spread.updates)))
+    store.write_json(out / "config.json", values)
+  return trainer
+
+
+def export(trainer: Trainer, episodes: int = 20) -> dict:
+  """Writes OUT/agent of the first seed: weights, moments, counters, and the card with its returns. Returns the card."""
+  from mjx_cl import agents, evaluate, store
+  train = jax.tree.map(lambda x: x[0], trainer.state.train)
+  scores = {"first_seed": 0, **evaluate.evaluate(trainer.env, trainer.plain, train.params, episodes, 0, trainer.config.repeat)}
+  phases: dict[str, dict] = {}
+  for row in trainer.rows:
+    phase = phases.setdefault(row["phase"], {"first_update": row["updates"], "returns": []})
+    phase["last_update"] = row["updates"]
+    if row["return"] is not None:
+      phase["returns"].append(row["return"])
+  for phase in phases.values():  # own episodes of the training, about the last three rounds
+    phase["return_at_end"] = float(np.mean(phase["returns"][-3:])) if phase["returns"] else None
+    phase["return_at_start"] = float(np.mean(phase["returns"][:1])) if phase["returns"] else None
+    del phase["returns"]
+  kept = json.loads(json.dumps(trainer.about))
+  if kept["train"]["demonstrator"]:
+    kept["train"]["demonstrator"] = pathlib.Path(kept["train"]["demonstrator"]).name
+  card = {**kept, "updates": trainer.updates, "records": trainer.rows[-1]["records"], "seconds": round(trainer.seconds), "phases": phases,
+          "demonstrator_return": trainer.expert_return or None, "eval": scores, **store.provenance()}
+  agents.save(trainer.out / "agent", train, card)
+  return card
 
 
 def run(trainer: Trainer, progress=lambda row: None, save_every_s: float = 240.0) -> None:

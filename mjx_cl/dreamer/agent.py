@@ -308,6 +308,12 @@ class Agent:
     obs = nets.symexp(self._apply(params, "dec", deters, stochs))
     return obs, nets.two_hot_mean(self._apply(params, "rew", deters, stochs), self.bins)
 
+  def dream(self, params, deter, stoch, steps: int, key: jax.Array):
+    """As `open_loop`, with the actions that the policy imagines for itself."""
+    deters, stochs, _ = self.imagine(params, deter, stoch, key, steps)
+    obs = nets.symexp(self._apply(params, "dec", deters[1:], stochs[1:]))
+    return obs, nets.two_hot_mean(self._apply(params, "rew", deters[1:], stochs[1:]), self.bins)
+
 
 def categorical_entropy(logits):
   """Mean entropy [nats] summed over the categorical variables."""

@@ -7,6 +7,7 @@ result depends on what the batch object held before: XLA may repeat or reorder c
 from __future__ import annotations
 
 import threading
+import time
 
 import jax
 import jax.numpy as jnp
@@ -58,6 +59,7 @@ class Native:
     self._shapes = {o: np.shape(getattr(data, o)) for o in self.outputs}
     self._batches: dict[int, object] = {}
     self._lock = threading.Lock()
+    self.seconds = 0.0  # spent in callbacks since the start, for a run's wall_share
 
   def init(self, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
     """Row (uint32, opaque) of the model's initial state with qpos (nq,) and qvel (nv,). Makes no callback."""
@@ -73,6 +75,7 @@ class Native:
     return jax.pure_callback(self._host_step, result, fields, state, ctrl, vmap_method="broadcast_all")
 
   def _host_step(self, fields, state, ctrl):
+    begin = time.perf_counter()
     state = np.asarray(state)
     lead, width = state.shape[:-1], state.shape[-1]
     num = int(np.prod(lead, dtype=np.int64))
@@ -85,7 +88,9 @@ class Native:
         view[...] = np.asarray(value).reshape(view.shape)
       batch.step(nstep=self.substeps)
       out = {o: np.array(views["out " + o], np.float32).reshape(lead + self._shapes[o]) for o in self.outputs}
-      return np.array(views["state"]).view(np.uint32).reshape(lead + (width,)), out
+      rows = np.array(views["state"]).view(np.uint32).reshape(lead + (width,))
+      self.seconds += time.perf_counter() - begin
+      return rows, out
 
   def _batch(self, num: int, fields: tuple[str, ...]):
     key = (num, fields)

@@ -1,0 +1,37 @@
+"""Have six signals settled? A pure test over a ring of chunk values."""
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from mjx_cl.config import AdaptConfig
+
+SIGNALS = ("opr", "rpr", "reward", "dyn_loss", "adv_mag", "value_loss")
+
+
+def settled(ring: jax.Array, count: jax.Array, nominal_mean: jax.Array, nominal_std: jax.Array, config: AdaptConfig) -> jax.Array:
+  """Which signals show neither trend nor excess fluctuation over the ring.
+
+    level      = mean of the ring
+    trend      : |mean(second half) - mean(first half)| <= trend level
+    fluctuation: std(ring) <= max(fluctuation level, excess nominal_std)
+    OPR, RPR   : also settled while level <= near nominal_mean
+
+  Args:
+    ring: float32 (patience, 6), one row per chunk in any rotation, SIGNALS along the last axis; nan rows are left out.
+    count: int32 (), rows ever written; fewer than `patience` means not settled.
+    nominal_mean, nominal_std: float32 (6,).
+  Returns:
+    bool (6,).
+  """
+  size = ring.shape[0]
+  order = jnp.arange(size)
+  ring = ring[(count + order) % size]  # oldest first
+  half = size // 2
+  level = jnp.nanmean(ring, 0)
+  trend = jnp.abs(jnp.nanmean(ring[half:], 0) - jnp.nanmean(ring[:half], 0))
+  scale = jnp.abs(level)
+  calm = jnp.nanstd(ring, 0) <= jnp.maximum(config.fluctuation * scale, config.excess * nominal_std)
+  steady = (trend <= config.trend * scale) & calm
+  residual = jnp.arange(len(SIGNALS)) < 2
+  return (steady | (residual & (level <= config.near * nominal_mean))) & (count >= size)

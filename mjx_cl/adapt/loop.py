@@ -1,0 +1,179 @@
+"""What happens to a chunk of rows: residuals, alarms, signals, phase, replay, updates. One jitted program without callbacks.
+
+Streams are groups of one member: each has its own parameters. A stream that is not adapting costs no update.
+"""
+from __future__ import annotations
+
+import functools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from mjx_cl import replay as replay_lib
+from mjx_cl.adapt import phase as phase_lib
+from mjx_cl.config import AdaptConfig
+from mjx_cl.dreamer.agent import Agent, Batch, TrainState
+from mjx_cl.monitor import History, Monitor, Residual
+from mjx_cl.rollout import records
+
+
+class LoopState(NamedTuple):
+  """Everything of a run but the streams; leading (groups,) unless said.
+
+  Attributes:
+    train: TrainState of each stream.
+    replay: Replay with one environment each, post-alarm records only.
+    history: monitor history, leading (n - 1, groups, 1).
+    detector: state of the detector.
+    phase: PhaseState.
+    past: Residual of the last `refit` rows, leading (refit, groups).
+    owed: float32, fraction of an update that is due.
+    executed: int32, updates taken since the run began.
+  """
+  train: TrainState
+  replay: replay_lib.Replay
+  history: History
+  detector: Any
+  phase: phase_lib.PhaseState
+  past: Residual
+  owed: jax.Array
+  executed: jax.Array
+
+
+class Digest(NamedTuple):
+  """What the host logs of a chunk: rows (T, groups) and values (groups,)."""
+  residual: Residual
+  score: jax.Array
+  fired: jax.Array
+  signals: jax.Array
+  settled: jax.Array
+  phase: jax.Array
+  decision: jax.Array
+  since: jax.Array
+  updates: jax.Array
+
+
+class Loop:
+  """Monitor, detector, phase machine and learner of a run.
+
+  Args:
+    agent: Agent whose config holds the learning rate of adaptation.
+    monitor, detector: what watches.
+    spec: of the environment (acceptance, posture).
+    repeat: control steps per decision.
+    capacity: post-alarm records kept per stream.
+  """
+
+  def __init__(self, agent: Agent, monitor: Monitor, detector, spec, config: AdaptConfig, repeat: int = 1, capacity: int = 20_480):
+    self.agent, self.monitor, self.detector, self.spec = agent, monitor, detector, spec
+    self.config, self.repeat, self.capacity = config, repeat, capacity
+    self.digest = jax.jit(self._digest, donate_argnums=0)
+
+  def init(self, train: TrainState, groups: int) -> LoopState:
+    """State before the first step; `train` is the shipped agent, the same for every stream."""
+    a = self.agent
+    spread = lambda tree: jax.tree.map(lambda x: jnp.broadcast_to(x, (groups,) + x.shape).copy(), tree)
+    empty = replay_lib.init(1, self.capacity, a.obs_size, a.act_size, a.size.deter, a.size.stoch)
+    rows = max(1, self.config.refit // self.repeat)
+    past = Residual(jnp.zeros((rows, groups)), jnp.zeros((rows, groups)), jnp.zeros((rows, groups, a.obs_size)), jnp.zeros((rows, groups), bool))
+    return LoopState(spread(train), spread(empty), self.monitor.init(groups, 1), spread(self.detector.init()), spread(phase_lib.init(self.config)),
+                     past, jnp.zeros(groups), jnp.zeros(groups, jnp.int32))
+
+  def _digest(self, state: LoopState, rows, now, acts, keys):
+    """One chunk.
+
+    Args:
+      rows: rollout.Row, leading (T, groups, 1). now: int32 (), control steps done after the chunk. acts: bool (groups,).
+      keys: (groups,), each stream's own, so that what a stream draws does not depend on its neighbours.
+    Returns:
+      (state', Digest).
+    """
+    split = jax.vmap(lambda key: jax.random.split(jax.random.fold_in(key, now), 3))(keys)
+    key_monitor, key_eval, key_update = split[:, 0], split[:, 1], split[:, 2]
+    length = rows.reward.shape[0]
+    before = state.history
+    history, residual = self.monitor.update(state.train.params, state.history, rows, key_monitor)
+    residual = jax.tree.map(lambda x: x[:, :, 0], residual)
+    detector, alarms = jax.lax.scan(jax.vmap(self.detector.update), state.detector, residual)
+    past = jax.tree.map(lambda a, b: jnp.concatenate([a, b])[-a.shape[0]:], state.past, residual)
+
+    dyn, adv, value = self._evaluate(state.train, before, rows, key_eval)
+    reward = jnp.mean(rows.rewards, (0, 2, 3))
+    signals = jnp.stack([jnp.nanmean(residual.opr, 0), jnp.nanmean(residual.rpr, 0), reward, dyn, adv, value], -1)
+    index, least_posture = self.spec.posture or (0, -jnp.inf)
+    posture = jnp.mean(rows.final_obs[:, :, 0, index], 0)
+
+    chunk_start = now - length * self.repeat
+    first = jnp.argmax(alarms.fired, 0)
+    alarm_step = chunk_start + (first + 1) * self.repeat - 1
+    acceptance = self.spec.acceptance if self.config.acceptance is None else self.config.acceptance
+    step = functools.partial(phase_lib.update, config=self.config)
+    was = state.phase.phase
+    phase, decision, ok = jax.vmap(step, (0, 0, 0, 0, 0, None, 0, None, None))(
+        state.phase, signals, posture, jnp.any(alarms.fired, 0), alarm_step, now, acts, acceptance, least_posture)
+
+    # replay holds what came after the alarm and nothing else
+    begins = decision == phase_lib.START
+    replay = jax.tree.map(lambda a, b: jnp.where(begins.reshape((-1,) + (1,) * (a.ndim - 1)), a, b), *self._counts(state.replay))
+    keep = jnp.where(begins[None], jnp.arange(length)[:, None] > first[None], (was == phase_lib.ADAPTING)[None])
+    new, exist = records(rows)
+    exist = exist & jnp.repeat(keep.T, 2, axis=1)[:, None]
+    replay = jax.vmap(replay_lib.add)(state.replay._replace(count=replay[0], queue=replay[1]), new, exist)
+
+    c = self.agent.config
+    windows = jax.vmap(lambda r: replay_lib.windows(r, c.length + 1))(replay)
+    due = (phase.phase == phase_lib.ADAPTING) & (windows >= self.config.start_windows)
+    owed = jnp.where(due, state.owed + length * self.config.ratio / (c.batch * c.length), 0.0)
+    number = jnp.floor(owed + 1e-6).astype(jnp.int32)
+    train, replay = self._learn(state.train, replay, key_update, number)
+
+    # a stream that has converged watches again, its reference refitted on the latest rows
+    detector = jax.lax.cond(jnp.any(decision == phase_lib.STOP), self._refit, lambda d, p, s: d, detector, past, decision == phase_lib.STOP)
+    state = LoopState(train, replay, history, detector, phase, past, owed - number, state.executed + number)
+    return state, Digest(residual, alarms.score, alarms.fired, signals, ok, phase.phase, decision, phase.since, state.executed)
+
+  @staticmethod
+  def _counts(replay):
+    return (jnp.zeros_like(replay.count), jnp.zeros_like(replay.queue)), (replay.count, replay.queue)
+
+  def _evaluate(self, train: TrainState, before: History, rows, keys):
+    """Dynamics loss, advantage magnitude and value loss (groups,) on the chunk just lived, without gradient.
+
+    The ring of recent data is the chunk itself with the last record before it as context, so an alarm leaves nothing old in it.
+    """
+    join = lambda old, new: jnp.concatenate([old[-1:].astype(new.dtype), new])[:, :, 0].swapaxes(0, 1)[:, None]  # (groups, 1, 1 + T, ...)
+    done = rows.terminated | rows.truncated
+    deter, stoch, action = join(before.deter, rows.deter), join(before.stoch, rows.stoch), join(before.action, rows.action)
+    obs, reward, first = join(before.obs, rows.obs), join(before.reward, rows.reward_in), join(before.done, rows.first)
+    first = first.at[:, :, 0].set(True)
+    last = jnp.concatenate([first[:, :, 1:], jnp.zeros_like(first[:, :, :1])], 2)
+    terminal = jnp.concatenate([jnp.zeros_like(first[:, :, :1]), jnp.zeros_like(done[:, :, 0].T[:, None])], 2)
+    batch = Batch(obs, action, reward, first, last, terminal, deter, stoch, jnp.zeros_like(action), jnp.zeros_like(first))
+
+    def one(train, batch, key):
+      metrics = self.agent.loss(train.params, train.slow, train.range, batch, key)[1][0]
+      return metrics["loss/dyn"], metrics["adv_mag"], metrics["loss/value"]
+    return jax.vmap(one)(train, batch, keys)
+
+  def _learn(self, train: TrainState, replay, keys, number):
+    """`number` (groups,) updates for each stream. Nested loops with their own trip counts: the carry is changed in place, so a stream
+    without an update costs neither arithmetic nor a copy (`vmap` would compute all, `lax.map` would copy all)."""
+    c = self.agent.config
+    take = lambda tree, g: jax.tree.map(lambda x: jax.lax.dynamic_index_in_dim(x, g, keepdims=False), tree)
+    put = lambda tree, g, value: jax.tree.map(lambda x, v: jax.lax.dynamic_update_index_in_dim(x, v, g, 0), tree, value)
+
+    def stream(g, state):
+      def update(i, state):
+        train, replay = state
+        key_sample, key_update = jax.random.split(jax.random.fold_in(keys[g], i))
+        own, data, address = replay_lib.sample(take(replay, g), key_sample, c.batch, c.length + 1)
+        learnt, _, latents = self.agent.update(take(train, g), data, key_update)
+        return put(train, g, learnt), put(replay, g, replay_lib.refresh(own, address, latents))
+      return jax.lax.fori_loop(0, number[g], update, state)
+    return jax.lax.fori_loop(0, number.shape[0], stream, (train, replay))
+
+  def _refit(self, detector, past, stop):
+    fresh = jax.tree.map(lambda x: jnp.broadcast_to(x, (stop.shape[0],) + x.shape), self.detector.init())
+    fresh, _ = jax.lax.scan(jax.vmap(self.detector.update), fresh, past)
+    return jax.tree.map(lambda a, b: jnp.where(stop.reshape((-1,) + (1,) * (a.ndim - 1)), a, b), fresh, detector)

@@ -1,0 +1,102 @@
+"""The phase of one stream: nominal --alarm--> adapting --> converged | aborted. One call per chunk, every decision has a reason."""
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from mjx_cl.adapt.convergence import SIGNALS, settled
+from mjx_cl.config import AdaptConfig
+
+NOMINAL, ADAPTING, CONVERGED, ABORTED = range(4)
+PHASES = ("nominal", "adapting", "converged", "aborted")
+# decisions of a chunk
+NOTHING, START, STOP, ABORT_BELOW, ABORT_HOPELESS, ABORT_BUDGET = range(6)
+REASONS = ("", "alarm", "all six signals settled, task acceptable", "settled below acceptance", "no settling in sight", "budget spent")
+
+
+class PhaseState(NamedTuple):
+  """Attributes:
+    phase: int32 (). since: int32 (), control step of the alarm. ring (patience, 6), count (): chunk signals since the alarm.
+    best, best_at: float32 (), int32 (): highest reward over a patience since the alarm, and when it was reached.
+    mean, square, number: running moments of the nominal signals, (6,), (6,), (6,).
+    posture (patience,): mean posture per chunk.
+  """
+  phase: jax.Array
+  since: jax.Array
+  ring: jax.Array
+  count: jax.Array
+  best: jax.Array
+  best_at: jax.Array
+  mean: jax.Array
+  square: jax.Array
+  number: jax.Array
+  posture: jax.Array
+
+
+def init(config: AdaptConfig) -> PhaseState:
+  """A nominal stream that knows nothing."""
+  six = jnp.zeros(len(SIGNALS))
+  zero = jnp.int32(0)
+  return PhaseState(zero, zero, jnp.full((config.patience, len(SIGNALS)), jnp.nan), zero, jnp.float32(-jnp.inf), zero, six, six, six,
+                    jnp.zeros(config.patience))
+
+
+def nominal_std(state: PhaseState) -> jax.Array:
+  """Deviation of the nominal chunk signals, (6,)."""
+  return jnp.sqrt(jnp.maximum(0.0, state.square / jnp.maximum(1.0, state.number - 1.0)))
+
+
+def update(state: PhaseState, signals, posture, alarm, alarm_step, now, acts, acceptance, least_posture, config: AdaptConfig):
+  """One chunk.
+
+  Args:
+    signals: float32 (6,), means over the chunk in the order of SIGNALS, nan where unknown.
+    posture: float32 (), mean posture over the chunk.
+    alarm, alarm_step: bool (), an alarm fell in this chunk, at which control step.
+    now: int32 (), control steps done after this chunk.
+    acts: bool (), the stream's arm acts on alarms.
+    acceptance, least_posture: float32 (), levels of the task.
+  Returns:
+    (state', decision int32 (), settled bool (6,)).
+  """
+  watching = (state.phase == NOMINAL) | (state.phase == CONVERGED)
+  begins = watching & alarm & acts & (now > config.warmup)
+  adapting = state.phase == ADAPTING
+
+  # nominal levels: Welford, until the first adaptation
+  learns = (state.phase == NOMINAL) & ~begins & (now > config.warmup) & ~jnp.isnan(signals)
+  number = state.number + learns
+  delta = jnp.where(learns, signals - state.mean, 0.0)
+  mean = state.mean + delta / jnp.maximum(1.0, number)
+  square = state.square + delta * jnp.where(learns, signals - mean, 0.0)
+
+  slot = state.count % config.patience
+  ring = jnp.where(adapting, state.ring.at[slot].set(signals), state.ring)
+  postures = jnp.where(adapting, state.posture.at[slot].set(posture), state.posture)
+  count = state.count + adapting
+  state = state._replace(ring=ring, count=count, posture=postures, mean=mean, square=square, number=number)
+
+  age = now - state.since
+  ok = settled(ring, count, mean, nominal_std(state), config)
+  reward = jnp.nanmean(ring[:, SIGNALS.index("reward")])
+  accepted = (reward >= acceptance) & (jnp.mean(postures) >= least_posture)
+  full = adapting & (count >= config.patience) & (age >= config.least)
+  # progress: the reward over the patience has not risen by 5 % of acceptance above its best for a third of `give_up`
+  better = full & (reward > state.best + 0.05 * acceptance)
+  best = jnp.where(better, reward, state.best)
+  best_at = jnp.where(better, now, state.best_at)
+  stuck = full & (age >= config.give_up) & (now - best_at >= config.give_up // 3) & ~accepted
+
+  stop = full & jnp.all(ok) & accepted
+  below = full & jnp.all(ok) & ~accepted & stuck
+  hopeless = stuck & ~below
+  spent = adapting & (age >= config.budget) & ~stop & ~stuck
+  decision = jnp.select([begins, stop, below, hopeless, spent], [START, STOP, ABORT_BELOW, ABORT_HOPELESS, ABORT_BUDGET], NOTHING)
+  phase = jnp.select([begins, stop, below | hopeless | spent], [ADAPTING, CONVERGED, ABORTED], state.phase)
+  state = state._replace(
+      phase=phase.astype(jnp.int32), since=jnp.where(begins, alarm_step, state.since).astype(jnp.int32), best=jnp.where(begins, -jnp.inf, best),
+      best_at=jnp.where(begins, now, best_at).astype(jnp.int32), count=jnp.where(begins, 0, state.count).astype(jnp.int32),
+      ring=jnp.where(begins, jnp.nan, state.ring))
+  return state, decision.astype(jnp.int32), ok

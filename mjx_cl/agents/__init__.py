@@ -1,0 +1,103 @@
+"""Trained agents: one folder each with `agent.npz` (arrays, never unpickled) and `card.json` (how it was made, what it scores).
+
+Names of the shipped ones are the folders beside this file; a path to any such folder works too.
+"""
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import pathlib
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import ml_dtypes
+import numpy as np
+
+from mjx_cl.config import DreamerConfig
+from mjx_cl.dreamer.agent import Agent, TrainState
+from mjx_cl.errors import FileError, UserError
+
+HERE = pathlib.Path(__file__).parent
+_HALF = "|bfloat16"  # suffix of a moment that is stored as the upper half of its float32
+
+
+class Trained(NamedTuple):
+  """A loaded agent. `card` is its JSON card: env, preset, repeat, dreamer (config), command, returns, ..."""
+  agent: Agent
+  train: TrainState
+  card: dict
+  path: str
+
+
+def shipped() -> list[str]:
+  """Names of the agents inside the package."""
+  return sorted(p.parent.name for p in HERE.glob("*/card.json"))
+
+
+def _flatten(train: TrainState) -> dict[str, jax.Array]:
+  return {jax.tree_util.keystr(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(train)}
+
+
+def save(folder, train: TrainState, card: dict) -> None:
+  """Writes an agent of one seed: parameters and counters in full, optimiser moments as bfloat16 (they only steer step sizes)."""
+  folder = pathlib.Path(folder)
+  folder.mkdir(parents=True, exist_ok=True)
+  arrays = {}
+  for name, leaf in _flatten(train).items():
+    leaf = np.asarray(leaf)
+    if name.startswith(".opt") and leaf.dtype == np.float32 and leaf.ndim:
+      arrays[name + _HALF] = leaf.astype(ml_dtypes.bfloat16).view(np.uint16)
+    else:
+      arrays[name] = leaf
+  tmp = folder / "agent.tmp.npz"
+  np.savez_compressed(tmp, **arrays)
+  os.replace(tmp, folder / "agent.npz")
+  tmp = folder / "card.json.tmp"
+  tmp.write_text(json.dumps(card, indent=1) + "\n")
+  os.replace(tmp, folder / "card.json")
+
+
+def load(path: str | None, env_name: str, obs_size: int, act_size: int, lr: float | None = None) -> Trained:
+  """Loads an agent by shipped name or folder.
+
+  Args:
+    path: folder or shipped name; None: the shipped agent named as the environment.
+    env_name: robot that it must fit.
+    lr: learning rate to go on with, None: that of its own config at the end of its training.
+  Raises:
+    UserError for an agent of another robot or an unknown name; FileError for a broken or foreign file.
+  """
+  name = path or env_name
+  folder = pathlib.Path(name)
+  if not (folder / "card.json").exists():
+    folder = HERE / name
+  if not (folder / "card.json").exists():
+    raise UserError(f"no agent {name!r}; shipped: {', '.join(shipped()) or 'none'}; or give a folder that holds agent.npz and card.json")
+  try:
+    card = json.loads((folder / "card.json").read_text())
+    config = DreamerConfig(**card["dreamer"])
+  except (OSError, ValueError, KeyError, TypeError) as e:
+    raise FileError(f"{folder / 'card.json'} is not an agent's card: {e}") from None
+  if card.get("env") != env_name:
+    raise UserError(f"agent {name!r} was trained on {card.get('env')!r}, not on {env_name!r}")
+  if lr is not None:
+    config = dataclasses.replace(config, lr=lr)
+  agent = Agent(config, obs_size, act_size)
+  like = jax.eval_shape(agent.init, jax.random.key(0))
+  try:
+    with np.load(folder / "agent.npz", allow_pickle=False) as z:
+      arrays = {k: z[k] for k in z.files}
+  except Exception as e:  # zipfile, zlib and numpy each raise their own kind for a truncated file
+    raise FileError(f"cannot read {folder / 'agent.npz'}: {str(e).splitlines()[0] if str(e) else type(e).__name__}") from None
+  leaves = []
+  for leaf_path, want in jax.tree_util.tree_leaves_with_path(like):
+    key = jax.tree_util.keystr(leaf_path)
+    value = arrays.get(key)
+    if value is None and key + _HALF in arrays:
+      value = arrays[key + _HALF].view(ml_dtypes.bfloat16).astype(np.float32)
+    if value is None or value.shape != want.shape:
+      raise FileError(f"{folder / 'agent.npz'} does not fit size {config.size} with {obs_size} observations and {act_size} actions: {key}")
+    leaves.append(jnp.asarray(value, want.dtype))
+  return Trained(agent, jax.tree.unflatten(jax.tree.structure(like), leaves), card, str(folder))

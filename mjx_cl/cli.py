@@ -1,0 +1,431 @@
+"""The command line. Nothing here imports JAX before a command that computes runs, so `--help` answers at once.
+
+Exit codes: 0 done; 2 arguments, names, ranges, refused --out; 1 files, disk, numeric failure; 130 Ctrl-C, after state is saved.
+"""
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import io
+import json
+import os
+import re
+import signal
+import sys
+import time
+from dataclasses import dataclass
+from typing import Annotated
+
+import tyro
+
+from mjx_cl.config import ARMS, PRESETS, AdaptConfig, RunConfig, TrainConfig, replace
+from mjx_cl.errors import FileError, UserError, choose
+
+Positional = tyro.conf.Positional
+
+
+@dataclass(frozen=True)
+class Run:
+  """Lives the whole loop: fault, alarm, finetuning, stop; arms x seeds streams side by side.
+
+  Writes config.json, trace.parquet, events.parquet, runs.parquet, summary.json and figure.png into --out.
+  """
+  env: Positional[str]
+  """Robot, see `mjx-cl list envs`."""
+  out: str = "runs/latest"
+  """Result folder."""
+  fault: str = "gear"
+  """Fault, see `mjx-cl list faults`; `none` for the healthy robot."""
+  target: str = "random"
+  """Joint or part that the fault hits, `random`: drawn from the stream's seed."""
+  severity: float = 0.5
+  """In [0, 1]; 0 is nominal, 0.5 is the paper's gear halved."""
+  onset: int = 5000
+  """First control step that the fault acts in."""
+  duration: int | None = None
+  """Control steps until the fault is repaired; default: never."""
+  steps: int = 25_000
+  """Control steps in all, counted from 0."""
+  seeds: int = 10
+  """Streams per arm."""
+  first_seed: int = 0
+  """Seeds are first_seed, first_seed + 1, ..."""
+  detector: str = "rolling_sigma"
+  """Change detector, see `mjx-cl list detectors`."""
+  set: tuple[str, ...] = ()
+  """Detector settings, name=value ..."""
+  arm: tuple[str, ...] = ("detector", "none")
+  """Arms, see `mjx-cl list arms`."""
+  agent: str | None = None
+  """Trained agent: shipped name or folder."""
+  physics: str = "auto"
+  """auto, native or mjx."""
+  form: str = "paper"
+  """Residual form, paper or streaming."""
+  actions: str = "recorded"
+  """Actions of the monitor's predictions, recorded or policy."""
+  deterministic: bool = False
+  """Act by the policy's mean instead of a sample."""
+  adapt: AdaptConfig = AdaptConfig()
+  json: bool = False
+  """One JSON value on standard output, nothing else there."""
+  resume: bool = False
+  """Go on with a run that was cut off."""
+  overwrite: bool = False
+  """Replace an earlier run in --out."""
+
+
+@dataclass(frozen=True)
+class Train:
+  """Pretrains an agent; ends with OUT/agent (weights, card), which every --agent takes."""
+  env: Positional[str]
+  """Robot, see `mjx-cl list envs`."""
+  out: str = "runs/train"
+  """Folder for checkpoints, metrics.parquet and the agent."""
+  preset: str = "cpu"
+  """Learner and schedule, see `mjx-cl list presets`."""
+  demonstrator: str | None = None
+  """A policy's .npz, or `ppo`: train one first with brax (needs mjx-cl[brax]); default: none."""
+  agent: str | None = None
+  """Start from this agent's weights, moments and counters; the replay is filled by acting."""
+  set: tuple[str, ...] = ()
+  """Settings of learner or schedule, name=value ... (updates=20000 lr=1e-4)."""
+  seed: int = 0
+  seeds: int = 1
+  """Agents trained side by side; their parameters share one program."""
+  physics: str = "auto"
+  save_every_s: float = 240.0
+  """Seconds between checkpoints."""
+  json: bool = False
+  resume: bool = False
+  overwrite: bool = False
+
+
+@dataclass(frozen=True)
+class Eval:
+  """Return of an agent on the healthy robot."""
+  env: Positional[str]
+  episodes: int = 20
+  agent: str | None = None
+  seed: int = 0
+  """Episodes use seeds seed, seed + 1, ..."""
+  physics: str = "auto"
+  deterministic: bool = False
+  json: bool = False
+
+
+@dataclass(frozen=True)
+class Plot:
+  """Draws figure.png of a run anew."""
+  folder: Positional[str]
+
+
+@dataclass(frozen=True)
+class Query:
+  """SQL over a run's files: trace, events, runs are views."""
+  folder: Positional[str]
+  sql: Positional[str]
+  json: bool = False
+
+
+@dataclass(frozen=True)
+class List:
+  """Names that other commands take."""
+  what: Positional[str] = "all"
+  """envs, faults, detectors, presets, agents, arms or all."""
+  json: bool = False
+
+
+@dataclass(frozen=True)
+class Doctor:
+  """Versions, devices, physics backend, free memory and a two-second speed check."""
+  json: bool = False
+
+
+Command = (Annotated[Run, tyro.conf.subcommand("run")] | Annotated[Train, tyro.conf.subcommand("train")] | Annotated[Eval, tyro.conf.subcommand("eval")]
+           | Annotated[Plot, tyro.conf.subcommand("plot")] | Annotated[Query, tyro.conf.subcommand("query")]
+           | Annotated[List, tyro.conf.subcommand("list")] | Annotated[Doctor, tyro.conf.subcommand("doctor")])
+
+
+# ---- helpers ---------------------------------------------------------------------------------------------------------------------
+
+def settings(pairs: tuple[str, ...]) -> dict:
+  """("a=1", "b=x") -> {"a": 1, "b": "x"}; values are read as JSON where they are JSON."""
+  out = {}
+  for pair in pairs:
+    name, sign, value = pair.partition("=")
+    if not sign:
+      raise UserError(f"--set takes name=value; got {pair!r}")
+    try:
+      out[name] = json.loads(value.lower() if value in ("True", "False") else value)
+    except ValueError:
+      out[name] = value
+  return out
+
+
+def say(text: str) -> None:
+  """One line on standard error."""
+  print(text, file=sys.stderr, flush=True)
+
+
+def clock(seconds: float) -> str:
+  """m:ss or h:mm:ss."""
+  seconds = int(max(0, seconds))
+  return f"{seconds // 3600}:{seconds % 3600 // 60:02d}:{seconds % 60:02d}" if seconds >= 3600 else f"{seconds // 60}:{seconds % 60:02d}"
+
+
+def emit(value) -> None:
+  print(json.dumps(value, allow_nan=False))
+
+
+class RunDisplay:
+  """Live table of a run on a terminal; a plain line now and then elsewhere."""
+
+  def __init__(self):
+    from rich.console import Console
+    from rich.live import Live
+    self.console = Console(stderr=True)
+    self.live = Live(console=self.console, refresh_per_second=2, transient=True) if self.console.is_terminal else None
+    self.begin, self.first, self.told = time.monotonic(), None, 0.0
+
+  def __enter__(self):
+    if self.live:
+      self.live.start()
+    return self
+
+  def __exit__(self, *_):
+    if self.live:
+      self.live.stop()
+
+  def __call__(self, p) -> None:
+    from mjx_cl.adapt.phase import PHASES
+    now = time.monotonic()
+    if self.first is None:
+      self.first = (now, p.step)
+    rate = (p.step - self.first[1]) / max(1e-9, now - self.first[0])
+    left = clock((p.steps - p.step) / rate) if rate > 0 else "?"
+    head = f"step {p.step:,}/{p.steps:,}  {clock(now - self.begin)} gone, {left} left"
+    if self.live:
+      from rich.table import Table
+      table = Table(title=head, title_justify="left")
+      for name in ("arm", "seed", "phase", "reward", "alarms", "updates"):
+        table.add_column(name, justify="left" if name in ("arm", "phase") else "right")
+      for i, arm in enumerate(p.arms):
+        table.add_row(arm, str(p.seeds[i]), PHASES[p.phase[i]], f"{p.reward[i]:.2f}", str(p.alarms[i]), str(p.updates[i]))
+      self.live.update(table)
+    elif now - self.told > 15 or p.step >= p.steps:
+      self.told = now
+      counts = ", ".join(f"{int((p.phase == i).sum())} {name}" for i, name in enumerate(PHASES) if (p.phase == i).any())
+      say(f"{head}; {counts}; mean reward {p.reward.mean():.2f}")
+
+
+# ---- commands --------------------------------------------------------------------------------------------------------------------
+
+def do_run(args: Run) -> None:
+  config = RunConfig(
+      env=args.env, fault=args.fault, target=None if args.target == "random" else args.target, severity=args.severity, onset=args.onset,
+      duration=args.duration, steps=args.steps, seeds=args.seeds, first_seed=args.first_seed, detector=args.detector, settings=settings(args.set),
+      arms=args.arm, agent=args.agent, physics=args.physics, form=args.form, actions=args.actions, deterministic=args.deterministic, adapt=args.adapt)
+  from mjx_cl import run
+  with RunDisplay() as display:
+    summary = run.execute(config, args.out, args.resume, args.overwrite, display)
+  if args.json:
+    emit(summary)
+  else:
+    print(summary_text(summary, args.out))
+
+
+def summary_text(s: dict, out: str) -> str:
+  """A run's numbers for a reader."""
+  lines = [f"{s['env']}, {s['fault']} {s['severity']:g} at step {s['onset']:,} of {s['steps']:,}, detector {s['detector']}; {clock(s['wall_s'])} wall ("
+           + ", ".join(f"{k} {v:.0%}" for k, v in s["wall_share"].items()) + ")"]
+  number = lambda x, form: "-" if x is None else format(x, form)
+  for arm, a in s["arms"].items():
+    lines.append(f"  {arm:9s} {a['seeds']} seeds, {a['affected']} affected; false-alarm streams {a['false_alarm_streams']}; alarm within 500 steps "
+                 f"{a['affected_alarmed_within_500']}/{a['affected']}, median {number(a['latency_median_steps'], '.0f')} steps; recovered within 10,000 steps "
+                 f"{a['recovered_within_10000']}/{a['affected']}, median {number(a['recovery_median_steps'], '.0f')}; converged {a['converged']}, aborted by rule "
+                 f"{a['aborted_by_rule']}, by budget {a['aborted_by_budget']}; reward {number(a['reward_pre'], '.2f')} -> drop {number(a['reward_drop'], '.0%')} -> "
+                 f"{number(a['reward_final'], '.2f')}")
+  return "\n".join(lines + [f"files in {out}"])
+
+
+def do_train(args: Train) -> None:
+  preset = choose("preset", args.preset, PRESETS)
+  names = {f.name for f in dataclasses.fields(TrainConfig)}
+  changes = settings(args.set)
+  train_config = replace(preset.train, **{k: v for k, v in changes.items() if k in names})
+  rest = {k: v for k, v in changes.items() if k not in names}
+  known = {f.name for f in dataclasses.fields(preset.dreamer)}
+  for name in rest:
+    if name not in known:
+      raise UserError(f"unknown setting {name!r}; choose from: {', '.join(sorted(names | known))}")
+  dreamer = replace(preset.dreamer, **rest)
+  if args.seeds < 1:
+    raise UserError(f"seeds must be above 0; got {args.seeds}")
+  from mjx_cl import envs, store, train
+  state = store.claim_folder(args.out, args.resume, args.overwrite, done_marker="agent/card.json")
+  if state == "done":
+    say(f"{args.out}: this training is finished")
+    return
+  from mjx_cl import run
+  if state == "new" and args.overwrite:
+    run.clear(train.pathlib.Path(args.out))
+  env = envs.make(args.env, args.physics)
+  command = "mjx-cl " + " ".join(sys.argv[1:]) if len(sys.argv) > 1 else "mjx-cl train"
+  trainer = train.build(env, dreamer, train_config, args.out, args.seed, args.seeds, args.demonstrator, args.agent, args.preset, command, state == "resume")
+  display = TrainDisplay(train_config.updates)
+  with display:
+    train.run(trainer, display, args.save_every_s)
+  card = train.export(trainer)
+  if args.json:
+    emit(card)
+  else:
+    say(f"agent in {args.out}/agent, return {card['eval']['return_mean']:.0f} over {card['eval']['episodes']} episodes")
+
+
+class TrainDisplay:
+  """Progress bar with return, updates per second and time left; a plain line now and then without a terminal."""
+
+  def __init__(self, total: int):
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+    self.console = Console(stderr=True)
+    self.total, self.recent, self.marks, self.told = total, [], [], 0.0
+    self.bar = Progress(TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed:,.0f}/{task.total:,.0f} updates"), TimeRemainingColumn(),
+                        console=self.console) if self.console.is_terminal else None
+    self.task = self.bar.add_task("", total=total) if self.bar else None
+
+  def __enter__(self):
+    if self.bar:
+      self.bar.start()
+    return self
+
+  def __exit__(self, *_):
+    if self.bar:
+      self.bar.stop()
+
+  def __call__(self, row: dict) -> None:
+    now = time.monotonic()
+    if row["return"] is not None:
+      self.recent = (self.recent + [row["return"]])[-5:]
+    self.marks = (self.marks + [(now, row["updates"])])[-200:]
+    rate = (self.marks[-1][1] - self.marks[0][1]) / max(1e-9, self.marks[-1][0] - self.marks[0][0])
+    mean = f"{sum(self.recent) / len(self.recent):.0f}" if self.recent else "-"
+    text = f"{row['phase']}: return {mean}, {rate:.1f} updates/s"
+    if self.bar:
+      self.bar.update(self.task, completed=row["updates"], description=text)
+    elif now - self.told > 30 or row["updates"] >= self.total:
+      self.told = now
+      left = clock((self.total - row["updates"]) / rate) if rate else "?"
+      say(f"{row['updates']:,}/{self.total:,} updates, {row['records']:,} records, {text}, {left} left")
+
+
+def do_eval(args: Eval) -> None:
+  if args.episodes < 1:
+    raise UserError(f"episodes must be above 0; got {args.episodes}")
+  from mjx_cl import agents, envs, evaluate
+  env = envs.make(args.env, args.physics)
+  trained = agents.load(args.agent, args.env, len(env.spec.obs), len(env.spec.act))
+  result = evaluate.evaluate(env, trained.agent, trained.train.params, args.episodes, args.seed, int(trained.card.get("repeat", 1)), args.deterministic)
+  result = {"env": args.env, "agent": args.agent or args.env, **result}
+  if args.json:
+    emit(result)
+  else:
+    print(f"{args.env}: return {result['return_mean']:.1f} (IQM {result['return_iqm']:.1f}, 95 % interval {result['return_ci'][0]:.1f} to "
+          f"{result['return_ci'][1]:.1f}) over {args.episodes} episodes, {result['terminations']} terminations" if result["return_ci"] else
+          f"{args.env}: return {result['return_mean']:.1f} in one episode")
+
+
+def do_plot(args: Plot) -> None:
+  from mjx_cl import plots
+  if not os.path.exists(os.path.join(args.folder, "trace.parquet")):
+    raise UserError(f"{args.folder} holds no finished run (no trace.parquet)")
+  print(plots.figure(args.folder))
+
+
+def do_query(args: Query) -> None:
+  from mjx_cl import store
+  names, rows = store.query(args.folder, args.sql)
+  if args.json:
+    print(json.dumps([dict(zip(names, r)) for r in rows], default=str))
+    return
+  from rich.console import Console
+  from rich.table import Table
+  table = Table(*names)
+  for r in rows:
+    table.add_row(*(str(x) for x in r))
+  Console().print(table)
+
+
+def do_list(args: List) -> None:
+  from mjx_cl import agents, detectors, envs, faults
+  first = lambda f: (f.__doc__ or "").strip().split("\n")[0]
+  tables = {"envs": {k: first(v) for k, v in envs.ENVS.items()}, "faults": {k: first(v) for k, v in faults.FAULTS.items()},
+            "detectors": {k: first(v) for k, v in detectors.DETECTORS.items()}, "presets": {k: p.about for k, p in PRESETS.items()},
+            "agents": {k: "shipped" for k in agents.shipped()}, "arms": ARMS}
+  chosen = tables if args.what == "all" else {args.what: choose("list", args.what, tables)}
+  if args.json:
+    emit(chosen)
+    return
+  for kind, table in chosen.items():
+    print(kind)
+    for name, about in table.items():
+      print(f"  {name:22s} {about}")
+
+
+def do_doctor(args: Doctor) -> None:
+  from mjx_cl import doctor
+  rows = doctor.report()
+  if args.json:
+    emit(rows)
+  else:
+    for name, value in rows.items():
+      print(f"{name:16s} {value if not isinstance(value, dict) else ', '.join(f'{k} {v}' for k, v in value.items())}")
+
+
+DO = {Run: do_run, Train: do_train, Eval: do_eval, Plot: do_plot, Query: do_query, List: do_list, Doctor: do_doctor}
+
+
+def parse(argv: list[str] | None):
+  """Arguments -> command. tyro's framed report of a mistake becomes one line."""
+  report = io.StringIO()
+  try:
+    with contextlib.redirect_stderr(report):
+      return tyro.cli(Command, prog="mjx-cl", args=argv, description="Robots that notice a fault, adapt to it and know when they are done.",
+                      config=(tyro.conf.FlagCreatePairsOff,))
+  except SystemExit as e:
+    if e.code in (0, None):
+      raise
+    text = re.sub(r"\x1b\[[0-9;]*m", "", report.getvalue())
+    lines = [re.sub(r"^[│|]|[│|]$", "", line).strip() for line in text.splitlines()]
+    words = [line for line in lines if line and not re.match(r"^[╭╰─]", line) and not line.startswith("For full helptext")]
+    raise UserError(re.sub(r"\s+", " ", " ".join(words)) or "wrong arguments; see mjx-cl --help") from None
+
+
+def main(argv: list[str] | None = None) -> int:
+  """Entry point of `mjx-cl`."""
+  def stop(*_):
+    raise KeyboardInterrupt
+  signal.signal(signal.SIGTERM, stop)
+  try:
+    command = parse(argv)
+    if not isinstance(command, (Plot, Query)):
+      from mjx_cl import runtime
+      runtime.setup()
+    DO[type(command)](command)
+    return 0
+  except UserError as e:
+    say(f"mjx-cl: {' '.join(str(e).split())}")
+    return e.exit_code
+  except KeyboardInterrupt:
+    say("mjx-cl: interrupted; what was saved can be resumed with --resume")
+    return 130
+  except OSError as e:
+    say(f"mjx-cl: {e.strerror or e}{f': {e.filename}' if e.filename else ''}")
+    return FileError.exit_code
+  except BrokenPipeError:
+    return 0
+
+
+if __name__ == "__main__":
+  sys.exit(main())

@@ -1,0 +1,115 @@
+"""Prediction residuals: what the world model foresaw, step by step, against what came.
+
+At decision t the model imagines n steps from its posterior, one prior sample each, with the recorded actions; predictions are in raw
+units. With x_{t+i} the observation arrived at i steps later and o ranging over observation variables:
+
+  paper       e_t[o] = (1/n) sum_{i=1..n} |xhat_{t+i|t}[o] - x_{t+i}[o]|, in the row whose arrival is t+n, when it is known
+  streaming   s_t[o] = (1/n) sum_{i=1..n} |xhat_{t|t-i}[o] - x_t[o]|, in the row whose arrival is t
+
+OPR = mean over o; RPR is the same sum over the reward. A window is cut at a reset and averaged over the steps left; fewer than
+`least` of them, or fewer than n steps since the run began, make the row invalid.   Source: the paper, section on change detection.
+"""
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from mjx_cl.errors import UserError
+
+
+class Residual(NamedTuple):
+  """Residuals of one row; what detectors see.
+
+  Attributes:
+    opr, rpr: float32 (). variables: float32 (O,), in raw units. valid: bool (); an invalid row is nan.
+  """
+  opr: jax.Array
+  rpr: jax.Array
+  variables: jax.Array
+  valid: jax.Array
+
+
+class History(NamedTuple):
+  """The last n - 1 rows before a chunk, time-major (n - 1, groups, members, ...). `exists` is false before the run began."""
+  deter: jax.Array
+  stoch: jax.Array
+  action: jax.Array
+  obs: jax.Array
+  reward: jax.Array
+  done: jax.Array
+  exists: jax.Array
+
+
+class Monitor:
+  """Residuals of chunks.
+
+  Args:
+    agent: dreamer.agent.Agent.
+    n: decisions predicted.
+    form: `paper` or `streaming`.
+    actions: `recorded`, or `policy` (the literal reading of the paper: the policy imagines its own actions).
+    least: fewest steps a cut window may keep.
+  """
+
+  def __init__(self, agent, n: int = 15, form: str = "paper", actions: str = "recorded", least: int = 5):
+    if form not in ("paper", "streaming"):
+      raise UserError(f"unknown residual form {form!r}; choose from: paper, streaming")
+    if actions not in ("recorded", "policy"):
+      raise UserError(f"unknown residual actions {actions!r}; choose from: recorded, policy")
+    if not 1 <= least <= n:
+      raise UserError(f"least must lie in 1..n={n}; got {least}")
+    self.agent, self.n, self.form, self.actions, self.least = agent, n, form, actions, least
+
+  def init(self, groups: int, members: int) -> History:
+    """The history before a run."""
+    a = self.agent
+    zeros = lambda *shape: jnp.zeros((self.n - 1, groups, members) + shape)
+    return History(zeros(a.size.deter), jnp.zeros((self.n - 1, groups, members, a.size.stoch), jnp.int32), zeros(a.act_size), zeros(a.obs_size),
+                   zeros(), zeros().astype(bool), zeros().astype(bool))
+
+  def update(self, params, history: History, rows, keys: jax.Array):
+    """Residuals of one chunk.
+
+    Args:
+      params: leading (groups,). rows: rollout.Row with leading (T, groups, members), T >= n - 1. keys: (groups,).
+    Returns:
+      (history', Residual with leading (T, groups, members)).
+    """
+    done = rows.terminated | rows.truncated
+    chunk = History(rows.deter, rows.stoch, rows.action, rows.final_obs, rows.reward, done, jnp.ones_like(done))
+    seq = jax.tree.map(lambda a, b: jnp.concatenate([a, b.astype(a.dtype)]), history, chunk)
+    per_group = jax.vmap(self._group, (0, 1, 0), 1)
+    residual = per_group(params, seq, keys)
+    return jax.tree.map(lambda x: x[-(self.n - 1):], seq) if self.n > 1 else history, residual
+
+  def _group(self, params, seq: History, key):
+    """One parameter set; seq has leading (n - 1 + T, members)."""
+    n, total, members = self.n, seq.done.shape[0], seq.done.shape[1]
+    rows = total - n + 1
+    starts = rows if self.form == "paper" else total
+    # window[i, s] = row s + i, clamped; `inside` says that it exists
+    index = jnp.arange(starts)[None] + jnp.arange(n)[:, None]
+    inside = index < total
+    index = jnp.minimum(index, total - 1)
+    actions = seq.action[index].reshape(n, starts * members, -1)
+    deter = seq.deter[:starts].reshape(starts * members, -1)
+    stoch = self.agent.hot(seq.stoch[:starts]).reshape(starts * members, -1)
+    if self.actions == "recorded":
+      obs, reward = self.agent.open_loop(params, deter, stoch, actions, key)
+    else:
+      obs, reward = self.agent.dream(params, deter, stoch, n, key)
+    shape = (n, starts, members)
+    error = jnp.concatenate([jnp.abs(obs.reshape(shape + (-1,)) - seq.obs[index]), jnp.abs(reward.reshape(shape) - seq.reward[index])[..., None]], -1)
+    ended = jnp.cumsum(seq.done[index].astype(jnp.int32), 0) - seq.done[index]  # resets before the i-th arrival
+    valid = inside[..., None] & (ended == 0) & seq.exists[:starts][None]
+    if self.form == "streaming":  # row k gathers the i-th prediction of start k - i + 1
+      row = jnp.arange(n - 1, total)[None] - jnp.arange(n)[:, None]
+      step = jnp.arange(n)[:, None]
+      error, valid = error[step, row], valid[step, row]
+    count = jnp.sum(valid, 0)
+    mean = jnp.sum(jnp.where(valid[..., None], error, 0.0), 0) / jnp.maximum(1, count)[..., None]
+    good = count >= self.least
+    mean = jnp.where(good[..., None], mean, jnp.nan)
+    return Residual(jnp.mean(mean[..., :-1], -1), mean[..., -1], mean[..., :-1], good)

@@ -1,0 +1,83 @@
+"""figure.png of a run: the paper's two panels, mean and standard deviation over the streams of arm `detector`, arm `none` in grey."""
+from __future__ import annotations
+
+import os
+import pathlib
+
+import numpy as np
+
+from mjx_cl import store
+
+UPPER = (("reward", "reward per step"), ("opr", "OPR"), ("rpr", "RPR"))
+LOWER = (("adv_mag", "advantage magnitude"), ("dyn_loss", "dynamics loss [nats]"), ("value_loss", "value loss [nats]"))
+COLORS = ("#1f5fa8", "#c4472b", "#3b8a4a")
+
+
+def smooth(values: np.ndarray, width: int) -> np.ndarray:
+  """Trailing mean over `width` steps that leaves nan out, (streams, steps)."""
+  good = np.isfinite(values)
+  sums = np.cumsum(np.where(good, values, 0.0), -1)
+  counts = np.cumsum(good, -1)
+  sums[:, width:] -= sums[:, :-width].copy()
+  counts[:, width:] -= counts[:, :-width].copy()
+  return np.where(counts > 0, sums / np.maximum(1, counts), np.nan)
+
+
+def figure(folder, width: int = 500) -> pathlib.Path:
+  """Draws FOLDER/figure.png from its trace, events and config.
+
+  Args:
+    width: steps of the trailing mean that every curve is drawn with.
+  """
+  import matplotlib
+  matplotlib.use("Agg")
+  import matplotlib.pyplot as plt
+  import json
+  folder = pathlib.Path(folder)
+  trace, events = store.read_table(folder / "trace.parquet"), store.read_table(folder / "events.parquet")
+  config = json.loads((folder / "config.json").read_text())
+  steps = int(trace["step"].max()) + 1
+  control_s = config["control_s"]
+  panels = {}
+  for arm in dict.fromkeys(trace["arm"]):
+    mask = trace["arm"] == arm
+    panels[arm] = {c: np.asarray(trace[c][mask], float).reshape(-1, steps) for c, _ in UPPER + LOWER}
+  main = "detector" if "detector" in panels else next(iter(panels))
+  fig, axes = plt.subplots(2, 1, figsize=(10, 7.2), sharex=True, constrained_layout=True)
+  x = np.arange(steps)
+  every = max(1, steps // 2000)
+  for axis, columns in zip(axes, (UPPER, LOWER)):
+    hosts = [axis, axis.twinx(), axis.twinx()]
+    hosts[2].spines["right"].set_position(("axes", 1.09))
+    for host, (column, label), color in zip(hosts, columns, COLORS):
+      top = 0.0
+      for arm, data in panels.items():
+        curves = smooth(data[column], width)
+        mean, std = np.nanmean(curves, 0), np.nanstd(curves, 0)
+        shade = color if arm == main else "0.6"
+        host.plot(x[::every], mean[::every], color=shade, lw=1.6 if arm == main else 1.0, zorder=3 if arm == main else 1,
+                  ls="-" if arm == main else ("--", ":", "-.")[columns.index((column, label))])
+        if arm == main:
+          host.fill_between(x[::every], (mean - std)[::every], (mean + std)[::every], color=color, alpha=0.14, lw=0)
+        top = max(top, np.nanmax((mean + std)[min(width, steps - 1):], initial=0.0))
+      host.set_ylim(0, 1.1 * top if top else 1)
+      host.set_ylabel(label, color=color)
+      host.tick_params(axis="y", colors=color)
+    onset = [int(s) for s, k in zip(events["step"], events["kind"]) if k == "onset"]
+    starts = [int(s) for s, k, a in zip(events["step"], events["kind"], events["arm"]) if k == "start" and a == main]
+    stops = [int(s) for s, k, a in zip(events["step"], events["kind"], events["arm"]) if k in ("stop", "abort") and a == main]
+    for s in sorted(set(onset)):
+      axis.axvline(s, color="k", lw=1.3)
+    low, high = axis.get_ylim()
+    axis.plot(starts, [high * 0.985] * len(starts), "v", color="k", ms=5, clip_on=False, label="alarm, finetuning starts")
+    axis.plot(stops, [high * 0.985] * len(stops), "^", mfc="w", mec="k", ms=5, clip_on=False, label="finetuning ends")
+  axes[0].legend(loc="lower right", fontsize=8, framealpha=0.9)
+  axes[0].set_title(f"{config['env']}: {config['fault']} {config['severity']:g} at step {config['onset']:,}; {panels[main]['opr'].shape[0]} streams, mean and "
+                    f"standard deviation\narm {main} in colour" + (", arm none in grey" if "none" in panels and main != "none" else "")
+                    + f"; curves are trailing means of {width} steps", fontsize=10)
+  axes[1].set_xlabel(f"control step ({control_s:g} s)")
+  tmp = folder / "figure.tmp.png"
+  fig.savefig(tmp, dpi=130)
+  plt.close(fig)
+  os.replace(tmp, folder / "figure.png")
+  return folder / "figure.png"

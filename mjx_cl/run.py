@@ -1,0 +1,391 @@
+"""`run`: the whole loop for arms x seeds streams, a host loop over chunks; checkpoints, result files."""
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import pathlib
+import shutil
+import time
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_cl import agents, checkpoint, detectors, envs, faults, scoring, store
+from mjx_cl.adapt import phase as phase_lib
+from mjx_cl.adapt.loop import Loop, LoopState
+from mjx_cl.config import RunConfig
+from mjx_cl.errors import FileError
+from mjx_cl.monitor import Monitor
+from mjx_cl.rollout import Rollout, Stream, nest, start
+from mjx_cl.scoring import alarms as alarm_score, bootstrap, recovery
+
+CHUNK = 64  # decisions
+
+
+class State(NamedTuple):
+  """All arrays of a run: the robots and everything else."""
+  streams: Stream
+  loop: LoopState
+
+
+class Progress(NamedTuple):
+  """What a display needs after each chunk: arrays over streams."""
+  step: int
+  steps: int
+  seconds: float
+  arms: list[str]
+  seeds: list[int]
+  phase: np.ndarray
+  reward: np.ndarray
+  alarms: np.ndarray
+  updates: np.ndarray
+
+
+class Runner:
+  """Runs one RunConfig into the folder `out`.
+
+  Streams are ordered arm by arm, seed by seed. A stream's keys come from its seed alone, so the same seed lives the same life in
+  every arm until an alarm is acted on.
+  """
+
+  def __init__(self, config: RunConfig, out):
+    self.config, self.out = config, pathlib.Path(out)
+    self.env = envs.make(config.env, config.physics)
+    spec = self.env.spec
+    self.trained = agents.load(config.agent, config.env, len(spec.obs), len(spec.act), lr=config.adapt.lr)
+    agent, self.repeat = self.trained.agent, int(self.trained.card.get("repeat", 1))
+    self.fault = faults.make(config.fault, spec)
+    target = faults.target_index(self.fault, config.target)
+    detector = detectors.make(config.detector, **config.settings)
+    monitor = Monitor(agent, n=15, form=config.form, actions=config.actions)
+    self.rollout = Rollout(self.env, agent, self.fault, self.repeat, config.deterministic)
+    self.chunk_steps = CHUNK * self.repeat
+    self.chunks = -(-config.steps // self.chunk_steps)
+    capacity = (self.chunks + 1) * CHUNK + config.steps // spec.episode_steps + CHUNK
+    self.loop = Loop(agent, monitor, detector, spec, config.adapt, self.repeat, capacity=capacity)
+    self.seeds = [config.first_seed + i for i in range(config.seeds)]
+    self.labels = [(arm, seed) for arm in config.arms for seed in self.seeds]
+    self.groups = len(self.labels)
+    self.acts = jnp.asarray([arm == "detector" for arm, _ in self.labels])
+    keys = jnp.stack([jax.random.key(seed) for _, seed in self.labels])[:, None]
+    self.keys = jax.vmap(lambda k: jax.random.fold_in(k, 7))(keys[:, 0])
+    begin = lambda k: start(self.env, agent, self.fault, k, config.severity, config.onset, config.duration or faults.schedule.FOREVER, target)
+    self.state = State(nest(begin, 0, 0)(keys), self.loop.init(self.trained.train, self.groups))
+    self.done_chunks = 0
+    self.seconds = {"physics": 0.0, "acting": 0.0, "digest": 0.0, "other": 0.0}
+    self.quiet: list[float] = []  # digest time of chunks without an update
+    self.parts: list[dict] = []
+    self.stream_seconds = np.zeros(self.groups)
+    self._updates = np.zeros(self.groups, int)
+    self._alarms = np.zeros(self.groups, int)
+    self._phase = np.zeros(self.groups, int)
+    self.work = self.out / "work"
+    self.checkpoints = checkpoint.Checkpoints(self.work / "checkpoints")
+
+  # ---- one chunk -----------------------------------------------------------------------------------------------------------------
+
+  def step(self) -> Progress:
+    """Lives one chunk and logs it."""
+    begin = time.perf_counter()
+    physics = getattr(self.env.physics, "seconds", 0.0)
+    streams, rows = self.rollout.chunk(self.state.loop.train.params, self.state.streams, CHUNK)
+    rows = jax.block_until_ready(rows)
+    acted = time.perf_counter()
+    physics = getattr(self.env.physics, "seconds", 0.0) - physics
+    now = (self.done_chunks + 1) * self.chunk_steps
+    loop, digest = self.loop.digest(self.state.loop, rows, jnp.int32(now), self.acts, self.keys)
+    digest = jax.tree.map(np.asarray, jax.block_until_ready(digest))
+    digested = time.perf_counter()
+    self.state = State(streams, loop)
+    self._log(rows, digest)
+    updates = digest.updates - self._updates
+    self._updates = digest.updates
+    self.done_chunks += 1
+    if not np.all(np.isfinite(digest.signals[:, 2:])):
+      bad = [self.labels[g] for g in np.flatnonzero(~np.isfinite(digest.signals[:, 2:]).all(1))]
+      raise FileError(f"numeric failure at step {now} in stream {bad[0]}: a loss is not finite; the last checkpoint is intact")
+    if self.done_chunks > 1:  # the first chunk compiles
+      self.seconds["physics"] += physics
+      self.seconds["acting"] += acted - begin - physics
+      self.seconds["digest"] += digested - acted
+      if not updates.sum():
+        self.quiet.append(digested - acted)
+    else:
+      self.seconds["other"] += digested - begin
+    self.stream_seconds += (digested - begin) / self.groups
+    self.seconds["other"] += time.perf_counter() - digested
+    self._alarms = self._alarms + digest.fired.sum(0)
+    return Progress(min(now, self.config.steps), self.config.steps, sum(self.seconds.values()), [a for a, _ in self.labels], [s for _, s in self.labels],
+                    digest.phase, digest.signals[:, 2], self._alarms, digest.updates)
+
+  def _log(self, rows, digest) -> None:
+    """Keeps a chunk's rows, (control steps, groups), and its chunk values (groups,)."""
+    control = lambda x: np.repeat(np.asarray(x)[:, :, 0], self.repeat, 0)
+
+    def at_end(x):  # a value per decision, known with its last control step
+      out = np.full((CHUNK, self.repeat) + x.shape[1:], np.nan, np.float32)
+      out[:, -1] = x
+      return out.reshape((-1,) + x.shape[1:])
+    ends = lambda x: at_end(np.asarray(x).astype(np.float32)) > 0
+    rewards = np.asarray(rows.rewards)[:, :, 0].swapaxes(1, 2).reshape(-1, self.groups)
+    part = {
+        "reward": rewards, "severity": control(rows.severity), "episode": control(rows.episode),
+        "terminated": ends(np.asarray(rows.terminated)[:, :, 0]), "truncated": ends(np.asarray(rows.truncated)[:, :, 0]),
+        "opr": at_end(digest.residual.opr), "rpr": at_end(digest.residual.rpr), "valid": ends(digest.residual.valid),
+        "score": at_end(digest.score), "alarm": ends(digest.fired),
+        "phase": np.broadcast_to(self._phase.astype(np.int8), rewards.shape).copy(),
+        "updates": np.broadcast_to(self._updates.astype(np.int32), rewards.shape).copy(),
+        "signals": digest.signals[None], "decision": digest.decision[None], "since": digest.since[None], "settled": digest.settled[None]}
+    self._phase = digest.phase
+    self.parts.append(part)
+
+  # ---- kill and resume -----------------------------------------------------------------------------------------------------------
+
+  def save(self) -> None:
+    """Trace so far and state, so that a killed run goes on from here."""
+    number = self.done_chunks
+    if self.checkpoints.latest() == number:
+      return
+    begin = time.perf_counter()
+    tmp = self.work / "trace.tmp.npz"
+    try:
+      np.savez(tmp, **self._trace())
+      os.replace(tmp, self.work / f"trace-{number:06d}.npz")
+    except OSError as e:
+      tmp.unlink(missing_ok=True)
+      raise FileError(f"cannot write in {self.work}: {e.strerror or e}; the last checkpoint is intact") from None
+    self.seconds["other"] += time.perf_counter() - begin
+    meta = {"seconds": self.seconds, "quiet": self.quiet, "stream_seconds": self.stream_seconds.tolist(), "updates": self._updates.tolist(),
+            "alarms": self._alarms.tolist(), "phase": self._phase.tolist()}
+    self.checkpoints.save(number, self.state, meta)
+    for old in sorted(self.work.glob("trace-*.npz"))[:-2]:
+      old.unlink()
+
+  def _trace(self) -> dict[str, np.ndarray]:
+    return {k: np.concatenate([p[k] for p in self.parts]) for k in self.parts[0]} if self.parts else {}
+
+  def resume(self) -> None:
+    """Goes on from the newest checkpoint; without one, from the start."""
+    number = self.checkpoints.latest()
+    if number is None:
+      return
+    self.state, meta = self.checkpoints.load(self.state)
+    with np.load(self.work / f"trace-{number:06d}.npz", allow_pickle=False) as z:
+      self.parts = [{k: z[k] for k in z.files}]
+    self.done_chunks = number
+    self.seconds, self.quiet, self.stream_seconds = meta["seconds"], meta["quiet"], np.asarray(meta["stream_seconds"])
+    self._updates, self._alarms, self._phase = (np.asarray(meta[k]) for k in ("updates", "alarms", "phase"))
+
+  @property
+  def done(self) -> bool:
+    return self.done_chunks >= self.chunks
+
+  # ---- result files --------------------------------------------------------------------------------------------------------------
+
+  def config_dict(self) -> dict:
+    """What config.json holds."""
+    return {"command": "run", **json.loads(json.dumps(dataclasses.asdict(self.config))), "physics": self.env.physics.name,
+            "agent_card": self.trained.card, "agent_path": pathlib.Path(self.trained.path).name, "repeat": self.repeat,
+            "control_s": self.env.spec.control_s, **store.provenance()}
+
+  def finish(self) -> dict:
+    """Writes trace, events, runs, summary and figure; removes the working files. Returns summary.json's value."""
+    from mjx_cl import plots
+    steps = self.config.steps
+    trace = {k: v[:steps] if v.shape[0] >= steps else v for k, v in self._trace().items()}
+    targets = np.asarray(self.state.streams.injection.state).reshape(self.groups, -1)[:, 0]
+    names = [f"{self.config.fault}:{self.fault.targets[int(t)]}" for t in targets]
+    table = self._trace_table(trace, names)
+    events = self._events(trace, names)
+    runs = self._runs(trace, events, names)
+    store.write_table(self.out / "trace.parquet", table)
+    store.write_table(self.out / "events.parquet", {k: [e[k] for e in events] for k in ("stream", "arm", "seed", "step", "kind", "reason", "fault")})
+    store.write_table(self.out / "runs.parquet", {k: [r[k] for r in runs] for k in runs[0]})
+    plots.figure(self.out)
+    summary = self._summary(runs, trace)
+    store.write_json(self.out / "summary.json", summary)
+    self.checkpoints.close()
+    shutil.rmtree(self.work, ignore_errors=True)
+    return summary
+
+  def _trace_table(self, trace, names) -> dict:
+    steps, groups = trace["reward"].shape
+    flat = lambda x: np.ascontiguousarray(x.T).reshape(-1)
+    column = lambda values: np.repeat(np.asarray(values), steps)
+    table = {"stream": column(np.arange(groups, dtype=np.int32)), "arm": column([a for a, _ in self.labels]),
+             "seed": column(np.asarray([s for _, s in self.labels], np.int32)), "fault": column(names),
+             "step": np.tile(np.arange(steps, dtype=np.int32), groups), "episode": flat(trace["episode"]),
+             "phase": np.asarray(phase_lib.PHASES)[flat(trace["phase"])], "fault_active": flat(trace["severity"] > 0), "severity": flat(trace["severity"]),
+             "reward": flat(trace["reward"]), "opr": flat(trace["opr"]), "rpr": flat(trace["rpr"]), "score": flat(trace["score"]),
+             "alarm": flat(trace["alarm"]), "terminated": flat(trace["terminated"]), "truncated": flat(trace["truncated"]), "valid": flat(trace["valid"])}
+    for column_name, index in (("dyn_loss", 3), ("adv_mag", 4), ("value_loss", 5)):  # once per chunk, in the row at which it is known
+      values = np.full((steps, groups), np.nan, np.float32)
+      at = np.minimum((np.arange(len(trace["signals"])) + 1) * self.chunk_steps, steps) - 1
+      values[at] = trace["signals"][:, :, index]
+      table[column_name] = flat(values)
+    return table | {"updates": flat(trace["updates"])}
+
+  def _events(self, trace, names) -> list[dict]:
+    """Every onset, alarm, start, stop, abort and repair, with its reason."""
+    c, events = self.config, []
+    for g, (arm, seed) in enumerate(self.labels):
+      def add(step, kind, reason):
+        events.append({"stream": g, "arm": arm, "seed": seed, "step": int(step), "kind": kind, "reason": reason, "fault": names[g]})
+      if c.fault != "none" and c.onset < c.steps:
+        add(c.onset, "onset", f"severity {c.severity:g}")
+        if c.duration and c.onset + c.duration < c.steps:
+          add(c.onset + c.duration, "repair", f"after {c.duration} steps")
+      decisions = trace["decision"][:, g]
+      started = {int(trace["since"][i, g]) for i in np.flatnonzero(decisions == phase_lib.START)}
+      for step in np.flatnonzero(trace["alarm"][:, g]):
+        if int(step) in started:
+          add(step, "alarm", "acted on" + (", before onset: a false alarm" if step < c.onset else ""))
+        else:
+          phase = phase_lib.PHASES[trace["phase"][step, g]]
+          why = "arm does not adapt" if arm == "none" else "warm-up" if step < c.adapt.warmup else f"phase {phase}"
+          add(step, "alarm", f"logged, not acted on: {why}" + (", before onset: a false alarm" if step < c.onset else ""))
+      for i in np.flatnonzero(decisions):
+        end = min((i + 1) * self.chunk_steps, c.steps) - 1
+        decision = int(decisions[i])
+        kind = {phase_lib.START: "start", phase_lib.STOP: "stop"}.get(decision, "abort")
+        add(end, kind, phase_lib.REASONS[decision] if decision != phase_lib.START else f"alarm at step {int(trace['since'][i, g])}")
+    return sorted(events, key=lambda e: (e["stream"], e["step"]))
+
+  def _runs(self, trace, events, names) -> list[dict]:
+    """One row per stream."""
+    c, rows = self.config, []
+    onset, control_s = c.onset, self.env.spec.control_s
+    pre, drop = {}, {}
+    for g, (arm, seed) in enumerate(self.labels):
+      reward, alarm = trace["reward"][:, g].astype(float), trace["alarm"][:, g]
+      fired = np.flatnonzero(alarm[:onset])
+      pre[g] = recovery.reward_pre(reward, onset, c.adapt.warmup, int(fired[0]) if len(fired) else None)
+      if arm == "none":
+        drop[seed] = recovery.reward_drop(reward, onset, pre[g]) if c.fault != "none" and onset < c.steps else None
+    for g, (arm, seed) in enumerate(self.labels):
+      reward = trace["reward"][:, g].astype(float)
+      own = [e for e in events if e["stream"] == g]
+      score = alarm_score.score(trace["alarm"][:, g], onset)
+      starts = [e["step"] for e in own if e["kind"] == "start"]
+      ends = [e for e in own if e["kind"] in ("stop", "abort")]
+      outcome = "nominal" if not starts else "adapting"
+      if starts and ends:
+        reason = ends[-1]["reason"]
+        outcome = "converged" if ends[-1]["kind"] == "stop" else "aborted_by_budget" if reason == phase_lib.REASONS[phase_lib.ABORT_BUDGET] else "aborted_by_rule"
+      affected = None if drop.get(seed) is None else bool(drop[seed] >= 0.1)
+      back = recovery.recovery_step(reward, onset, pre[g])
+      rows.append({
+          "stream": g, "arm": arm, "seed": seed, "fault": names[g], "onset": onset, "alarm_step": score.alarm_step, "latency_steps": score.latency_steps,
+          "latency_s": None if score.latency_steps is None else score.latency_steps * control_s, "false_alarms": score.false_alarms,
+          "adapt_start": starts[0] if starts else None, "adapt_stop": ends[-1]["step"] if ends else None, "outcome": outcome,
+          "reason": ends[-1]["reason"] if ends else None, "affected": affected, "recovery_step": back if affected else None,
+          "reward_pre": pre[g], "reward_drop": drop.get(seed), "reward_final": float(np.mean(reward[-recovery.FINAL:])),
+          "return_lost": recovery.return_lost(reward, onset, pre[g]), "terminations": int(trace["terminated"][:, g].sum()),
+          "updates": int(self._updates[g]), "wall_s": float(self.stream_seconds[g])})
+    return rows
+
+  def _summary(self, runs, trace) -> dict:
+    """summary.json: per arm the aggregates of design.md section 4, each with its interval."""
+    out = {"env": self.config.env, "fault": self.config.fault, "severity": self.config.severity, "onset": self.config.onset, "steps": self.config.steps,
+           "detector": self.config.detector}
+    arms = {arm: summarise([r for r in runs if r["arm"] == arm], self.config, self.env.spec.control_s) for arm in self.config.arms}
+    out["arms"] = arms
+    if "detector" in arms:
+      out |= arms["detector"]
+    nominal = trace["valid"][15 * self.repeat:]
+    out["invalid_share"] = float(1.0 - nominal[self.repeat - 1::self.repeat].mean())
+    wall = sum(self.seconds.values())
+    quiet = float(np.median(self.quiet)) if self.quiet else 0.0
+    monitor = min(self.seconds["digest"], quiet * max(1, self.done_chunks - 1))
+    shares = {"physics": self.seconds["physics"], "acting": self.seconds["acting"], "monitor": monitor, "updates": self.seconds["digest"] - monitor,
+              "other": self.seconds["other"]}
+    out["wall_s"] = wall
+    out["wall_share"] = {k: v / wall for k, v in shares.items()}
+    return out
+
+
+def summarise(rows: list[dict], config: RunConfig, control_s: float) -> dict:
+  """Aggregates of one arm. Recovery counts affected streams alone; times are censored medians; means are IQM with bootstrap intervals."""
+  affected = [r for r in rows if r["affected"]]
+  latency = [np.inf if r["latency_steps"] is None else r["latency_steps"] for r in rows]
+  back = [np.inf if r["recovery_step"] is None else r["recovery_step"] - r["onset"] for r in affected]
+  out: dict = {"seeds": len(rows), "affected": len(affected)}
+
+  def put(name, value, ci):
+    out[name], out[name + "_ci"] = value, ci
+
+  def count(name, hits, n):
+    p = bootstrap.wilson(hits, n)
+    put(name, hits, None if p is None else [p[0] * n, p[1] * n])
+  count("alarms", sum(np.isfinite(x) for x in latency), len(rows))
+  count("false_alarm_streams", sum(r["false_alarms"] > 0 for r in rows), len(rows))
+  hours = sum(min(r["onset"], config.steps) for r in rows) * control_s / 3600
+  out["false_alarms_per_hour"] = sum(r["false_alarms"] for r in rows) / hours if hours else None
+  median = lambda x: bootstrap.finite(bootstrap.censored_median(x)) if len(x) else None
+  put("latency_median_steps", median(latency), bootstrap.interval(latency, bootstrap.censored_median) if latency else None)
+  put("miss_probability", float(np.mean(~np.isfinite(latency))), bootstrap.wilson(int(np.sum(~np.isfinite(latency))), len(latency)))
+  hit = [r["latency_steps"] is not None and r["latency_steps"] <= 500 for r in affected]
+  count("affected_alarmed_within_500", sum(hit), len(affected))
+  for outcome in ("converged", "aborted_by_rule", "aborted_by_budget", "adapting"):
+    count(outcome, sum(r["outcome"] == outcome for r in rows), len(rows))
+  count("recovered", sum(np.isfinite(x) for x in back), len(affected))
+  count("recovered_within_10000", sum(x <= 10_000 for x in back), len(affected))
+  put("recovery_median_steps", median(back), bootstrap.interval(back, bootstrap.censored_median) if len(back) > 1 else None)
+  for name in ("reward_pre", "reward_drop", "reward_final", "return_lost"):
+    values = [r[name] for r in rows if r[name] is not None]
+    put(name, float(bootstrap.iqm(values)) if values else None, bootstrap.interval(values) if values else None)
+  values = [r["reward_final"] for r in affected]
+  put("reward_final_affected", float(bootstrap.iqm(values)) if values else None, bootstrap.interval(values) if values else None)
+  return out
+
+
+def execute(config: RunConfig, out, resume: bool = False, overwrite: bool = False, progress=lambda p: None, save_every_s: float = 60.0) -> dict:
+  """Runs `config` into `out` and returns summary.json's value. A kill at any moment loses at most `save_every_s` seconds of work."""
+  out = pathlib.Path(out)
+  state = store.claim_folder(out, resume, overwrite)
+  if state == "done":
+    return json.loads((out / "summary.json").read_text())
+  if state == "new" and overwrite:
+    clear(out)
+  runner = Runner(config, out)
+  values = runner.config_dict()
+  if state == "resume":
+    check_same(out, values)
+    runner.resume()
+  else:
+    store.write_json(out / "config.json", values)
+  saved = time.monotonic()
+  try:
+    while not runner.done:
+      progress(runner.step())
+      if time.monotonic() - saved > save_every_s:
+        runner.save()
+        saved = time.monotonic()
+  except KeyboardInterrupt:
+    runner.save()
+    raise
+  return runner.finish()
+
+
+RESULTS = ("config.json", "trace.parquet", "events.parquet", "runs.parquet", "residuals.parquet", "summary.json", "figure.png", "metrics.parquet")
+
+
+def clear(out: pathlib.Path) -> None:
+  """Removes an earlier run's own files, nothing else."""
+  for name in RESULTS:
+    (out / name).unlink(missing_ok=True)
+  for name in ("work", "checkpoints"):
+    shutil.rmtree(out / name, ignore_errors=True)
+
+
+def check_same(out: pathlib.Path, values: dict) -> None:
+  """Refuses to resume with other settings than the run began with."""
+  from mjx_cl.errors import UserError
+  old = json.loads((out / "config.json").read_text())
+  skip = ("git_commit", "machine", "python")
+  changed = [k for k in values if k not in skip and old.get(k) != values[k]]
+  if changed:
+    raise UserError(f"--resume: {out} was begun with another {', '.join(changed)}; give the same settings or --overwrite")

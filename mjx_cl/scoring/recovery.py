@@ -1,0 +1,50 @@
+"""What a fault cost and when the robot was back. Definitions: windows and recovery in control steps, reward per step."""
+from __future__ import annotations
+
+import numpy as np
+
+TRAIL = 1000  # steps of the trailing mean
+HOLD = 2000   # steps for which it must stay
+SHARE = 0.9   # of reward_pre
+DROP = 2000   # steps after onset over which the drop is taken
+FINAL = 2000  # last steps of the run
+
+
+def reward_pre(reward: np.ndarray, onset: int, warmup: int, first_alarm: int | None) -> float | None:
+  """Mean reward of all steps before onset, after warm-up, before any alarm; None where none are left."""
+  end = onset if first_alarm is None else min(onset, first_alarm)
+  return float(np.mean(reward[warmup:end])) if end > warmup else None
+
+
+def reward_drop(reward: np.ndarray, onset: int, pre: float | None) -> float | None:
+  """1 - mean(onset .. onset + 2,000) / reward_pre, of arm `none`."""
+  return None if not pre else float(1.0 - np.mean(reward[onset:onset + DROP]) / pre)
+
+
+def recovery_step(reward: np.ndarray, onset: int, pre: float | None) -> int | None:
+  """First step from which the trailing 1,000-step mean stays at or above 90 % of reward_pre for 2,000 steps, after it had fallen below.
+
+  The mean lags by up to 1,000 steps. A stream whose mean never falls below after onset was never down: its recovery step is the onset.
+  None: censored, or the run ends before the hold does.
+  """
+  if not pre:
+    return None
+  sums = np.concatenate([[0.0], np.cumsum(reward, dtype=float)])
+  steps = np.arange(len(reward))
+  begin = np.maximum(0, steps + 1 - TRAIL)
+  trailing = (sums[steps + 1] - sums[begin]) / (steps + 1 - begin)
+  good = trailing >= SHARE * pre
+  fallen = np.flatnonzero(~good[onset:])
+  if not len(fallen):
+    return onset
+  run = 0
+  for k in range(onset + int(fallen[0]), len(reward)):
+    run = run + 1 if good[k] else 0
+    if run == HOLD:
+      return k - HOLD + 1
+  return None
+
+
+def return_lost(reward: np.ndarray, onset: int, pre: float | None) -> float | None:
+  """Sum of (reward_pre - reward) from onset on."""
+  return None if pre is None else float(np.sum(pre - reward[onset:]))

@@ -1,0 +1,275 @@
+"""The whole agent: sizes, values at initialisation, resets and context, gradient routes, the losses against NumPy, acting, prediction."""
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mjx_cl.config import DreamerConfig
+from mjx_cl.dreamer import nets, rssm
+from mjx_cl.dreamer.agent import Agent, Batch, Weights, parameter_count
+
+OBS, ACT, ROWS, LENGTH, IMAGINE = 5, 2, 3, 4, 3
+SMALL = dict(size="tiny", batch=ROWS, length=LENGTH, imagine=IMAGINE, warmup=20)
+KEY = jax.random.key(7)
+TERMS = ("dyn", "rep", "rec", "rew", "con", "policy", "value", "repval", "clone")
+GAMMA = 1 - 1 / 333
+
+
+def make_batch(seed=0, ends=False):
+  """Random windows; with `ends`, a time limit at index 2 of row 0 and a true terminal at index 2 of row 1."""
+  rng = np.random.default_rng(seed)
+  flag = lambda *at: np.isin(np.arange(ROWS * (LENGTH + 1)).reshape(ROWS, -1), [r * (LENGTH + 1) + i for r, i in at])
+  n = lambda *shape: rng.standard_normal((ROWS, LENGTH + 1) + shape).astype(np.float32)
+  last, terminal, first = (flag(*((0, 2), (1, 2)) * ends), flag(*((1, 2),) * ends), flag(*((0, 3), (1, 3)) * ends))
+  return Batch(3 * n(OBS), 1.5 * n(ACT), n(), first, last, terminal, np.tanh(n(128)), rng.integers(0, 8, (ROWS, LENGTH + 1, 8)),
+               np.tanh(n(ACT)), rng.random((ROWS, LENGTH + 1)) < 0.6)
+
+
+def shake(params, seed=0):
+  """Noise on every parameter: heads that start at zero speak, and the KL is above its floor."""
+  leaves, tree = jax.tree.flatten(params)
+  rng = np.random.default_rng(seed)
+  return jax.tree.unflatten(tree, [x + jnp.asarray(rng.standard_normal(x.shape) * 2 / np.sqrt(max(4, x.shape[-1])), jnp.float32) for x in leaves])
+
+
+class Fixture:
+  """One agent and its compiled loss, which also gives each term's gradient with respect to every module."""
+
+  def __init__(self, last_starts):
+    self.agent = Agent(DreamerConfig(**SMALL, last_starts=last_starts), OBS, ACT, clone_std=0.2)
+
+    def terms(params, slow, range_, batch, key, weights):
+      total, (metrics, range_, deter, stoch) = self.agent.loss(params, slow, range_, batch, key, weights)
+      return jnp.stack([metrics[f"loss/{k}"] for k in TERMS]), (total, metrics, range_, deter, stoch)
+    self._jac = jax.jit(jax.jacrev(terms, has_aux=True))
+    self.fresh = jax.jit(self.agent.init)(jax.random.key(0)).params
+    self.params, self.slow = shake(self.fresh), shake(self.fresh["val"], seed=1)
+    self.observe = jax.jit(self.agent.observe)
+
+  def __call__(self, params, slow, batch, range_=(0.0, 0.0), weights=Weights(0.3, 1.0)):
+    jac, aux = self._jac(params, slow, jnp.array(range_), batch, KEY, weights)
+    return jac, *aux
+
+  def reached(self, jac, term):
+    """Modules with any non-zero gradient of `term`."""
+    i = TERMS.index(term)
+    return {name for name, tree in jac.items() if any(np.any(np.asarray(x[i]) != 0) for x in jax.tree.leaves(tree))}
+
+
+@pytest.fixture(scope="module")
+def full():
+  return Fixture(0)
+
+
+@pytest.fixture(scope="module")
+def tail():
+  return Fixture(2)
+
+
+# ---- sizes and initial values ----------------------------------------------------------------------------------------------------
+
+def count(size):
+  params = jax.eval_shape(Agent(DreamerConfig(size=size), 24, 6).init, jax.random.key(0)).params
+  return parameter_count(params), {k: parameter_count(v) for k, v in params.items()}
+
+
+def test_parameter_counts():
+  total, modules = count("size1m")
+  assert total == 640_867
+  assert modules == {"enc": 10_112, "dyn": 364_416, "dec": 51_096, "rew": 57_663, "con": 41_153, "pol": 50_316, "val": 66_111}
+  total, modules = count("size12m")
+  assert total == 9_738_019
+  assert modules == {"enc": 138_752, "dyn": 5_783_040, "dec": 794_136, "rew": 721_407, "con": 656_129, "pol": 791_052, "val": 853_503}
+
+
+def test_losses_at_init(full):
+  _, _, metrics, range_, _, _ = full(full.fresh, full.fresh["val"], make_batch())
+  np.testing.assert_allclose(metrics["loss/rew"], np.log(255), rtol=1e-6)  # float32 logsumexp
+  np.testing.assert_allclose(metrics["loss/repval"], 2 * np.log(255), rtol=1e-6)  # float32 logsumexp
+  for name in ("val", "tar", "rew", "adv"):
+    assert metrics[name] == 0.0, name
+  assert metrics["ret_scale"] == 1.0 and np.all(np.asarray(range_) == 0.0)
+
+
+def test_heads_predict_zero_at_init(full):
+  agent = full.agent
+  deter, stoch = (np.random.default_rng(i).standard_normal((50, n)).astype(np.float32) for i, n in ((0, 128), (1, 64)))
+  for name in ("rew", "val"):
+    logits = getattr(agent, name).apply({"params": full.fresh[name]}, deter, stoch)
+    assert np.all(np.asarray(nets.two_hot_mean(logits, agent.bins)) == 0.0), name
+
+
+def test_floors_of_continue_and_kl(full):
+  params = dict(full.fresh)
+  flat = lambda tree, bias: {**tree, "kernel": jnp.zeros_like(tree["kernel"]), "bias": jnp.full_like(tree["bias"], bias)}
+  params["con"] = {**params["con"], "out": flat(params["con"]["out"], np.log(332.0))}  # sigmoid(ln 332) = 332 / 333
+  params["dyn"] = {**params["dyn"], "prior_out": flat(params["dyn"]["prior_out"], 0.0), "post_out": flat(params["dyn"]["post_out"], 0.0)}
+  jac, _, metrics, _, _, _ = full(params, full.fresh["val"], make_batch())
+  np.testing.assert_allclose(metrics["loss/con"], 0.02044, atol=5e-6)  # published digits
+  assert metrics["loss/dyn"] == 1.0 and metrics["loss/rep"] == 1.0
+  assert full.reached(jac, "dyn") == set() and full.reached(jac, "rep") == set()  # no gradient below the free nats
+
+
+# ---- resets and context ----------------------------------------------------------------------------------------------------------
+
+def changed(batch, **arrays):
+  return batch._replace(**arrays)
+
+
+def poke(x, index, value=0.7):
+  """A copy of x (rows, time, ...) with other values at the time indices."""
+  x = np.array(x)
+  x[:, index] = (x[:, index] + 1) % 8 if x.dtype.kind == "i" else ~x[:, index] if x.dtype == bool else x[:, index] + value
+  return x
+
+
+def same(a, b):
+  return all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b)))
+
+
+def test_first_erases_state_and_action(full):
+  batch = make_batch()
+  for at in (1, 3):
+    first = np.zeros_like(batch.first)
+    first[:, at] = True
+    start = changed(batch, first=first)
+    before = list(range(at))
+    other = changed(start, deter=poke(batch.deter, 0), stoch=poke(batch.stoch, 0), action=poke(batch.action, before), obs=poke(batch.obs, before))
+    a, b = (jax.tree.map(lambda x: x[at - 1:], full.observe(full.params, x, KEY)) for x in (start, other))
+    assert same(a, b)
+  no_reset = jax.tree.map(lambda x: x[at - 1:], full.observe(full.params, changed(other, first=np.zeros_like(batch.first)), KEY))
+  assert not same(no_reset, b)
+
+
+def test_first_state_of_an_episode_is_the_core_of_zeros(full):
+  batch = make_batch()
+  deter, _, _ = full.observe(full.params, changed(batch, first=np.ones_like(batch.first)), KEY)
+  zeros = full.agent._core(full.params, jnp.zeros((1, 128)), jnp.zeros((1, 64)), jnp.zeros((1, ACT)))
+  np.testing.assert_allclose(deter, np.broadcast_to(zeros, deter.shape), atol=1e-6)  # another program, same float32 sums
+
+
+def test_only_latent_and_action_of_the_context_count(full):
+  batch = make_batch(ends=True)
+  out = lambda b: full(full.params, full.slow, b)
+  base = out(batch)
+  quiet = changed(batch, **{n: poke(getattr(batch, n), 0) for n in ("obs", "reward", "first", "last", "terminal", "demo", "has_demo")},
+                  deter=poke(batch.deter, slice(1, None)), stoch=poke(batch.stoch, slice(1, None)))
+  assert same(base, out(quiet))
+  for name in ("deter", "stoch", "action"):
+    assert not same(base, out(changed(batch, **{name: poke(getattr(batch, name), 0)}))), name
+
+
+# ---- gradient routes -------------------------------------------------------------------------------------------------------------
+
+ROUTES = {
+    "dyn": {"enc", "dyn"}, "rep": {"enc", "dyn"}, "rec": {"enc", "dyn", "dec"}, "rew": {"enc", "dyn", "rew"}, "con": {"enc", "dyn", "con"},
+    "policy": {"pol"}, "value": {"val"}, "repval": {"enc", "dyn", "val"}, "clone": {"pol"}}
+
+
+@pytest.mark.parametrize("starts", ["full", "tail"])
+def test_each_loss_reaches_exactly_its_modules(starts, request):
+  fixture = request.getfixturevalue(starts)
+  jac, _, metrics, _, _, _ = fixture(fixture.params, fixture.slow, make_batch())
+  assert metrics["loss/dyn"] > 1.0 and metrics["loss/rep"] > 1.0  # else the free nats hide the route
+  assert {term: fixture.reached(jac, term) for term in TERMS} == ROUTES
+
+
+def test_dyn_and_rep_stop_one_side(full):
+  batch = make_batch()
+  batch = changed(batch, first=np.ones_like(batch.first))  # no step sees an earlier posterior, so only the direct route is left
+  jac, _, metrics, _, _, _ = full(full.params, full.slow, batch)
+  assert metrics["loss/dyn"] > 1.0
+  touched = lambda term: {n for n, t in jac["dyn"].items() if any(np.any(np.asarray(x[TERMS.index(term)]) != 0) for x in jax.tree.leaves(t))}
+  core = {"in_deter", "in_stoch", "in_action", "core_hidden", "core_norm", "core_gates"}
+  assert touched("dyn") - core == {"prior_mlp", "prior_out"} and "core_gates" in touched("dyn")
+  assert touched("rep") - core == {"post_hidden", "post_out"} and "core_gates" in touched("rep")
+  assert "enc" not in full.reached(jac, "dyn") and "enc" in full.reached(jac, "rep")
+
+
+# ---- the loss against NumPy ------------------------------------------------------------------------------------------------------
+
+def np_two_hot_ce(logits, x, bins):
+  """Cross-entropy (...) of logits (..., bins) with the two-hot of x (...), by a loop."""
+  out = np.zeros(x.shape)
+  for at in np.ndindex(x.shape):
+    row, target = logits[at].astype(np.float64), np.clip(x[at], bins[0], bins[-1])
+    logp = row - row.max() - np.log(np.sum(np.exp(row - row.max())))
+    high = min(max(1, int(np.sum(bins <= target))), len(bins) - 1)
+    weight = (target - bins[high - 1]) / (bins[high] - bins[high - 1])
+    out[at] = -(1 - weight) * logp[high - 1] - weight * logp[high]
+  return out
+
+
+def np_mean(logits, bins):
+  e = np.exp(logits.astype(np.float64) - logits.max(-1, keepdims=True))
+  return (e / e.sum(-1, keepdims=True)) @ bins
+
+
+@pytest.mark.parametrize("starts", ["full", "tail"])
+def test_loss_equals_numpy(starts, request):
+  fixture = request.getfixturevalue(starts)
+  agent, batch, weights = fixture.agent, make_batch(ends=True), Weights(0.3, 0.7)
+  # small heads keep the predictions small against the bins' 5e8, so that float32 and float64 agree
+  params = {**fixture.params, **{k: jax.tree.map(lambda x: 0.3 * x, fixture.params[k]) for k in ("rew", "val")}}
+  for k in ("rew", "val"):
+    bins_in_symlog = np.log1p(np.abs(np.asarray(agent.bins)))
+    out = params[k]["out"]
+    params[k] = {**params[k], "out": {**out, "bias": out["bias"] - 2 * jnp.asarray(bins_in_symlog)}}
+  slow = {**fixture.slow, "out": {**fixture.slow["out"], "bias": fixture.slow["out"]["bias"] - 3 * jnp.asarray(bins_in_symlog)}}
+  range_ = (-40.0, 60.0)
+  _, total, metrics, new_range, _, _ = fixture(params, slow, batch, range_, weights)
+  key_observe, key_imagine = jax.random.split(KEY)
+  deter, stoch, post = fixture.observe(params, batch, key_observe)
+  head = lambda name, d, s, p=None: getattr(agent, name).apply({"params": params[name] if p is None else p}, d, s)
+  bins = np.asarray(agent.bins, np.float64)
+  time = lambda x: np.asarray(x)[:, 1:].swapaxes(0, 1)
+  obs, reward, last, terminal, demo, has = (time(x) for x in (batch.obs, batch.reward, batch.last, batch.terminal, batch.demo, batch.has_demo))
+  want = {}
+
+  prior = agent.dyn.apply({"params": params["dyn"]}, deter, method="prior")
+  want["dyn"] = want["rep"] = np.mean(np.maximum(1.0, rssm.kl(post, prior)))
+  want["rec"] = np.mean(np.sum((np.asarray(head("dec", deter, stoch)) - np.sign(obs) * np.log1p(np.abs(obs))) ** 2, -1))
+  want["rew"] = np.mean(np_two_hot_ce(np.asarray(head("rew", deter, stoch)), reward, bins))
+  p_con, target = 1 / (1 + np.exp(-np.asarray(head("con", deter, stoch), np.float64)[..., 0])), (1 - terminal) * GAMMA
+  want["con"] = np.mean(-target * np.log(p_con) - (1 - target) * np.log(1 - p_con))
+
+  starts = agent.config.last_starts or LENGTH
+  flat = lambda x: x[LENGTH - starts:].reshape((starts * ROWS, -1))
+  i_deter, i_stoch, action = jax.jit(agent.imagine, static_argnums=4)(params, flat(deter), flat(stoch), key_imagine, IMAGINE)
+  r, v_logits = np_mean(np.asarray(head("rew", i_deter, i_stoch)), bins), np.asarray(head("val", i_deter, i_stoch))
+  c = 1 / (1 + np.exp(-np.asarray(head("con", i_deter, i_stoch), np.float64)[..., 0]))
+  v, w = np_mean(v_logits, bins), np_mean(np.asarray(head("val", i_deter, i_stoch, slow)), bins)
+  ret = np.zeros((IMAGINE, starts * ROWS))
+  after = v[-1]
+  for i in reversed(range(IMAGINE)):
+    after = ret[i] = r[i + 1] + c[i + 1] * (0.05 * v[i + 1] + 0.95 * after)
+  omega = np.stack([np.prod(c[:i + 1], 0) for i in range(IMAGINE)])
+  low_high = 0.99 * np.array(range_) + 0.01 * np.percentile(ret, [5, 95])
+  adv = (ret - v[:-1]) / max(1.0, low_high[1] - low_high[0])
+  mean, std = (np.asarray(x, np.float64) for x in head("pol", i_deter[:-1], i_stoch[:-1]))
+  mean, std = np.tanh(mean), 0.1 + 0.9 / (1 + np.exp(-std - 2))
+  logp = np.sum(-0.5 * ((np.asarray(action)[:-1] - mean) / std) ** 2 - np.log(std) - 0.5 * np.log(2 * np.pi), -1)
+  entropy = np.sum(0.5 * np.log(2 * np.pi * np.e * std ** 2), -1)
+  want["policy"] = np.mean(-omega * (logp * adv + 3e-4 * entropy))
+  want["value"] = np.mean(omega * (np_two_hot_ce(v_logits[:-1], ret, bins) + np_two_hot_ce(v_logits[:-1], w[:-1], bins)))
+
+  reward, last, terminal, boot = *(x[LENGTH - starts:] for x in (reward, last, terminal)), ret[0].reshape(starts, ROWS)
+  after, targets = boot[-1], np.zeros((starts - 1, ROWS))
+  for t in reversed(range(starts - 1)):
+    lam = 0.95 * (1 - last[t + 1])
+    after = targets[t] = reward[t + 1] + (1 - terminal[t + 1]) * GAMMA * ((1 - lam) * boot[t + 1] + lam * after)
+  d, s = deter[LENGTH - starts:][:-1], stoch[LENGTH - starts:][:-1]
+  logits, slow_value = np.asarray(head("val", d, s)), np_mean(np.asarray(head("val", d, s, slow)), bins)
+  want["repval"] = np.mean((1 - last[:-1]) * (np_two_hot_ce(logits, targets, bins) + np_two_hot_ce(logits, slow_value, bins)))
+
+  mean, std = (np.asarray(x, np.float64) for x in head("pol", deter, stoch))
+  mean, std = np.tanh(mean), 0.1 + 0.9 / (1 + np.exp(-std - 2))
+  kl = np.sum(np.log(std / 0.2) + (0.2 ** 2 + (demo - mean) ** 2) / (2 * std ** 2) - 0.5, -1)
+  want["clone"] = kl[has].mean()
+
+  assert np.abs(adv).max() > 1e-3 and np.abs(w - v).max() > 1e-3 and last.any()  # the case is not trivial
+  np.testing.assert_allclose(new_range, low_high, rtol=1e-4)  # float32 expectations over bins up to 5e8
+  for name in TERMS:
+    np.testing.assert_allclose(metrics[f"loss/{name}"], want[name], rtol=1e-3, atol=1e-5, err_msg=name)  # the same expectations
+  scales = dict(dyn=1, rep=0.1, rec=1, rew=1, con=1, policy=0.7, value=1, repval=0.3, clone=0.3)
+  np.testing.assert_allclose(total, sum(scales[k] * float(metrics[f"loss/{k}"]) for k in TERMS), rtol=1e-5)  # float32 sum of 9
