@@ -175,7 +175,8 @@ def clock(seconds: float) -> str:
 
 
 def emit(value) -> None:
-  print(json.dumps(value, allow_nan=False))
+  from mjx_cl.store import plain
+  print(json.dumps(value, allow_nan=False, default=plain))
 
 
 class RunDisplay:

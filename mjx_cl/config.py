@@ -121,6 +121,7 @@ class AdaptConfig:
     ratio: replayed steps per post-alarm record, 16 in the paper.
     start_windows: windows that the post-alarm replay must hold before the first update.
     lr: learning rate while adapting, None: the agent's own.
+    last_starts: imagination starts while adapting, the last k states of each sequence, 0 all; None: the agent's own.
     patience: length over which every signal must be settled [chunks of 64 decisions].
     trend: largest difference of the means of the first and second half of that length [share of the level].
     fluctuation: largest standard deviation over that length [share of the level], or
@@ -136,6 +137,7 @@ class AdaptConfig:
   ratio: float = 16.0
   start_windows: int = 1024
   lr: float | None = None
+  last_starts: int | None = None
   patience: int = 32
   trend: float = 0.25
   fluctuation: float = 0.5

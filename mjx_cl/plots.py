@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import os
 import pathlib
+import warnings
 
 import numpy as np
 
@@ -53,7 +54,9 @@ def figure(folder, width: int = 500) -> pathlib.Path:
       top = 0.0
       for arm, data in panels.items():
         curves = smooth(data[column], width)
-        mean, std = np.nanmean(curves, 0), np.nanstd(curves, 0)
+        with warnings.catch_warnings():  # the first rows of a run have no residual yet
+          warnings.simplefilter("ignore", RuntimeWarning)
+          mean, std = np.nanmean(curves, 0), np.nanstd(curves, 0)
         shade = color if arm == main else "0.6"
         host.plot(x[::every], mean[::every], color=shade, lw=1.6 if arm == main else 1.0, zorder=3 if arm == main else 1,
                   ls="-" if arm == main else ("--", ":", "-.")[columns.index((column, label))])

@@ -55,7 +55,7 @@ class Runner:
     self.config, self.out = config, pathlib.Path(out)
     self.env = envs.make(config.env, config.physics)
     spec = self.env.spec
-    self.trained = agents.load(config.agent, config.env, len(spec.obs), len(spec.act), lr=config.adapt.lr)
+    self.trained = agents.load(config.agent, config.env, len(spec.obs), len(spec.act), config.adapt.lr, config.adapt.last_starts)
     agent, self.repeat = self.trained.agent, int(self.trained.card.get("repeat", 1))
     self.fault = faults.make(config.fault, spec)
     target = faults.target_index(self.fault, config.target)
@@ -260,9 +260,9 @@ class Runner:
     onset, control_s = c.onset, self.env.spec.control_s
     pre, drop = {}, {}
     for g, (arm, seed) in enumerate(self.labels):
-      reward, alarm = trace["reward"][:, g].astype(float), trace["alarm"][:, g]
-      fired = np.flatnonzero(alarm[:onset])
-      pre[g] = recovery.reward_pre(reward, onset, c.adapt.warmup, int(fired[0]) if len(fired) else None)
+      reward = trace["reward"][:, g].astype(float)
+      acted = [int(s) for s, d in zip(trace["since"][:, g], trace["decision"][:, g]) if d == phase_lib.START]
+      pre[g] = recovery.reward_pre(reward, onset, c.adapt.warmup, acted[0] if acted else None)
       if arm == "none":
         drop[seed] = recovery.reward_drop(reward, onset, pre[g]) if c.fault != "none" and onset < c.steps else None
     for g, (arm, seed) in enumerate(self.labels):

@@ -13,12 +13,19 @@ from mjx_cl.errors import FileError, UserError
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "mjbatch", "flax", "optax", "orbax-checkpoint", "numpy")
 
 
+def plain(x):
+  """NumPy scalars and arrays as Python values, for json."""
+  if hasattr(x, "tolist"):
+    return x.tolist()
+  raise TypeError(f"{type(x).__name__} is no JSON value")
+
+
 def write_json(path, value) -> None:
   """Writes JSON (nan and infinity refused) to a temporary name and renames it."""
   path = pathlib.Path(path)
   tmp = path.with_name(path.name + ".tmp")
   try:
-    tmp.write_text(json.dumps(value, indent=1, allow_nan=False) + "\n")
+    tmp.write_text(json.dumps(value, indent=1, allow_nan=False, default=plain) + "\n")
     os.replace(tmp, path)
   except OSError as e:
     tmp.unlink(missing_ok=True)

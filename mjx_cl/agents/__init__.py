@@ -59,13 +59,14 @@ def save(folder, train: TrainState, card: dict) -> None:
   os.replace(tmp, folder / "card.json")
 
 
-def load(path: str | None, env_name: str, obs_size: int, act_size: int, lr: float | None = None) -> Trained:
+def load(path: str | None, env_name: str, obs_size: int, act_size: int, lr: float | None = None,
+         last_starts: int | None = None) -> Trained:
   """Loads an agent by shipped name or folder.
 
   Args:
     path: folder or shipped name; None: the shipped agent named as the environment.
     env_name: robot that it must fit.
-    lr: learning rate to go on with, None: that of its own config at the end of its training.
+    lr, last_starts: learning rate and imagination starts to go on with, None: those of its own config.
   Raises:
     UserError for an agent of another robot or an unknown name; FileError for a broken or foreign file.
   """
@@ -82,8 +83,7 @@ def load(path: str | None, env_name: str, obs_size: int, act_size: int, lr: floa
     raise FileError(f"{folder / 'card.json'} is not an agent's card: {e}") from None
   if card.get("env") != env_name:
     raise UserError(f"agent {name!r} was trained on {card.get('env')!r}, not on {env_name!r}")
-  if lr is not None:
-    config = dataclasses.replace(config, lr=lr)
+  config = dataclasses.replace(config, **{k: v for k, v in (("lr", lr), ("last_starts", last_starts)) if v is not None})
   agent = Agent(config, obs_size, act_size)
   like = jax.eval_shape(agent.init, jax.random.key(0))
   try:

@@ -11,7 +11,10 @@ FINAL = 2000  # last steps of the run
 
 
 def reward_pre(reward: np.ndarray, onset: int, warmup: int, first_alarm: int | None) -> float | None:
-  """Mean reward of all steps before onset, after warm-up, before any alarm; None where none are left."""
+  """Mean reward of all steps before onset, after warm-up, before any alarm that was acted on; None where none are left.
+
+  An alarm that is only logged (arm `none`) changes nothing that the robot does, so it does not end the window.
+  """
   end = onset if first_alarm is None else min(onset, first_alarm)
   return float(np.mean(reward[warmup:end])) if end > warmup else None
 

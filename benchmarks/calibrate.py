@@ -1,0 +1,128 @@
+"""Calibrates `rolling_sigma` on the walker: threshold, window and run length for ARL0 = 100,000 control steps.
+
+  python benchmarks/calibrate.py --out results/arl0.json
+
+Nominal streams of seeds 100 to 109 give ARL0 = nominal steps / alarms, with restarts (every alarm counts, the window is kept), for every
+setting of the grid; the same agent with its gear halved (seeds 100 to 109, onset 5,000) gives the share of affected streams that alarm within
+500 steps. Chosen: among settings with ARL0 at or above the goal the one that finds most, then the one with the shortest mean delay, capped at
+500. ARL0 carries a Poisson interval; one that rests on fewer than 50 alarms is marked.
+"""
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import sys
+import time
+
+import numpy as np
+
+WARMUP = 1000  # control steps at the start of a stream that nothing is counted in, as in `run`
+
+
+def scores(x: np.ndarray, window: int, warmup: int = 500) -> np.ndarray:
+  """z of each sample against the rolling mean and deviation of the `window` samples before it, for one channel (steps, streams).
+
+  Invalid (nan) samples are left out of the windows, as `detectors.on` does; nan where nothing is known.
+  """
+  z = np.full(x.shape, np.nan)
+  for g in range(x.shape[1]):
+    good = np.flatnonzero(np.isfinite(x[:, g]))
+    v = x[good, g].astype(np.float64)
+    sums = np.concatenate([[0.0], np.cumsum(v)])
+    squares = np.concatenate([[0.0], np.cumsum(v * v)])
+    at = np.arange(len(v))
+    low = np.maximum(0, at - window)
+    n = np.maximum(1, at - low)
+    mean = (sums[at] - sums[low]) / n
+    std = np.sqrt(np.maximum(0.0, (squares[at] - squares[low]) / n - mean * mean))
+    z[good, g] = np.where(at >= min(warmup, window), (v - mean) / np.maximum(std, 1e-6), np.nan)
+  return z
+
+
+def alarms(z: np.ndarray, threshold: float, patience: int, two_sided: bool) -> np.ndarray:
+  """Alarms of one channel, bool (steps, streams): `patience` valid samples in a row beyond the threshold, then the run starts anew."""
+  fired = np.zeros(z.shape, bool)
+  for g in range(z.shape[1]):
+    good = np.flatnonzero(np.isfinite(z[:, g]))
+    beyond = (np.abs(z[good, g]) if two_sided else z[good, g]) > threshold
+    at = np.arange(len(beyond))
+    start = np.maximum.accumulate(np.where(~beyond, at, -1))
+    run = np.where(beyond, at - start, 0)
+    fired[good[(run > 0) & (run % patience == 0)], g] = True
+  return fired
+
+
+def poisson(count: int, steps: float) -> list[float | None]:
+  """95 % interval of steps / alarms from the exact Poisson interval of the count."""
+  from scipy.stats import chi2
+  low = chi2.ppf(0.025, 2 * count) / 2 if count else 0.0
+  high = chi2.ppf(0.975, 2 * count + 2) / 2
+  return [steps / high, steps / low if low else None]
+
+
+def main() -> None:
+  parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+  parser.add_argument("--out", default="results/arl0.json")
+  parser.add_argument("--agent", default=None)
+  parser.add_argument("--streams", type=int, default=10, help="nominal streams per seed")
+  parser.add_argument("--steps", type=int, default=20_000, help="steps of each nominal stream")
+  parser.add_argument("--goal", type=float, default=100_000.0)
+  parser.add_argument("--cache", default=None, help="an .npz that keeps the recorded streams between calls")
+  parser.add_argument("--json", action="store_true")
+  args = parser.parse_args()
+  import os
+  from mjx_cl import agents, envs, record, runtime, store
+  runtime.setup()
+  seeds = range(100, 110)
+  begin = time.time()
+  if args.cache and os.path.exists(args.cache):
+    with np.load(args.cache) as z:
+      data = {k: z[k] for k in z.files}
+  else:
+    env = envs.make("walker")
+    trained = agents.load(args.agent, "walker", len(env.spec.obs), len(env.spec.act))
+    tell = lambda done, steps: print(f"{done}/{steps}", file=sys.stderr) if done % 6400 == 0 else None
+    nominal = record.record(env, trained, record.stream_keys(seeds, args.streams), args.steps, progress=tell)
+    fault = record.record(env, trained, record.stream_keys(seeds, 4), 7500, "gear", 0.5, 5000, progress=tell)
+    data = {f"n_{k}": nominal[k] for k in ("opr", "rpr", "reward")} | {f"f_{k}": fault[k] for k in ("opr", "rpr", "reward", "target")}
+    if args.cache:
+      np.savez(args.cache, **data)
+  pre, post = data["f_reward"][WARMUP:5000].mean(0), data["f_reward"][5000:7000].mean(0)
+  affected = 1 - post / pre >= 0.1
+  steps = (data["n_opr"].shape[0] - WARMUP) * data["n_opr"].shape[1]
+  rows = []
+  for window in (1000, 2000, 4000, 8000):
+    zn = {c: scores(data[f"n_{c}"], window) for c in ("opr", "rpr")}
+    zf = {c: scores(data[f"f_{c}"], window) for c in ("opr", "rpr")}
+    grid = itertools.product((2.0, 2.5, 3.0, 3.5, 4.0, 5.0, 6.0), (1, 5, 10, 15, 20, 25, 30, 40, 50, 65, 80, 100), (True, False))
+    for threshold, patience, two_sided in grid:
+      hit = sum(alarms(zn[c], threshold, patience, two_sided) for c in zn) > 0
+      count = int(hit[WARMUP:].sum())
+      found = sum(alarms(zf[c], threshold, patience, two_sided) for c in zf) > 0
+      after = found[5000:5501]
+      delay = np.where(after.any(0), after.argmax(0), 500)
+      first = hit[WARMUP:5000].any(0)
+      rows.append({"window": window, "threshold": threshold, "patience": patience, "two_sided": two_sided, "alarms": count,
+                   "arl0": steps / count if count else None, "arl0_ci": poisson(count, steps), "few": count < 50,
+                   "nominal_5000_clean": float(1 - first.mean()), "within_500": float((delay[affected] < 500).mean()), "delay": float(delay[affected].mean())})
+  plain = next(r for r in rows if r["window"] == 1000 and r["threshold"] == 3.0 and r["patience"] == 1 and r["two_sided"])
+  good = [r for r in rows if r["arl0"] is None or r["arl0"] >= args.goal]
+  best = max(good, key=lambda r: (r["within_500"], -r["delay"]))
+  value = {"command": f"python benchmarks/calibrate.py --streams {args.streams} --steps {args.steps} --goal {args.goal:g}", "seeds": [100, 109], "nominal_steps": steps,
+           "fault_streams": int(len(affected)), "fault_affected": int(affected.sum()), "goal": args.goal, "chosen": best, "plain": plain,
+           "frontier": sorted(good, key=lambda r: (-r["within_500"], r["delay"]))[:20], "wall_s": round(time.time() - begin), **store.provenance()}
+  store.write_json(args.out, value)
+  out = [{"name": name, "value": r[k], "unit": unit, "goal": goal, "holds": None if goal is None else bool((r[k] or 1e18) >= args.goal)}
+         for name, r, k, unit, goal in (("arl0_chosen", best, "arl0", "control steps", f">= {args.goal:g}"), ("arl0_plain", plain, "arl0", "control steps", None),
+                                        ("within_500_chosen", best, "within_500", "share of affected", None))]
+  if args.json:
+    print(json.dumps(out))
+  else:
+    print("affected", int(affected.sum()), "of", len(affected), "\nplain ", plain, "\nchosen", best)
+    for r in value["frontier"][:8]:
+      print(r)
+
+
+if __name__ == "__main__":
+  main()

@@ -1,0 +1,137 @@
+"""XLA flags, compile cache, and the two programs that have been known to hang: many MJX robots, many physics callbacks."""
+import importlib.metadata
+import os
+import pathlib
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+
+from mjx_cl import runtime
+from mjx_cl.physics.native import Native
+
+SCHEDULER = "--xla_cpu_enable_concurrency_optimized_scheduler"
+
+
+@pytest.mark.parametrize("version", ["0.9.2", "0.11", "0.11.0", "0.12.1", "1.10.0"])
+def test_flags_of_sound_versions_are_the_users(version):
+  assert runtime.xla_flags(version, "") == ""
+  assert runtime.xla_flags(version, "--xla_a=1  --xla_b=2") == "--xla_a=1 --xla_b=2"
+
+
+@pytest.mark.parametrize("version", ["0.10.0", "0.10.2", "0.10.2.dev20260101"])
+def test_flags_of_0_10_cure_the_hang_and_keep_the_users(version):
+  assert runtime.xla_flags(version, "") == f"{SCHEDULER}=false"
+  assert runtime.xla_flags(version, "--xla_b=2 --xla_a=1") == f"--xla_b=2 --xla_a=1 {SCHEDULER}=false"
+
+
+@pytest.mark.parametrize("own", [f"{SCHEDULER}=true", f"{SCHEDULER}=false", SCHEDULER])
+def test_the_users_own_value_wins(own):
+  assert runtime.xla_flags("0.10.2", f"--xla_a=1 {own}") == f"--xla_a=1 {own}"
+
+
+def test_a_flag_with_the_same_beginning_is_another_flag():
+  assert runtime.xla_flags("0.10.2", f"{SCHEDULER}_other=1").split() == [f"{SCHEDULER}_other=1", f"{SCHEDULER}=false"]
+
+
+def test_cache_dir_follows_the_environment(monkeypatch, tmp_path):
+  monkeypatch.setenv("MJX_CL_CACHE", str(tmp_path / "here"))
+  assert runtime.cache_dir() == tmp_path / "here"
+  monkeypatch.setenv("MJX_CL_CACHE", "~/there")
+  assert runtime.cache_dir() == pathlib.Path.home() / "there"
+  monkeypatch.delenv("MJX_CL_CACHE")
+  monkeypatch.setattr(runtime.sys, "platform", "linux")
+  monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+  assert runtime.cache_dir() == tmp_path / "mjx_cl"
+  monkeypatch.setattr(runtime.sys, "platform", "darwin")
+  assert runtime.cache_dir() == pathlib.Path.home() / "Library/Caches/mjx_cl"
+
+
+def test_setup_has_set_cache_and_dispatch():
+  assert jax.config.jax_compilation_cache_dir == os.environ["MJX_CL_CACHE"]
+  assert jax.config.values["jax_cpu_enable_async_dispatch"] is False
+
+
+def test_setup_is_idempotent(monkeypatch):
+  monkeypatch.setattr(importlib.metadata, "version", lambda name: {"jaxlib": "0.10.2"}[name])
+  monkeypatch.setattr(runtime, "_done", False)
+  monkeypatch.setenv("XLA_FLAGS", "--xla_a=1")
+  for _ in range(2):
+    runtime.setup()
+    assert os.environ["XLA_FLAGS"] == f"--xla_a=1 {SCHEDULER}=false"
+  monkeypatch.setenv("XLA_FLAGS", "--xla_a=2")
+  runtime.setup()
+  assert os.environ["XLA_FLAGS"] == "--xla_a=2"  # a second call touches nothing
+
+
+def test_setup_survives_a_home_that_cannot_be_written(monkeypatch, tmp_path):
+  (tmp_path / "file").write_text("")
+  before = jax.config.jax_compilation_cache_dir
+  monkeypatch.setattr(runtime, "_done", False)
+  monkeypatch.setenv("MJX_CL_CACHE", str(tmp_path / "file" / "cache"))  # a folder below a file: OSError for every user, root too
+  monkeypatch.setenv("XLA_FLAGS", "")
+  runtime.setup()
+  assert jax.config.jax_compilation_cache_dir == before
+
+
+def test_256_mjx_walkers_finish_and_agree_with_mujoco(walker, pair, fields, crowd, within):
+  init, step = pair["mjx"]
+  qpos, qvel = (np.concatenate([x[1][:128]] * 2) for x in crowd)  # robot i + 128 is robot i once more
+  ctrl = np.random.default_rng(1).uniform(-1, 1, (3, 128, 6)).astype(np.float32)
+
+  def run():
+    state = init(qpos, qvel)
+    for c in ctrl:
+      state, out = step(fields, state, np.concatenate([c, c]))
+    return {name: np.asarray(x) for name, x in out.items()}
+  out = within(300, run)
+  for x in out.values():
+    np.testing.assert_array_equal(x[:128], x[128:])
+  error = []
+  for i in range(0, 128, 8):
+    data = mujoco.MjData(walker)
+    data.qpos[:], data.qvel[:] = qpos[i], qvel[i]
+    for c in ctrl[:, i]:
+      data.ctrl[:] = c
+      mujoco.mj_step(walker, data, 10)
+    assert np.abs(data.qpos - qpos[i]).max() > 0.05  # it moved far more than the tolerance
+    error.append([np.abs(data.qpos - out["qpos"][i]).max(), np.abs(data.qvel - out["qvel"][i]).max()])
+  position, speed = np.median(error, 0)
+  assert position < 5e-6 and speed < 2e-4, error  # measured: 5.5e-7, 1.5e-5; contact outliers are test_physics.py's business
+
+
+def test_20000_callbacks_with_160_streams(walker, within):
+  """The known risk is a deadlock (jax issues 24255, 25861); the oracle is plain mj_step, bit for bit."""
+  streams, calls, watched = 160, 20_000, np.array([3, 158])
+  native = Native(walker, substeps=1)
+  rng = np.random.default_rng(2)
+  gear = (np.asarray(walker.actuator_gear) * rng.uniform(0.5, 1.5, (streams, 6, 1))).astype(np.float32)
+  qpos = np.concatenate([np.zeros((streams, 2)), rng.uniform(-1, 1, (streams, 1)), rng.uniform(-0.3, 0, (streams, 6))], 1).astype(np.float32)
+
+  @jax.jit
+  def run(state, key):
+    def one(state, k):
+      ctrl = jax.random.uniform(jax.random.fold_in(key, k), (streams, 6), minval=-1, maxval=1)
+      state, _ = jax.vmap(native.step)({"actuator_gear": gear}, state, ctrl)
+      return state, ctrl[watched]
+    return jax.lax.scan(one, state, np.arange(calls))
+  state = jax.vmap(native.init)(qpos, np.zeros((streams, 9), np.float32))
+  state, ctrl = within(500, lambda: jax.tree.map(np.asarray, run(state, jax.random.key(0))))
+  spec = mujoco.mjtState.mjSTATE_INTEGRATION
+  for j, i in enumerate(watched):
+    model, data, row = load_geared(walker, gear[i]), mujoco.MjData(walker), np.empty(mujoco.mj_stateSize(walker, spec))
+    data.qpos[:] = qpos[i]
+    for c in ctrl[:, j]:
+      data.ctrl[:] = c
+      mujoco.mj_step(model, data)
+    mujoco.mj_getState(model, data, row, spec)
+    assert data.time == pytest.approx(50.0)  # 20,000 steps of 0.0025 s
+    np.testing.assert_array_equal(state[i].view(np.float64), row)
+
+
+def load_geared(model, gear):
+  """Copy of a model with other gears."""
+  model = model.__copy__()
+  model.actuator_gear[:] = gear
+  return model
