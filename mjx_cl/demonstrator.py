@@ -12,6 +12,7 @@ import os
 import pathlib
 import sys
 import time
+import zipfile
 from typing import NamedTuple
 
 import jax
@@ -58,7 +59,7 @@ def load(path: str | os.PathLike) -> Policy:
     with np.load(path, allow_pickle=False) as z:
       layers = tuple((jnp.asarray(z[f"kernel{i}"]), jnp.asarray(z[f"bias{i}"])) for i in range(sum(k.startswith("kernel") for k in z)))
       return Policy(jnp.asarray(z["mean"]), jnp.asarray(z["std"]), layers)
-  except (OSError, KeyError, ValueError) as e:
+  except (OSError, KeyError, ValueError, zipfile.BadZipFile) as e:
     raise FileError(f"cannot read demonstrator {path}: {e}") from None
 
 
