@@ -18,6 +18,7 @@ from mjx_cl.adapt import phase as phase_lib
 from mjx_cl.adapt.loop import Loop, LoopState
 from mjx_cl.config import RunConfig
 from mjx_cl.errors import FileError
+from mjx_cl.interrupt import Interruptible
 from mjx_cl.monitor import Monitor
 from mjx_cl.rollout import Rollout, Stream, nest, start
 from mjx_cl.scoring import alarms as alarm_score, bootstrap, recovery
@@ -358,15 +359,17 @@ def execute(config: RunConfig, out, resume: bool = False, overwrite: bool = Fals
   else:
     store.write_json(out / "config.json", values)
   saved = time.monotonic()
-  try:
-    while not runner.done:
-      progress(runner.step())
-      if time.monotonic() - saved > save_every_s:
-        runner.save()
-        saved = time.monotonic()
-  except KeyboardInterrupt:
-    runner.save()
-    raise
+  with Interruptible() as interrupt:
+    try:
+      while not runner.done:
+        progress(runner.step())
+        interrupt.check()
+        if time.monotonic() - saved > save_every_s:
+          runner.save()
+          saved = time.monotonic()
+    except KeyboardInterrupt:
+      runner.save()
+      raise
   return runner.finish()
 
 

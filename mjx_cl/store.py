@@ -71,9 +71,15 @@ def query(folder, sql: str) -> tuple[list[str], list[tuple]]:
     raise UserError(f"no .parquet file in {folder}")
   with duckdb.connect() as db:
     for file in files:
-      db.execute(f"create view {file.stem} as select * from read_parquet('{str(file).replace(chr(39), chr(39) * 2)}')")
+      name, at = file.stem.replace('"', '""'), str(file).replace("'", "''")
+      try:
+        db.execute(f"create view \"{name}\" as select * from read_parquet('{at}')")
+      except duckdb.Error as e:
+        raise FileError(f"cannot read {file}: {str(e).splitlines()[0]}") from None
     try:
       result = db.execute(sql)
+      if result is None:
+        raise UserError(f"query: no statement; views: {', '.join(f.stem for f in files)}")
       return [c[0] for c in result.description], result.fetchall()
     except duckdb.Error as e:
       raise UserError(f"query: {str(e).splitlines()[0]}; views: {', '.join(f.stem for f in files)}") from None

@@ -18,6 +18,7 @@ from mjx_cl import checkpoint, demonstrator, faults, replay as replay_lib
 from mjx_cl.config import DreamerConfig, TrainConfig
 from mjx_cl.dreamer.agent import Agent, TrainState, Weights
 from mjx_cl.errors import FileError, UserError
+from mjx_cl.interrupt import Interruptible
 from mjx_cl.rollout import Rollout, Stream, nest, records, start
 
 CHUNK = 64  # decisions between two rounds of updates
@@ -94,7 +95,7 @@ class Trainer:
     self.owed = 0.0
     self.rows: list[dict] = []
     self.own: list[float] = []
-    self.seconds = 0.0
+    self.seconds, self.chunks = 0.0, 0
     spec = env.spec
     self.plain = Agent(dreamer, len(spec.obs), len(spec.act))
     fault = faults.make("none", spec)
@@ -189,6 +190,7 @@ class Trainer:
     self.seconds += end - begin
     row |= {"updates": self.updates, "seconds": self.seconds, "collect_s": collected - begin, "learn_s": end - collected}
     self.rows.append(row)
+    self.chunks += 1
     self._advance_phase()
     return row
 
@@ -202,8 +204,9 @@ class Trainer:
     """Checkpoint (arrays with replay) and metrics.parquet."""
     meta = {"phase": self.phase, "phase_start": self.phase_start, "owed": self.owed, "own": self.own, "expert_return": self.expert_return,
             "sums": self.returns.sums.tolist(), "seconds": self.seconds}
-    self.checkpoints.save(len(self.rows), self.state, meta)
-    self.write_metrics()
+    self.write_metrics()  # first: a kill in between leaves rows too many, which resume cuts off
+    if self.checkpoints.latest() != self.chunks:
+      self.checkpoints.save(self.chunks, self.state, meta)
 
   def write_metrics(self) -> None:
     import pyarrow
@@ -221,9 +224,10 @@ class Trainer:
     self.state, meta = self.checkpoints.load(self.state)
     self.phase, self.phase_start, self.owed, self.own = meta["phase"], meta["phase_start"], meta["owed"], meta["own"]
     self.expert_return, self.returns.sums, self.seconds = meta["expert_return"], np.asarray(meta["sums"]), meta["seconds"]
+    self.chunks = self.checkpoints.latest()
     path = self.out / "metrics.parquet"
     if path.exists():
-      self.rows = pyarrow.parquet.read_table(path).to_pylist()[:self.checkpoints.latest()]
+      self.rows = pyarrow.parquet.read_table(path).to_pylist()[:self.chunks]
 
 
 def build(env, dreamer: DreamerConfig, config: TrainConfig, out, seed: int, seeds: int, demonstrator_name: str | None, agent_name: str | None,
@@ -284,12 +288,15 @@ def export(trainer: Trainer, episodes: int = 20) -> dict:
 def run(trainer: Trainer, progress=lambda row: None, save_every_s: float = 240.0) -> None:
   """Trains to the end, saving every `save_every_s` seconds, at the end, and when interrupted."""
   saved = time.monotonic()
-  try:
+  with Interruptible() as interrupt:
     while not trainer.done:
-      progress(trainer.step())
+      try:
+        progress(trainer.step())
+        interrupt.check()
+      except KeyboardInterrupt:
+        trainer.save()
+        raise
       if time.monotonic() - saved > save_every_s:
         trainer.save()
         saved = time.monotonic()
-  finally:
-    if trainer.rows and trainer.checkpoints.latest() != len(trainer.rows):
-      trainer.save()
+  trainer.save()
