@@ -122,6 +122,8 @@ class AdaptConfig:
     start_windows: windows that the post-alarm replay must hold before the first update.
     lr: learning rate while adapting, None: the agent's own.
     last_starts: imagination starts while adapting, the last k states of each sequence, 0 all; None: the agent's own.
+    fresh_moments: forget the optimiser's moments at an alarm. Kept ones were gathered on the gradients of a trained agent; those after an event
+      are many times larger, so that each step would be that many times the learning rate until the RMS (memory 1,000 updates) has followed.
     patience: length over which every signal must be settled [chunks of 64 decisions].
     trend: largest difference of the means of the first and second half of that length [share of the level].
     fluctuation: largest standard deviation over that length [share of the level], or
@@ -138,6 +140,7 @@ class AdaptConfig:
   start_windows: int = 1024
   lr: float | None = None
   last_starts: int | None = None
+  fresh_moments: bool = False
   patience: int = 32
   trend: float = 0.25
   fluctuation: float = 0.5

@@ -110,6 +110,6 @@ class Monitor:
       error, valid = error[step, row], valid[step, row]
     count = jnp.sum(valid, 0)
     mean = jnp.sum(jnp.where(valid[..., None], error, 0.0), 0) / jnp.maximum(1, count)[..., None]
-    good = count >= self.least
+    good = (count >= self.least) & seq.exists[:rows]  # n steps since the run began
     mean = jnp.where(good[..., None], mean, jnp.nan)
     return Residual(jnp.mean(mean[..., :-1], -1), mean[..., -1], mean[..., :-1], good)

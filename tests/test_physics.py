@@ -218,7 +218,8 @@ def test_both_backends_read_the_fields_they_are_given(walker, pair, fields, crow
   ctrl = np.full((len(qpos), 6), 0.8, np.float32)
   outs = {}
   for name, (init, step) in pair.items():
-    whole, half = (step({"actuator_gear": g}, init(qpos, qvel), ctrl)[1]["qvel"] for g in (fields["actuator_gear"], fields["actuator_gear"] / 2))
+    gear, start = fields["actuator_gear"], init(qpos, qvel)
+    whole, half = (step({"actuator_gear": g}, start, ctrl)[1]["qvel"] for g in (gear, gear / 2))
     outs[name] = np.asarray(whole - half)
   effect = np.abs(outs["native"]).max(-1)
   assert np.median(effect) > 0.5  # [rad/s]; measured: 5.4

@@ -104,14 +104,15 @@ class Loop:
     index, least_posture = self.spec.posture or (0, -jnp.inf)
     posture = jnp.mean(rows.final_obs[:, :, 0, index], 0)
 
-    chunk_start = now - length * self.repeat
-    first = jnp.argmax(alarms.fired, 0)
-    alarm_step = chunk_start + (first + 1) * self.repeat - 1
+    known = now - length * self.repeat + (jnp.arange(length) + 1) * self.repeat - 1  # control step at which each row is known
+    acted = alarms.fired & (known >= self.config.warmup)[:, None]
+    first = jnp.argmax(acted, 0)
+    alarm_step = known[first]
     acceptance = self.spec.acceptance if self.config.acceptance is None else self.config.acceptance
     step = functools.partial(phase_lib.update, config=self.config)
     was = state.phase.phase
     phase, decision, ok = jax.vmap(step, (0, 0, 0, 0, 0, None, 0, None, None))(
-        state.phase, signals, posture, jnp.any(alarms.fired, 0), alarm_step, now, acts, acceptance, least_posture)
+        state.phase, signals, posture, jnp.any(acted, 0), alarm_step, now, acts, acceptance, least_posture)
 
     # replay holds what came after the alarm and nothing else
     begins = decision == phase_lib.START
@@ -126,7 +127,12 @@ class Loop:
     due = (phase.phase == phase_lib.ADAPTING) & (windows >= self.config.start_windows)
     owed = jnp.where(due, state.owed + length * self.config.ratio / (c.batch * c.length), 0.0)
     number = jnp.floor(owed + 1e-6).astype(jnp.int32)
-    train, replay = self._learn(state.train, replay, key_update, number)
+    train = state.train
+    if self.config.fresh_moments:
+      fresh = jax.vmap(self.agent.optimizer.init)(train.params)
+      reset = lambda new, old: jnp.where(begins.reshape((-1,) + (1,) * (old.ndim - 1)), new, old)
+      train = train._replace(opt=jax.lax.cond(jnp.any(begins), lambda o: jax.tree.map(reset, fresh, o), lambda o: o, train.opt))
+    train, replay = self._learn(train, replay, key_update, number)
 
     # a stream that has converged watches again, its reference refitted on the latest rows
     detector = jax.lax.cond(jnp.any(decision == phase_lib.STOP), self._refit, lambda d, p, s: d, detector, past, decision == phase_lib.STOP)

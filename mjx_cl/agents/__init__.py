@@ -83,6 +83,7 @@ def load(path: str | None, env_name: str, obs_size: int, act_size: int, lr: floa
     raise FileError(f"{folder / 'card.json'} is not an agent's card: {e}") from None
   if card.get("env") != env_name:
     raise UserError(f"agent {name!r} was trained on {card.get('env')!r}, not on {env_name!r}")
+  config = dataclasses.replace(config, warmup=0)  # whatever goes on from here does so at full learning rate
   config = dataclasses.replace(config, **{k: v for k, v in (("lr", lr), ("last_starts", last_starts)) if v is not None})
   agent = Agent(config, obs_size, act_size)
   like = jax.eval_shape(agent.init, jax.random.key(0))

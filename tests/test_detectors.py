@@ -1,0 +1,254 @@
+"""Detectors: one contract for every entry of the table and every scalar detector, then each against its own oracle."""
+import importlib
+import pkgutil
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.stats
+
+from mjx_cl import detectors
+from mjx_cl.detectors import Alarm, Detector, any_of, on, rolling_sigma
+from mjx_cl.errors import UserError
+from mjx_cl.monitor import Residual
+
+# one detector a file, named as the file; a map over one float32
+SCALAR = {m.name: f for m in pkgutil.iter_modules(detectors.__path__)
+          if (f := getattr(importlib.import_module(f"mjx_cl.detectors.{m.name}"), m.name, None)) is not None}
+ALL = {f"{k} (residual)": lambda k=k: detectors.make(k) for k in detectors.DETECTORS} | {f"{k} (scalar)": lambda f=f: on("opr", f()) for k, f in SCALAR.items()}
+STREAMS, STEPS = 3, 700
+
+
+def residuals(key, steps=STEPS, streams=None, invalid=0.1):
+  """Gaussian residuals around 1; a tenth of the rows is invalid, that is nan."""
+  shape = (steps,) if streams is None else (steps, streams)
+  keys = jax.random.split(key, 3)
+  valid = jax.random.uniform(keys[0], shape) >= invalid
+  draw = lambda k: jnp.where(valid, 1.0 + 0.1 * jax.random.normal(k, shape), jnp.nan)
+  opr = draw(keys[1])
+  return Residual(opr, draw(keys[2]), opr[..., None] * jnp.ones(4), valid)
+
+
+@pytest.fixture(params=ALL, scope="module")
+def case(request):
+  """A detector and its one jitted program over several streams."""
+  detector = ALL[request.param]()
+  start = jax.tree.map(lambda x: jnp.broadcast_to(x, (STREAMS,) + x.shape), detector.init())
+  return detector, jax.jit(lambda xs: jax.lax.scan(jax.vmap(detector.update), start, xs))
+
+
+# ---- contract ------------------------------------------------------------------------------------------------------------------------
+
+def test_table_and_files_are_found():
+  assert set(SCALAR) == {"rolling_sigma"} and {"rolling_sigma", "rolling_sigma_plain"} <= set(detectors.DETECTORS)
+
+
+def test_update_keeps_structure_shapes_and_dtypes(case):
+  detector, _ = case
+  x = jax.tree.map(lambda a: a[0], residuals(jax.random.key(0)))
+  state = detector.init()
+  new, alarm = jax.eval_shape(detector.update, state, x)
+  chex.assert_trees_all_equal_shapes_and_dtypes(new, state)
+  assert jax.tree.structure(new) == jax.tree.structure(state) and isinstance(alarm, Alarm)
+  assert (alarm.fired.shape, alarm.fired.dtype, alarm.score.shape, alarm.score.dtype) == ((), jnp.bool_, (), jnp.float32)
+
+
+def test_scan_of_vmap_equals_each_stream_alone(case, same):
+  detector, program = case
+  xs = residuals(jax.random.key(1), streams=STREAMS)
+  state, alarms = program(xs)
+  assert alarms.fired.shape == (STEPS, STREAMS)
+  alone = jax.jit(lambda xs: jax.lax.scan(detector.update, detector.init(), xs))
+  for g in range(STREAMS):
+    state_g, alarms_g = alone(jax.tree.map(lambda x: x[:, g], xs))
+    chex.assert_trees_all_close(alarms_g.score, alarms.score[:, g], rtol=1e-4, atol=1e-4)  # another order of a sum of the window in float32
+    np.testing.assert_array_equal(alarms_g.fired, alarms.fired[:, g])
+    chex.assert_trees_all_close(state_g, jax.tree.map(lambda x: x[g], state), rtol=1e-4)
+
+
+def test_same_input_gives_equal_bits(case, same):
+  _, program = case
+  xs = residuals(jax.random.key(2), streams=STREAMS)
+  assert same(program(xs), program(xs))
+
+
+def test_an_invalid_row_changes_nothing(case, same):
+  detector, program = case
+  state, _ = program(residuals(jax.random.key(3), streams=STREAMS))
+  nan = jnp.full(STREAMS, jnp.nan)
+  for filling in (nan, jnp.full(STREAMS, 1e9)):  # whatever the row holds
+    row = Residual(filling, filling, jnp.tile(filling[:, None], 4), jnp.zeros(STREAMS, bool))
+    new, alarm = jax.jit(jax.vmap(detector.update))(state, row)
+    assert same(new, state)
+    assert not alarm.fired.any() and np.isnan(alarm.score).all()
+
+
+def test_invalid_rows_may_as_well_be_cut_out(case):
+  detector, _ = case
+  xs = residuals(jax.random.key(4), invalid=0.5)
+  kept = jax.tree.map(lambda x: x[np.asarray(xs.valid)], xs)
+  run = lambda xs: jax.lax.scan(detector.update, detector.init(), xs)
+  (state, alarms), (state_kept, alarms_kept) = run(xs), run(kept)
+  chex.assert_trees_all_close(state, state_kept, rtol=1e-6)  # the same sums, perhaps fused another way
+  chex.assert_trees_all_close(alarms.score[xs.valid], alarms_kept.score, rtol=1e-5, atol=1e-5)
+
+
+def test_a_step_change_is_found(case):
+  _, program = case
+  onset, steps = 2000, 2300  # a long past: every sample of the change enters the reference of a rolling rule
+  xs = residuals(jax.random.key(5), steps, STREAMS, invalid=0.0)
+  late = (jnp.arange(steps) >= onset)[:, None]
+  xs = xs._replace(opr=jnp.where(late, xs.opr + 1.0, xs.opr), rpr=jnp.where(late, xs.rpr + 1.0, xs.rpr))  # ten deviations
+  assert program(xs)[1].fired[onset:].any(0).all()
+
+
+# ---- rolling_sigma -------------------------------------------------------------------------------------------------------------------
+
+def slow_rolling_sigma(xs, window, threshold, patience, two_sided, warmup):
+  """The docstring in NumPy and float64, one sample at a time."""
+  seen, run, fired, scores = [], 0, [], []
+  for x in xs:
+    held = np.array(seen[-window:])
+    if len(held) < min(warmup, window):
+      fired.append(False)
+      scores.append(np.nan)
+    else:
+      z = (x - held.mean()) / max(held.std(), 1e-6)
+      score = abs(z) if two_sided else z
+      run = run + 1 if score > threshold else 0
+      fired.append(run >= patience)
+      scores.append(score)
+      run = 0 if run >= patience else run
+    seen.append(x)
+  return np.array(fired), np.array(scores)
+
+
+@pytest.mark.parametrize("settings", [
+    dict(window=50, threshold=2.0, patience=1, two_sided=True, warmup=20),
+    dict(window=50, threshold=2.0, patience=1, two_sided=False, warmup=20),
+    dict(window=30, threshold=0.5, patience=3, two_sided=False, warmup=30),
+    dict(window=20, threshold=1.0, patience=2, two_sided=True, warmup=500),  # a warm-up beyond the window ends with it
+    dict(window=2, threshold=1.5, patience=1, two_sided=True, warmup=2),
+])
+def test_rolling_sigma_equals_the_loop(settings):
+  rng = np.random.default_rng(0)
+  xs = (rng.normal(5.0, 2.0, 300) + np.repeat([0, 4, -3], 100)).astype(np.float32)
+  detector = rolling_sigma(**settings)
+  alarms = jax.lax.scan(detector.update, detector.init(), jnp.asarray(xs))[1]
+  fired, scores = slow_rolling_sigma(xs.astype(float), **settings)
+  if settings["window"] > 2:  # a window of two nearly equal samples loses the digits of its deviation
+    np.testing.assert_allclose(alarms.score, scores, rtol=1e-3, atol=1e-4)  # float32 sums of at most 50 samples of size 5
+  assert fired.any() and not fired.all()
+  np.testing.assert_array_equal(alarms.fired, fired)
+
+
+def test_a_constant_stream_has_a_floor_under_its_deviation():
+  detector = rolling_sigma(window=10, warmup=5)
+  alarms = jax.lax.scan(detector.update, detector.init(), jnp.concatenate([jnp.full(20, 3.0), jnp.array([3.5])]))[1]
+  assert not alarms.fired[:20].any() and alarms.fired[20]
+  np.testing.assert_allclose(alarms.score[20], 0.5 / 1e-6, rtol=1e-5)  # float32
+
+
+def test_one_sided_is_blind_to_a_fall():
+  xs = jnp.concatenate([jax.random.normal(jax.random.key(0), (200,)), jnp.full(5, -8.0)])
+  for two_sided in (True, False):
+    detector = rolling_sigma(window=100, threshold=5.0, warmup=50, two_sided=two_sided)
+    assert bool(jax.lax.scan(detector.update, detector.init(), xs)[1].fired.any()) == two_sided
+
+
+def test_arl0_of_three_sigma_is_the_published_370():
+  """Two-sided three-sigma limits on Gaussian samples: ARL0 = 1 / P(|z| > 3) = 370.4 (Montgomery, Introduction to Statistical Quality Control).
+
+  With mean and deviation of a window of W samples, z sqrt((W - 1) / (W + 1)) is Student's t with W - 1 degrees: 359 for W = 1,000.
+  """
+  window, streams, steps = 1000, 100, 4000
+  detector = rolling_sigma(window=window, threshold=3.0, warmup=window)
+  start = jax.tree.map(lambda x: jnp.broadcast_to(x, (streams,) + x.shape), detector.init())
+  xs = jax.random.normal(jax.random.key(0), (window + steps, streams))
+  fired = jax.jit(lambda xs: jax.lax.scan(jax.vmap(detector.update), start, xs)[1].fired)(xs)
+  assert not fired[:window].any()
+  arl0 = streams * steps / int(fired.sum())
+  exact = 1 / (2 * scipy.stats.t.sf(3 * np.sqrt((window - 1) / (window + 1)), window - 1))
+  assert abs(exact - 370.4) < 15  # a long window is near the published value
+  # 400,000 samples give about 1,100 alarms, so 1 / sqrt(1100) = 3 % standard error; three of them
+  np.testing.assert_allclose(arl0, exact, rtol=0.09)
+
+
+@pytest.mark.parametrize("settings", [dict(window=1), dict(window=0), dict(patience=0), dict(threshold=0), dict(threshold=-1), dict(threshold=float("nan")),
+                                      dict(warmup=1), dict(warmup=-5)])
+def test_bad_settings_are_refused(settings):
+  with pytest.raises(UserError, match="rolling_sigma needs"):
+    rolling_sigma(**settings)
+  with pytest.raises(UserError):
+    detectors.make("rolling_sigma", **settings)
+
+
+# ---- table and combinators -----------------------------------------------------------------------------------------------------------
+
+def test_an_unknown_detector_lists_the_names():
+  with pytest.raises(UserError) as error:
+    detectors.make("cusumm")
+  assert all(name in str(error.value) for name in detectors.DETECTORS)
+
+
+def test_an_unknown_setting_is_named():
+  with pytest.raises(UserError, match="windows"):
+    detectors.make("rolling_sigma_plain", windows=5)
+
+
+def test_calibrated_settings_can_be_overridden():
+  assert detectors.make("rolling_sigma").init()[0].buffer.shape == (detectors.CALIBRATED["window"],)
+  assert detectors.make("rolling_sigma", window=300).init()[0].buffer.shape == (300,)
+  assert detectors.make("rolling_sigma_plain").init()[0].buffer.shape == (1000,)
+
+
+def echo(threshold):
+  """Fires above `threshold`; score is the sample; nan stays unknown."""
+  return Detector(lambda: jnp.int32(0), lambda state, x: (state + 1, Alarm(x > threshold, jnp.float32(x))))
+
+
+def row(opr, rpr, valid=True):
+  return Residual(jnp.float32(opr), jnp.float32(rpr), jnp.zeros(4), jnp.bool_(valid))
+
+
+def test_on_picks_its_channel():
+  for channel, want in (("opr", (True, 5.0)), ("rpr", (False, 1.0))):
+    state, alarm = on(channel, echo(3.0)).update(jnp.int32(0), row(5.0, 1.0))
+    assert (bool(alarm.fired), float(alarm.score)) == want and int(state) == 1
+
+
+def test_any_of_fires_when_either_does_and_keeps_both_states():
+  detector = any_of(on("opr", echo(3.0)), on("rpr", echo(2.0)))
+  for opr, rpr, fired, score in ((0, 0, False, 0), (4, 0, True, 4), (0, 2.5, True, 2.5), (9, 7, True, 9)):
+    states, alarm = detector.update(detector.init(), row(opr, rpr))
+    assert (bool(alarm.fired), float(alarm.score)) == (fired, score) and [int(s) for s in states] == [1, 1]
+
+
+def test_any_of_scores_what_is_known():
+  known = lambda value: Detector(lambda: jnp.int32(0), lambda state, x: (state, Alarm(jnp.bool_(False), jnp.float32(value))))
+  score = lambda *values: float(any_of(*map(known, values)).update((jnp.int32(0),) * len(values), row(0, 0))[1].score)
+  assert score(np.nan, 2.0) == 2.0 and score(-3.0, np.nan) == -3.0 and np.isnan(score(np.nan, np.nan))
+
+
+def test_the_papers_rule_is_either_residual():
+  detector = detectors.make("rolling_sigma_plain", window=50, warmup=20)
+  xs = residuals(jax.random.key(6), 200, invalid=0.0)
+  run = jax.jit(lambda xs: jax.lax.scan(detector.update, detector.init(), xs)[1].fired)
+  opr = slow_rolling_sigma(np.asarray(xs.opr, float), 50, 3.0, 1, True, 20)[0]
+  rpr = slow_rolling_sigma(np.asarray(xs.rpr, float), 50, 3.0, 1, True, 20)[0]
+  assert (opr & ~rpr).any() or (rpr & ~opr).any()
+  np.testing.assert_array_equal(run(xs), opr | rpr)
+
+
+def test_one_trace_across_seeds():
+  detector = detectors.make("rolling_sigma_plain", window=50, warmup=20)
+  chex.clear_trace_counter()
+
+  @jax.jit
+  @chex.assert_max_traces(n=1)
+  def program(key):
+    return jax.lax.scan(detector.update, detector.init(), residuals(key, 100))[1].fired
+  fired = [np.asarray(program(jax.random.key(seed))) for seed in range(4)]
+  assert any((a != fired[0]).any() for a in fired[1:])
