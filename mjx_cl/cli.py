@@ -421,11 +421,11 @@ def main(argv: list[str] | None = None) -> int:
   except KeyboardInterrupt:
     say("mjx-cl: interrupted; what was saved can be resumed with --resume")
     return 130
+  except BrokenPipeError:
+    return 0
   except OSError as e:
     say(f"mjx-cl: {e.strerror or e}{f': {e.filename}' if e.filename else ''}")
     return FileError.exit_code
-  except BrokenPipeError:
-    return 0
 
 
 if __name__ == "__main__":

@@ -37,6 +37,7 @@ class DreamerConfig:
     last_starts: imagination starts are the last k states of each sequence; 0 means all.
     horizon: the discount is 1 - 1 / horizon.
     lr, warmup: learning rate and updates of its linear warm-up.
+    decay: updates after which the learning rate has halved, lr / (1 + t / decay); 0: constant, as the authors'.
     bins: classes of the two-hot heads.
     entropy: weight of the policy's entropy.
   """
@@ -50,6 +51,7 @@ class DreamerConfig:
   lam: float = 0.95
   lr: float = 4e-5
   warmup: int = 1000
+  decay: int = 0
   agc: float = 0.3
   bins: int = 255
   entropy: float = 3e-4
@@ -124,6 +126,8 @@ class AdaptConfig:
     last_starts: imagination starts while adapting, the last k states of each sequence, 0 all; None: the agent's own.
     fresh_moments: forget the optimiser's moments at an alarm. Kept ones were gathered on the gradients of a trained agent; those after an event
       are many times larger, so that each step would be that many times the learning rate until the RMS (memory 1,000 updates) has followed.
+    lr_decay: updates since the alarm after which the learning rate has halved, lr / (1 + t / lr_decay); 0: constant. Needs fresh_moments,
+      whose counter it reads.
     patience: length over which every signal must be settled [chunks of 64 decisions].
     trend: largest difference of the means of the first and second half of that length [share of the level].
     fluctuation: largest standard deviation over that length [share of the level], or
@@ -141,6 +145,7 @@ class AdaptConfig:
   lr: float | None = None
   last_starts: int | None = None
   fresh_moments: bool = False
+  lr_decay: int = 0
   patience: int = 32
   trend: float = 0.25
   fluctuation: float = 0.5
@@ -159,6 +164,8 @@ class AdaptConfig:
       raise UserError(f"patience must be at least 4 chunks; got {self.patience}")
     if self.lr is not None:
       positive(self, "lr")
+    if self.lr_decay and not self.fresh_moments:
+      raise UserError("lr_decay needs fresh_moments: it counts updates since the moments began")
 
 
 ARMS = {"detector": "finetuning starts on the detector's alarm", "none": "no adaptation; alarms are logged"}

@@ -56,7 +56,8 @@ class Runner:
     self.config, self.out = config, pathlib.Path(out)
     self.env = envs.make(config.env, config.physics)
     spec = self.env.spec
-    self.trained = agents.load(config.agent, config.env, len(spec.obs), len(spec.act), config.adapt.lr, config.adapt.last_starts)
+    self.trained = agents.load(config.agent, config.env, len(spec.obs), len(spec.act), config.adapt.lr, config.adapt.last_starts,
+                               config.adapt.lr_decay)
     agent, self.repeat = self.trained.agent, int(self.trained.card.get("repeat", 1))
     self.fault = faults.make(config.fault, spec)
     target = faults.target_index(self.fault, config.target)
@@ -84,6 +85,9 @@ class Runner:
     self._alarms = np.zeros(self.groups, int)
     self._phase = np.zeros(self.groups, int)
     self.work = self.out / "work"
+
+  def open(self) -> None:
+    """Makes the working folder; before that nothing in `out` is touched."""
     self.checkpoints = checkpoint.Checkpoints(self.work / "checkpoints")
 
   # ---- one chunk -----------------------------------------------------------------------------------------------------------------
@@ -246,7 +250,8 @@ class Runner:
           add(step, "alarm", "acted on" + (", before onset: a false alarm" if step < c.onset else ""))
         else:
           phase = phase_lib.PHASES[trace["phase"][step, g]]
-          why = "arm does not adapt" if arm == "none" else "warm-up" if step < c.adapt.warmup else f"phase {phase}"
+          late = decisions[step // self.chunk_steps] == phase_lib.START  # the phase changes at the end of the chunk
+          why = "arm does not adapt" if arm == "none" else "warm-up" if step < c.adapt.warmup else "an alarm before it was" if late else f"phase {phase}"
           add(step, "alarm", f"logged, not acted on: {why}" + (", before onset: a false alarm" if step < c.onset else ""))
       for i in np.flatnonzero(decisions):
         end = min((i + 1) * self.chunk_steps, c.steps) - 1
@@ -297,7 +302,7 @@ class Runner:
     if "detector" in arms:
       out |= arms["detector"]
     nominal = trace["valid"][15 * self.repeat:]
-    out["invalid_share"] = float(1.0 - nominal[self.repeat - 1::self.repeat].mean())
+    out["invalid_share"] = float(1.0 - nominal[self.repeat - 1::self.repeat].mean()) if len(nominal) >= self.repeat else None
     wall = sum(self.seconds.values())
     quiet = float(np.median(self.quiet)) if self.quiet else 0.0
     monitor = min(self.seconds["digest"], quiet * max(1, self.done_chunks - 1))
@@ -348,28 +353,31 @@ def execute(config: RunConfig, out, resume: bool = False, overwrite: bool = Fals
   out = pathlib.Path(out)
   state = store.claim_folder(out, resume, overwrite)
   if state == "done":
+    check_same(out, {k: v for k, v in json.loads(json.dumps(dataclasses.asdict(config))).items() if k != "physics"})  # `auto` is resolved there
     return json.loads((out / "summary.json").read_text())
-  if state == "new" and overwrite:
-    clear(out)
-  runner = Runner(config, out)
+  runner = Runner(config, out)  # refuses wrong names and broken agents before anything of an earlier run is removed
   values = runner.config_dict()
   if state == "resume":
     check_same(out, values)
+    runner.open()
     runner.resume()
   else:
+    if overwrite:
+      clear(out)
+    runner.open()
     store.write_json(out / "config.json", values)
   saved = time.monotonic()
   with Interruptible() as interrupt:
-    try:
-      while not runner.done:
-        progress(runner.step())
+    while not runner.done:
+      progress(runner.step())
+      try:
         interrupt.check()
-        if time.monotonic() - saved > save_every_s:
-          runner.save()
-          saved = time.monotonic()
-    except KeyboardInterrupt:
-      runner.save()
-      raise
+      except KeyboardInterrupt:
+        runner.save()  # between two chunks; a second signal, in the middle of one, leaves nothing whole to save
+        raise
+      if time.monotonic() - saved > save_every_s:
+        runner.save()
+        saved = time.monotonic()
   return runner.finish()
 
 
@@ -387,7 +395,10 @@ def clear(out: pathlib.Path) -> None:
 def check_same(out: pathlib.Path, values: dict) -> None:
   """Refuses to resume with other settings than the run began with."""
   from mjx_cl.errors import UserError
-  old = json.loads((out / "config.json").read_text())
+  try:
+    old = json.loads((out / "config.json").read_text())
+  except ValueError:
+    raise FileError(f"{out / 'config.json'} is not a run's; give --overwrite or another --out") from None
   skip = ("git_commit", "machine", "python")
   changed = [k for k in values if k not in skip and old.get(k) != values[k]]
   if changed:

@@ -163,17 +163,20 @@ def test_parity_of_one_step_from_1000_states(walker, pair, fields, crowd):
 
 
 def test_parity_outliers_are_states_at_which_mujoco_differs_from_itself(pair, fields, crowd):
-  """4,096 single steps: within 0.02 rad/s (measured: 0.0054), or C MuJoCo itself moves as far when qpos moves by 3e-7."""
+  """4,096 single steps: within 0.05 rad/s, or C MuJoCo itself moves as far when qpos moves by 3e-7.
+
+  Measured over eleven seeds, 45,056 steps: at most 0.018, but for four steps at 0.16 to 0.71, of which each agreed with its own spread to 1e-3.
+  """
   (init, step), (init_mjx, step_mjx) = pair["native"], pair["mjx"]
-  rng, bound = np.random.default_rng(1), 2e-2
+  rng, signs, bound = np.random.default_rng(6), np.random.default_rng(0), 5e-2  # two of the four are met with this seed
   for qpos, qvel in zip(*crowd):
     for ctrl in rng.uniform(-1, 1, (4, len(qpos), 6)).astype(np.float32):
       native = step(fields, init(qpos, qvel), ctrl)[1]["qvel"]
       error, own = np.abs(native - step_mjx(fields, init_mjx(qpos, qvel), ctrl)[1]["qvel"]).max(-1), 0.0
       for _ in range(16 if (error > bound).any() else 0):
-        near = qpos + 3e-7 * rng.choice([-1, 1], qpos.shape).astype(np.float32)
+        near = qpos + 3e-7 * signs.choice([-1, 1], qpos.shape).astype(np.float32)
         own = np.maximum(own, np.abs(native - step(fields, init(near, qvel), ctrl)[1]["qvel"]).max(-1))
-      assert (error < np.maximum(bound, 3 * own)).all()  # measured: one state, 0.566 against 0.566
+      assert (error < np.maximum(bound, 3 * own)).all()
       assert (error > bound).mean() < 0.02
 
 

@@ -7,7 +7,7 @@ import pytest
 from mjx_cl import envs, faults
 from mjx_cl.rollout import Rollout, Row, nest, records, start
 
-SEVERITY, ONSET, TARGET = 0.5, 5, 3  # the fault of every stream: half a left hip from step 5 on
+SEVERITY, ONSET, TARGET = 0.5, 7, 3  # the fault of every stream: half a left hip from step 7 on, the second of its decision at repeat 2
 
 
 def streams_of(env, agent, fault, groups, members, seed=0):

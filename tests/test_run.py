@@ -1,0 +1,391 @@
+"""`run` end to end with a tiny agent of random weights on a walker that is easily pleased; kill and resume; agents' files; `eval`."""
+import contextlib
+import dataclasses
+import functools
+import io
+import json
+import os
+import pathlib
+import signal
+import subprocess
+import sys
+import time
+
+import jax
+import numpy as np
+import pyarrow.parquet
+import pytest
+
+from mjx_cl import agents, cli, envs, run, store
+from mjx_cl.config import RunConfig
+from mjx_cl.dreamer.agent import Agent
+from mjx_cl.envs.walker import Walker
+from mjx_cl.errors import FileError, UserError
+from mjx_cl.scoring import bootstrap
+
+STEPS, ONSET, EPISODE, SEEDS = 700, 300, 150, (3, 4)
+ENDS = [min(STEPS, (i + 1) * run.CHUNK) - 1 for i in range(-(-STEPS // run.CHUNK))]  # last step of each chunk
+# nominal levels from step 100, an alarm at any sample beyond three deviations of the last 100, settled four chunks after it
+ARGS = ["run", "walker", "--steps", str(STEPS), "--onset", str(ONSET), "--seeds", "2", "--first-seed", "3", "--detector", "rolling_sigma_plain",
+        "--set", "window=100", "warmup=30", "--adapt.warmup", "100", "--adapt.start-windows", "40", "--adapt.patience", "4", "--adapt.least", "64",
+        "--adapt.trend", "1e9", "--adapt.fluctuation", "1e9", "--adapt.refit", "100", "--json"]
+
+
+class Easy(Walker):
+  """A walker with short episodes whose task counts as done whatever the robot does: random weights can converge."""
+
+  def __init__(self, physics="auto"):
+    super().__init__(physics)
+    self.spec = self.spec._replace(episode_steps=EPISODE, posture=None, acceptance=0.0)
+
+
+def child(argv, save_every_s):
+  """`mjx-cl` with the easy walker, for a process of its own."""
+  envs.ENVS["walker"] = Easy
+  run.execute = functools.partial(run.execute, save_every_s=save_every_s)
+  sys.exit(cli.main(argv))
+
+
+def spawn(argv, save_every_s=60.0):
+  code = f"import sys, test_run; test_run.child(sys.argv[1:], {save_every_s})"
+  return subprocess.Popen([sys.executable, "-c", code, *argv], cwd=pathlib.Path(__file__).parent, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+@pytest.fixture(scope="session")
+def saved(tiny, tmp_path_factory):
+  """Folder of a tiny walker agent with random weights."""
+  folder = tmp_path_factory.mktemp("agents") / "tiny"
+  agents.save(folder, jax.jit(tiny.init)(jax.random.key(0)),
+              {"env": "walker", "preset": "tiny", "repeat": 1, "dreamer": dataclasses.asdict(tiny.config)})
+  return folder
+
+
+@pytest.fixture(scope="module")
+def whole(saved, tmp_path_factory):
+  """An uninterrupted run: (folder, standard output, standard error)."""
+  out = tmp_path_factory.mktemp("runs") / "whole"
+  process = spawn(ARGS + ["--agent", str(saved), "--out", str(out)])
+  stdout, stderr = process.communicate(timeout=300)
+  assert process.returncode == 0, stderr
+  return out, stdout, stderr
+
+
+def table(folder, name):
+  """Columns of a result file as lists, null as None."""
+  return pyarrow.parquet.read_table(folder / f"{name}.parquet").to_pydict()
+
+
+def by_stream(folder):
+  """trace.parquet as {column: (streams, steps)}; null in a number is nan."""
+  trace = store.read_table(folder / "trace.parquet")
+  return {k: v.reshape(4, STEPS) for k, v in trace.items()}
+
+
+def of_stream(folder, stream, *kinds):
+  """Events (step, reason) of one stream."""
+  e = table(folder, "events")
+  return [(s, r) for g, s, k, r in zip(e["stream"], e["step"], e["kind"], e["reason"]) if g == stream and k in kinds]
+
+
+# ---- files ---------------------------------------------------------------------------------------------------------------------------
+
+def test_all_files_are_there_with_their_columns(whole):
+  out, _, _ = whole
+  assert sorted(os.listdir(out)) == ["config.json", "events.parquet", "figure.png", "runs.parquet", "summary.json", "trace.parquet"]
+  assert list(table(out, "trace")) == [
+      "stream", "arm", "seed", "fault", "step", "episode", "phase", "fault_active", "severity", "reward", "opr", "rpr", "score", "alarm", "terminated",
+      "truncated", "valid", "dyn_loss", "adv_mag", "value_loss", "updates"]
+  assert {"stream", "step", "kind", "reason", "fault"} <= set(table(out, "events"))
+  assert {"arm", "onset", "alarm_step", "latency_steps", "latency_s", "false_alarms", "adapt_start", "adapt_stop", "outcome", "recovery_step", "reward_pre",
+          "reward_drop", "reward_final", "return_lost", "terminations", "updates", "wall_s"} <= set(table(out, "runs"))
+
+
+def test_config_tells_how_it_was_made(whole, saved):
+  config = json.loads((whole[0] / "config.json").read_text())
+  assert (config["command"], config["env"], config["severity"], config["onset"], config["arms"]) == ("run", "walker", 0.5, ONSET, ["detector", "none"])
+  assert config["settings"] == {"window": 100, "warmup": 30} and config["adapt"]["patience"] == 4 and config["physics"] in ("native", "mjx")
+  assert config["versions"]["jax"] == jax.__version__ and config["machine"]["cores"] == os.cpu_count() and "git_commit" in config
+  assert config["agent_card"] == json.loads((saved / "card.json").read_text())
+
+
+def test_standard_output_is_one_json_value(whole):
+  out, stdout, stderr = whole
+  assert json.loads(stdout) == json.loads((out / "summary.json").read_text()) and stdout.count("\n") == 1
+  assert f"{STEPS}/{STEPS}" in stderr  # progress goes there
+
+
+def test_summary_has_every_aggregate_with_its_interval(whole):
+  summary = json.loads((whole[0] / "summary.json").read_text())
+  assert set(summary["arms"]) == {"detector", "none"}
+  for arm in summary["arms"].values():
+    for name in ("alarms", "false_alarm_streams", "latency_median_steps", "miss_probability", "converged", "aborted_by_rule", "aborted_by_budget", "recovered",
+                 "recovery_median_steps", "reward_pre", "reward_drop", "reward_final", "return_lost"):
+      ci = arm[name + "_ci"]
+      assert name in arm and (ci is None or len(ci) == 2)
+      if arm[name] is not None and ci is not None and None not in ci:
+        assert ci[0] <= arm[name] <= ci[1], name
+    assert arm["seeds"] == 2 and 0 <= arm["affected"] <= 2
+  assert all(summary[k] == v for k, v in summary["arms"]["detector"].items())  # stands at the top level too
+  assert set(summary["wall_share"]) == {"physics", "acting", "monitor", "updates", "other"} and sum(summary["wall_share"].values()) == pytest.approx(1.0)
+  assert summary["wall_s"] > 0 and 0 <= summary["invalid_share"] < 0.5
+
+
+def test_figure_is_a_png(whole):
+  content = (whole[0] / "figure.png").read_bytes()
+  assert content.startswith(b"\x89PNG\r\n\x1a\n") and len(content) > 20_000
+
+
+# ---- what happened -------------------------------------------------------------------------------------------------------------------
+
+def test_trace_rows(whole):
+  trace = by_stream(whole[0])
+  assert (trace["step"] == np.arange(STEPS)).all()
+  assert [list(trace[k][:, 0]) for k in ("stream", "arm", "seed")] == [[0, 1, 2, 3], ["detector"] * 2 + ["none"] * 2, [3, 4, 3, 4]]
+  np.testing.assert_array_equal(trace["severity"], np.broadcast_to(np.where(np.arange(STEPS) >= ONSET, 0.5, 0.0), (4, STEPS)))
+  np.testing.assert_array_equal(trace["fault_active"], trace["severity"] > 0)
+  np.testing.assert_array_equal(trace["episode"], np.broadcast_to(np.arange(STEPS) // EPISODE, (4, STEPS)))
+  np.testing.assert_array_equal(trace["truncated"], np.broadcast_to(np.arange(STEPS) % EPISODE == EPISODE - 1, (4, STEPS)))
+  assert not trace["terminated"].any() and ((0 <= trace["reward"]) & (trace["reward"] <= 1)).all()
+  for name in ("opr", "rpr"):
+    np.testing.assert_array_equal(np.isfinite(trace[name]), trace["valid"])
+  assert not trace["valid"][:, :14].any() and trace["valid"][:, 14:].mean() > 0.9
+  for name in ("dyn_loss", "adv_mag", "value_loss"):
+    assert [list(np.flatnonzero(np.isfinite(x))) for x in trace[name]] == [ENDS] * 4
+
+
+def test_onset_and_alarms_are_events(whole):
+  out, trace = whole[0], by_stream(whole[0])
+  faults = trace["fault"][:, 0]
+  assert all(f.startswith("gear:") and f.split(":")[1] in Easy("native").spec.targets for f in faults) and list(faults[:2]) == list(faults[2:])
+  for g in range(4):
+    assert of_stream(out, g, "onset") == [(ONSET, "severity 0.5")]
+    alarms = of_stream(out, g, "alarm")
+    assert [s for s, _ in alarms] == list(np.flatnonzero(trace["alarm"][g])) and alarms
+    assert all(("before onset: a false alarm" in r) == (s < ONSET) for s, r in alarms)
+    assert all("acted on" in r for _, r in alarms)
+  kinds = set(table(out, "events")["kind"])
+  assert kinds <= {"onset", "alarm", "start", "stop", "abort", "repair"} and {"start", "stop"} <= kinds
+
+
+def test_starts_and_stops_have_their_reasons(whole):
+  out, trace = whole[0], by_stream(whole[0])
+  for g in (0, 1):
+    starts, stops = of_stream(out, g, "start"), of_stream(out, g, "stop", "abort")
+    assert starts and all(r == "all six signals settled, task acceptable" for _, r in stops)
+    acted = [s for s, r in of_stream(out, g, "alarm") if r.startswith("acted on")]
+    assert [r for _, r in starts] == [f"alarm at step {s}" for s in acted] and min(acted) >= 100  # never in the warm-up
+    for (end, _), alarm in zip(starts, acted):
+      assert end == min(e for e in ENDS if e >= alarm)  # decided at the end of the chunk
+    for (start, _), (stop, _) in zip(starts, stops):
+      assert stop == min(start + 4 * run.CHUNK, STEPS - 1)
+      assert set(trace["phase"][g, start + 1:stop + 1]) == {"adapting"}
+    first = starts[0][0]
+    assert set(trace["phase"][g, :first + 1]) == {"nominal"} and (trace["updates"][g, :first + 1] == 0).all()
+    assert trace["updates"][g, -1] > 0 and (np.diff(trace["updates"][g]) >= 0).all()
+  for g in (2, 3):
+    assert not of_stream(out, g, "start", "stop", "abort") and set(trace["phase"][g]) == {"nominal"} and not trace["updates"][g].any()
+    assert all("arm does not adapt" in r for _, r in of_stream(out, g, "alarm"))
+
+
+def test_both_arms_live_the_same_life_until_an_alarm_is_acted_on(whole):
+  out, trace = whole[0], by_stream(whole[0])
+  for g in (0, 1):
+    first = of_stream(out, g, "start")[0][0] + 1
+    for name in ("reward", "opr", "rpr", "score", "alarm"):
+      assert trace[name][g, :first].tobytes() == trace[name][g + 2, :first].tobytes(), name
+    assert (trace["reward"][g, first + run.CHUNK:] != trace["reward"][g + 2, first + run.CHUNK:]).any()  # then finetuning tells
+
+
+def test_runs_are_sums_of_the_trace(whole):
+  out, trace = whole[0], by_stream(whole[0])
+  rows = table(out, "runs")
+  for g in range(4):
+    row = {k: v[g] for k, v in rows.items()}
+    reward, alarms = trace["reward"][g].astype(float), np.flatnonzero(trace["alarm"][g])
+    after = alarms[alarms >= ONSET]
+    assert row["alarm_step"] == (after[0] if len(after) else None) and row["false_alarms"] == (alarms < ONSET).sum()
+    if len(after):
+      assert row["latency_steps"] == after[0] - ONSET and row["latency_s"] == pytest.approx(0.025 * (after[0] - ONSET))
+    acted = [int(r.split()[-1]) for _, r in of_stream(out, g, "start")]
+    end = min([ONSET] + acted[:1])
+    pre = reward[100:end].mean() if end > 100 else None
+    assert row["reward_pre"] == pytest.approx(pre)
+    assert row["reward_final"] == pytest.approx(reward.mean()) and row["terminations"] == 0  # the run is shorter than 2,000 steps
+    if pre is not None:
+      assert row["return_lost"] == pytest.approx((pre - reward[ONSET:]).sum())
+    none = trace["reward"][2 + g % 2].astype(float)
+    assert row["reward_drop"] == pytest.approx(1 - none[ONSET:].mean() / none[100:ONSET].mean())
+    assert row["affected"] == (row["reward_drop"] >= 0.1) and (row["recovery_step"] is None or row["affected"])
+    assert (row["outcome"] == "nominal") == (row["arm"] == "none") and (row["updates"] > 0) == (row["arm"] == "detector")
+
+
+# ---- kill and resume -----------------------------------------------------------------------------------------------------------------
+
+def resume(argv):
+  """Runs the command in this process: (exit code, standard error)."""
+  stderr, before = io.StringIO(), signal.getsignal(signal.SIGTERM)
+  try:
+    with contextlib.redirect_stderr(stderr), contextlib.redirect_stdout(io.StringIO()):
+      return cli.main(argv), stderr.getvalue()
+  finally:
+    signal.signal(signal.SIGTERM, before)
+
+
+def test_a_killed_and_interrupted_run_ends_in_the_same_files(whole, saved, tmp_path, monkeypatch):
+  out = tmp_path / "cut"
+  argv = ARGS + ["--agent", str(saved), "--out", str(out)]
+  process = spawn(argv, save_every_s=0.0)  # a checkpoint after every chunk
+  end = time.monotonic() + 300
+  try:
+    while not list(out.glob("work/trace-000004.npz")):  # its checkpoint may be half written: then the one before counts
+      assert process.poll() is None and time.monotonic() < end, process.communicate()[1]
+      time.sleep(0.002)
+  finally:
+    process.kill()
+    process.communicate()
+  assert process.returncode == -signal.SIGKILL and not (out / "summary.json").exists()
+
+  monkeypatch.setitem(envs.ENVS, "walker", Easy)
+  step, lived = run.Runner.step, []
+
+  def interrupted(self):
+    lived.append(self.done_chunks)
+    if len(lived) == 3:
+      os.kill(os.getpid(), signal.SIGINT)  # Ctrl-C during the third chunk
+    return step(self)
+  monkeypatch.setattr(run.Runner, "step", interrupted)
+  code, stderr = resume(argv + ["--resume"])
+  assert code == 130 and "--resume" in stderr.splitlines()[-1]
+  assert lived[0] in (3, 4) and len(lived) == 3  # went on from a checkpoint, stopped after the chunk
+  monkeypatch.setattr(run.Runner, "step", step)
+  assert (out / f"work/trace-{lived[-1] + 1:06d}.npz").exists()
+
+  code, stderr = resume(argv + ["--resume"])
+  assert code == 0, stderr
+  assert sorted(os.listdir(out)) == sorted(os.listdir(whole[0]))
+  for name in ("trace", "events", "runs"):
+    a, b = table(out, name), table(whole[0], name)
+    assert list(a) == list(b)
+    for column in set(a) - {"wall_s"}:
+      assert a[column] == b[column], (name, column)
+  a, b = (json.loads((f / "summary.json").read_text()) for f in (out, whole[0]))
+  assert {k: v for k, v in a.items() if "wall" not in k} == {k: v for k, v in b.items() if "wall" not in k}
+
+
+def test_resume_of_a_finished_run_changes_nothing(whole, saved, monkeypatch):
+  out = whole[0]
+  before = {p.name: p.read_bytes() for p in out.iterdir()}
+  monkeypatch.setattr(run.Runner, "__init__", None)  # nothing is built
+  assert resume(ARGS + ["--agent", str(saved), "--out", str(out), "--resume"])[0] == 0
+  code, stderr = resume(ARGS + ["--agent", str(saved), "--out", str(out), "--resume", "--severity", "0.7"])
+  assert code == 2 and "severity" in stderr and stderr.count("\n") == 1
+  assert {p.name: p.read_bytes() for p in out.iterdir()} == before
+
+
+class Stub:
+  """A Runner of five chunks that does nothing but note what is asked of it."""
+
+  signals, notes = 0, []
+
+  def __init__(self, config, out):
+    self.chunk = 0
+
+  def step(self):
+    self.chunk += 1
+    if self.chunk == 3:
+      for _ in range(self.signals):
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(0.01)  # Python runs the handler between two bytecodes
+    self.notes.append(f"step {self.chunk}")
+
+  done = property(lambda self: self.chunk == 5)
+  config_dict = lambda self: {}
+  open = lambda self: None
+  save = lambda self: self.notes.append("save")
+  finish = lambda self: self.notes.append("finish")
+
+
+@pytest.mark.parametrize("signals, want", [(0, ["step 4", "step 5", "finish"]), (1, ["save"]), (2, None)])
+def test_an_interrupt_is_acted_on_between_two_chunks(tmp_path, monkeypatch, signals, want):
+  """One signal: the chunk ends, its state is saved. A second one ends the chunk half way, and nothing half is saved."""
+  monkeypatch.setattr(run, "Runner", type("Stubbed", (Stub,), {"signals": signals, "notes": (notes := [])}))
+  call = lambda: run.execute(RunConfig("walker"), tmp_path / "x")
+  if signals:
+    with pytest.raises(KeyboardInterrupt):
+      call()
+  else:
+    call()
+  assert notes == ["step 1", "step 2"] + (["step 3"] + want if want else [])
+  assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+# ---- agents --------------------------------------------------------------------------------------------------------------------------
+
+def used(tiny):
+  """A TrainState whose every leaf is in use."""
+  state = jax.jit(tiny.init)(jax.random.key(1))
+  leaves, tree = jax.tree.flatten(state)
+  rng = np.random.default_rng(0)
+  leaves = [(rng.normal(size=x.shape) * 10.0 ** rng.uniform(-12, 3)).astype(np.float32) if x.dtype == np.float32 else np.full(x.shape, 77, x.dtype) for x in leaves]
+  return jax.tree.unflatten(tree, leaves)
+
+
+def test_agents_round_trip(tiny, tmp_path, same):
+  state = used(tiny)
+  card = {"env": "walker", "dreamer": dataclasses.asdict(tiny.config), "note": "ü"}
+  agents.save(tmp_path, state, card)
+  assert sorted(os.listdir(tmp_path)) == ["agent.npz", "card.json"]
+  back = agents.load(str(tmp_path), "walker", 24, 6)
+  assert back.card == card and isinstance(back.agent, Agent) and back.agent.config == tiny.config
+  assert same(back.train._replace(opt=()), state._replace(opt=()))  # parameters, slow critic, range and counters in full
+  for a, b in zip(jax.tree.leaves(back.train.opt), jax.tree.leaves(state.opt), strict=True):
+    assert a.dtype == b.dtype
+    np.testing.assert_allclose(a, b, rtol=2.0 ** -8 if b.dtype == np.float32 else 0)  # bfloat16 keeps 8 bits of a moment, rounded to nearest
+  agents.save(tmp_path, back.train, card)
+  assert same(agents.load(str(tmp_path), "walker", 24, 6).train, back.train)  # and loses nothing twice
+
+
+def test_load_overrides_how_it_goes_on(saved):
+  trained = agents.load(str(saved), "walker", 24, 6, lr=1e-5, last_starts=4)
+  assert (trained.agent.config.lr, trained.agent.config.last_starts) == (1e-5, 4)
+
+
+def test_the_shipped_agents_load():
+  assert agents.shipped() == ["walker"]
+  trained = agents.load(None, "walker", 24, 6)
+  assert trained.card["env"] == "walker" and {"command", "dreamer", "repeat"} <= set(trained.card) and int(trained.train.updates) > 0
+  assert all(np.isfinite(x).all() for x in jax.tree.leaves(trained.train))
+
+
+def test_load_refuses_what_does_not_fit(saved, tmp_path):
+  with pytest.raises(FileError, match="does not fit"):
+    agents.load(str(saved), "walker", 25, 6)
+  with pytest.raises(UserError, match="shipped: walker"):
+    agents.load(str(tmp_path / "none"), "walker", 24, 6)
+
+
+# ---- eval ----------------------------------------------------------------------------------------------------------------------------
+
+def test_eval_sums_the_rewards_of_one_episode_each(saved, short_walker, monkeypatch, capsys):
+  """Episodes of 12 steps; the rollouts, lived again step by step in one chunk, give the sums."""
+  import jax.numpy as jnp
+  from mjx_cl import faults
+  from mjx_cl.rollout import Rollout, nest, start
+  monkeypatch.setitem(envs.ENVS, "walker", lambda physics: short_walker)
+  before = signal.getsignal(signal.SIGTERM)
+  try:
+    assert cli.main(["eval", "walker", "--agent", str(saved), "--episodes", "3", "--seed", "5", "--json"]) == 0
+  finally:
+    signal.signal(signal.SIGTERM, before)
+  result = json.loads(capsys.readouterr().out)
+  trained = agents.load(str(saved), "walker", 24, 6)
+  fault = faults.make("none", short_walker.spec)
+  keys = jnp.stack([jax.random.key(s) for s in (5, 6, 7)])[None]
+  streams = nest(lambda k: start(short_walker, trained.agent, fault, k), 0, 0)(keys)
+  rows = Rollout(short_walker, trained.agent, fault).chunk(jax.tree.map(lambda x: x[None], trained.train.params), streams, 12)[1]
+  returns = np.asarray(rows.reward)[:, 0].sum(0)
+  assert np.asarray(rows.truncated)[-1].all()
+  assert set(result) >= {"env", "agent", "episodes", "return_mean", "return_iqm", "return_ci", "terminations"} and result["episodes"] == 3
+  np.testing.assert_allclose(result["returns"], returns, atol=0.005)  # printed to two places
+  np.testing.assert_allclose([result["return_mean"], result["return_iqm"]], [returns.mean(), bootstrap.iqm(returns)], rtol=1e-5)  # float32 sums
+  assert result["return_ci"][0] <= result["return_iqm"] <= result["return_ci"][1] and result["terminations"] == 0

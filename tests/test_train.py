@@ -1,0 +1,313 @@
+"""Pretraining: exact resume, the train ratio, phases with a demonstrator, checkpoints that survive kills and refuse damage."""
+import os
+import pathlib
+import shutil
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pyarrow.parquet
+import pytest
+
+from mjx_cl import checkpoint, demonstrator, replay as replay_lib, train
+from mjx_cl.config import PRESETS, TrainConfig, replace
+from mjx_cl.errors import FileError, UserError
+
+ENVS, BATCH, LENGTH = 4, 4, 8
+DREAMER = replace(PRESETS["tiny"].dreamer, batch=BATCH, length=LENGTH, imagine=4)
+PER_CHUNK = train.CHUNK * ENVS / (BATCH * LENGTH)  # updates of a chunk at train ratio 1: 8
+_collect = {}
+
+
+def make_trainer(env, out, dreamer=DREAMER, **config):
+  """A small Trainer; those of one kind share their compiled rollout."""
+  trainer = train.Trainer(env, dreamer, TrainConfig(**dict(dict(envs=ENVS, updates=10_000, ratio=1.0, capacity=256), **config)), out)
+  key = (id(env), bool(trainer.expert))
+  trainer.collect = _collect.setdefault(key, trainer.collect)
+  return trainer
+
+
+class Counted:
+  """Stands for the learner: only counts, and keeps what it was called with."""
+
+  def __init__(self, metric=0.0):
+    self.calls, self.metric = [], metric
+
+  def __call__(self, state, replay, key, weights, updates):
+    self.calls.append((updates, weights))
+    return state._replace(updates=state.updates + updates), replay, {"loss/rew": np.full(1, self.metric)}
+
+
+def counted(trainer, **kwargs):
+  learn = Counted(**kwargs)
+  trainer.learn = {k: learn for k in trainer.learn}
+  return learn
+
+
+@pytest.fixture(scope="module")
+def expert_path(tmp_path_factory):
+  """A demonstrator of random weights."""
+  rng = np.random.default_rng(0)
+  layer = lambda a, b: (rng.standard_normal((a, b)).astype(np.float32) / np.sqrt(a), np.zeros(b, np.float32))
+  path = tmp_path_factory.mktemp("demo") / "policy.npz"
+  demonstrator.save(path, demonstrator.Policy(np.zeros(24, np.float32), np.ones(24, np.float32), (layer(24, 8), layer(8, 12))))
+  return str(path)
+
+
+# ---- resume ----------------------------------------------------------------------------------------------------------------------
+
+def test_resume_gives_the_same_bits(short_walker, tmp_path, same):
+  whole = make_trainer(short_walker, tmp_path / "whole", ratio=0.25)
+  for _ in range(4):
+    whole.step()
+  first = make_trainer(short_walker, tmp_path / "parts", ratio=0.25)
+  first.learn = whole.learn
+  for _ in range(2):
+    first.step()
+  first.save()
+  second = make_trainer(short_walker, tmp_path / "parts", ratio=0.25)
+  second.learn = whole.learn
+  assert not same(second.state, first.state)
+  second.resume()
+  assert same(second.state, first.state) and second.updates == 4 == 2 * PER_CHUNK * 0.25
+  for _ in range(2):
+    second.step()
+  assert same(second.state, whole.state)  # parameters, moments, robots, replay and key
+  assert second.updates == whole.updates == 8
+  np.testing.assert_array_equal(second.returns.sums, whole.returns.sums)
+  assert (second.phase, second.owed, second.own) == (whole.phase, whole.owed, whole.own) and whole.own
+  timeless = lambda rows: [{k: v for k, v in row.items() if not k.endswith(("_s", "seconds")) and v is not None} for row in rows]
+  assert timeless(second.rows) == timeless(whole.rows)
+
+
+def test_resume_without_a_checkpoint(short_walker, tmp_path):
+  with pytest.raises(FileError, match="no checkpoint"):
+    make_trainer(short_walker, tmp_path).resume()
+
+
+# ---- train ratio -----------------------------------------------------------------------------------------------------------------
+
+@pytest.mark.parametrize("ratio", [0.1, 1.0, 3.0])  # less than one update a chunk; a power of two; not a power of two
+def test_updates_follow_the_ratio(short_walker, tmp_path, ratio):
+  trainer, chunks = make_trainer(short_walker, tmp_path, ratio=ratio), 20
+  learn = counted(trainer)
+  for _ in range(chunks):
+    trainer.step()
+  per_chunk = PER_CHUNK * ratio
+  assert chunks * per_chunk - per_chunk - 1 <= trainer.updates <= chunks * per_chunk  # at most a chunk's worth is owed
+  assert trainer.updates == sum(n for n, _ in learn.calls)
+  assert all(n & (n - 1) == 0 for n, _ in learn.calls)  # powers of two: few programs
+
+
+def test_first_update_waits_for_windows_and_pays_no_backlog(short_walker, tmp_path):
+  trainer = make_trainer(short_walker, tmp_path, replace(DREAMER, batch=64), ratio=16.0)  # 512 windows; 8 updates a chunk
+  counted(trainer)
+  counts, before = [], 0
+  for _ in range(5):
+    trainer.step()
+    windows = int(replay_lib.windows(jax.tree.map(lambda x: x[0], trainer.state.replay), LENGTH + 1))
+    counts.append((windows >= 64 * LENGTH, trainer.updates - before))
+    before = trainer.updates
+  assert not counts[0][0] and counts[-1][0]
+  assert all(n == (8 if ready else 0) for ready, n in counts)
+
+
+def test_last_chunk_stops_at_the_last_update(short_walker, tmp_path):
+  trainer = make_trainer(short_walker, tmp_path, updates=19)
+  counted(trainer)
+  while not trainer.done:
+    trainer.step()
+  assert trainer.updates == 19
+
+
+def test_learning_rate_falls_over_the_last_updates(short_walker, tmp_path):
+  trainer = make_trainer(short_walker, tmp_path, updates=64, pure=32, lr_end=DREAMER.lr / 4)
+  learn = counted(trainer)
+  while not trainer.done:
+    trainer.step()
+  np.testing.assert_allclose([w.lr for _, w in learn.calls], [1, 1, 1, 1, 1, 0.8125, 0.625, 0.4375])  # a line from 1 at 32 to 0.25 at 64
+
+
+# ---- phases ----------------------------------------------------------------------------------------------------------------------
+
+def phases(env, out, expert_path, **config):
+  trainer = make_trainer(env, out, demonstrator=expert_path, clone_until=1.0, clone_weight=0.4, **config)
+  learn = counted(trainer)
+  trainer.expert_return = 1e9  # out of reach: the phases end by their update counts
+  return trainer, learn
+
+
+def test_phases_follow_one_another(short_walker, tmp_path, expert_path):
+  trainer, learn = phases(short_walker, tmp_path, expert_path, updates=64, clone=16, fade=16, pure=32)
+  held = []
+  while not trainer.done:
+    labelled = trainer.step()["phase"] != "pure"
+    replay = trainer.state.replay
+    held.append(int(np.max(replay.count)))
+    written = np.asarray(replay.data.has_demo) & (np.arange(256) < np.asarray(replay.count)[..., None])
+    if labelled and held[-1]:
+      assert written.any()
+    if not labelled:
+      assert not written.any() and not trainer._drive().any()
+  names = [row["phase"] for row in trainer.rows]
+  assert names == ["clone"] * 2 + ["fade"] * 2 + ["pure"] * 4
+  assert held[3] == 0 and 0 < held[4] < held[2]  # emptied on entering the last phase, then filled anew
+  clone, policy = ([float(getattr(w, n)) for _, w in learn.calls] for n in ("clone", "policy"))
+  np.testing.assert_allclose(clone, [0.4, 0.4, 0.4, 0.2, 0, 0, 0, 0])
+  assert policy == [0, 0, 1, 1, 1, 1, 1, 1]
+  assert sum(n for (n, _), name in zip(learn.calls, names) if name == "pure") >= 32
+
+
+@pytest.mark.xfail(strict=True, reason="a chunk's updates are not cut at `updates - pure`, so the last phase can lose up to a chunk of them")
+def test_at_least_pure_updates_are_pure(short_walker, tmp_path, expert_path):
+  trainer, learn = phases(short_walker, tmp_path, expert_path, updates=100, clone=20, fade=30, pure=50)
+  while not trainer.done:
+    trainer.step()
+  assert sum(n for n, w in learn.calls if w.clone == 0.0) >= 50
+
+
+def test_expert_drives_its_share_and_is_labelled_everywhere(short_walker, tmp_path, expert_path):
+  trainer, _ = phases(short_walker, tmp_path, expert_path, updates=64, clone=16, fade=16, pure=32, demo_noise=0.0, demo_share=0.5)
+  trainer.step()
+  data = jax.tree.map(lambda x: np.asarray(x)[0], trainer.state.replay.data)
+  at = np.asarray(data.has_demo)
+  assert at[:, :60].sum() > 0.8 * at[:, :60].size  # all but the last records of episodes
+  for e in range(ENVS):
+    followed = np.allclose(data.action[e][at[e]], data.demo[e][at[e]], atol=1e-5)  # the expert's own action, without noise
+    assert followed == (e < 2), e
+  np.testing.assert_allclose(data.demo[at], trainer.expert(data.obs[at]), atol=1e-5)  # float32 in another order
+
+
+def test_cloning_ends_when_the_agent_is_good_enough(short_walker, tmp_path, expert_path):
+  trainer = make_trainer(short_walker, tmp_path, demonstrator=expert_path, clone_until=0.8, updates=20_000)
+  trainer.expert_return = 100.0
+  for own, phase in (([90.0] * 15, "clone"), ([70.0] * 16, "clone"), ([90.0] * 4 + [79.0] * 16, "clone"), ([10.0] * 4 + [81.0] * 16, "fade")):
+    trainer.own = own
+    trainer._advance_phase()
+    assert trainer.phase == phase, own
+
+
+def test_phases_must_fit():
+  with pytest.raises(UserError, match="exceeds updates"):
+    TrainConfig(demonstrator="x", updates=100)
+
+
+# ---- files -----------------------------------------------------------------------------------------------------------------------
+
+def test_metrics_are_written_and_readable(short_walker, tmp_path):
+  trainer = make_trainer(short_walker, tmp_path, updates=16)
+  counted(trainer, metric=2.5)
+  seen = []
+  train.run(trainer, progress=seen.append)
+  rows = pyarrow.parquet.read_table(tmp_path / "metrics.parquet").to_pylist()
+  assert trainer.done and [r["updates"] for r in rows] == [r["updates"] for r in seen] == [8, 16]
+  assert all(r["loss/rew"] == 2.5 and r["phase"] == "pure" for r in rows)
+  assert [r["records"] for r in rows] == [train.CHUNK * ENVS, 2 * train.CHUNK * ENVS]
+  assert trainer.checkpoints.latest() == 2
+
+
+def test_returns_are_sums_over_episodes(short_walker, tmp_path):
+  trainer = make_trainer(short_walker, tmp_path)
+  counted(trainer)
+  row = trainer.step()
+  data = jax.tree.map(lambda x: np.asarray(x)[0], trainer.state.replay.data)
+  episodes = [np.split(data.reward[e], np.flatnonzero(data.last[e]) + 1)[:-1] for e in range(ENVS)]
+  assert row["episodes"] == sum(map(len, episodes)) == ENVS * (train.CHUNK // 12)
+  np.testing.assert_allclose(row["return"], np.mean([np.sum(r) for e in episodes for r in e]), rtol=1e-5)  # float32 rewards
+
+
+def test_a_metric_that_is_not_finite_stops_the_run(short_walker, tmp_path):
+  trainer = make_trainer(short_walker, tmp_path)
+  counted(trainer, metric=float("nan"))
+  with pytest.raises(FileError, match="numeric failure") as e:
+    trainer.step()
+  assert "\n" not in str(e.value)
+
+
+TREE = {"w": jnp.arange(6.0).reshape(2, 3), "n": jnp.int32(4), "key": jax.random.key(3)}
+
+
+def like(tree):
+  return jax.tree.map(lambda x: jnp.zeros_like(x) if not checkpoint._is_key(x) else jax.random.key(0), tree)
+
+
+@pytest.fixture
+def saved(tmp_path):
+  """A folder with checkpoints 1 and 2."""
+  store = checkpoint.Checkpoints(tmp_path / "checkpoints")
+  for number in (1, 2):
+    store.save(number, TREE | {"n": jnp.int32(number)}, {"number": number})
+  store.close()
+  return tmp_path / "checkpoints"
+
+
+def test_round_trip_keeps_two(saved, same):
+  store = checkpoint.Checkpoints(saved)
+  store.save(7, TREE, {"text": "x", "list": [1.5, None]})
+  tree, meta = store.load(like(TREE))
+  assert same(tree, TREE) and meta == {"text": "x", "list": [1.5, None]}
+  assert sorted(p.name for p in saved.iterdir() if p.is_dir()) == ["2", "7"]
+
+
+DAMAGE = {
+    "truncated": lambda f: f.write_bytes(f.read_bytes()[:f.stat().st_size // 2]),
+    "emptied": lambda f: f.write_bytes(b""),
+    "garbage": lambda f: f.write_bytes(b"\x93\x00garbage" * 20),
+    "removed": lambda f: f.unlink()}
+
+
+@pytest.mark.parametrize("kind", DAMAGE)
+def test_damaged_checkpoint_is_one_clear_line(saved, kind):
+  for file in sorted((saved / "2").rglob("*")):
+    if file.is_file():
+      DAMAGE[kind](file)
+  with pytest.raises(FileError) as e:
+    checkpoint.Checkpoints(saved).load(like(TREE))
+  assert "\n" not in str(e.value) and "checkpoint 2" in str(e.value) and str(saved) in str(e.value)
+
+
+@pytest.mark.parametrize("other", [{"w": jnp.zeros((2, 4))}, {"w": jnp.zeros((3, 2))}, {"w": jnp.zeros(6)}, {"more": jnp.zeros(2)}])
+def test_checkpoint_of_another_size_is_one_clear_line(saved, other):
+  with pytest.raises(FileError) as e:
+    checkpoint.Checkpoints(saved).load(like(TREE) | other)
+  assert "\n" not in str(e.value) and "checkpoint 2" in str(e.value)
+
+
+CHILD = """
+import os, sys
+from mjx_cl import checkpoint
+import jax.numpy as jnp
+store = checkpoint.Checkpoints(sys.argv[1])
+def die(event, args):
+  if event == "os.rename" and os.path.basename(os.fspath(args[1])) == "3":
+    os._exit(9)  # as SIGKILL: nothing is cleaned up
+sys.addaudithook(die)
+store.save(3, {"w": jnp.ones((2, 3))}, {"number": 3})
+"""
+
+
+def test_kill_during_a_save_keeps_the_last_good_checkpoint(saved, same):
+  root = str(pathlib.Path(checkpoint.__file__).parents[1])
+  env = os.environ | {"PYTHONPATH": os.pathsep.join([root, os.environ.get("PYTHONPATH", "")]), "JAX_PLATFORMS": "cpu"}
+  done = subprocess.run([sys.executable, "-c", CHILD, str(saved)], env=env, capture_output=True, text=True, timeout=120)
+  assert done.returncode == 9, done.stderr
+  left = [p.name for p in saved.iterdir() if p.name not in ("1", "2")]
+  assert any(n.startswith("3.") for n in left)  # the half-written folder, under its temporary name
+  store = checkpoint.Checkpoints(saved)
+  assert store.latest() == 2
+  tree, meta = store.load(like(TREE))
+  assert same(tree, TREE | {"n": jnp.int32(2)}) and meta == {"number": 2}
+  store.save(3, TREE, {"number": 3})
+  assert store.latest() == 3 and same(store.load(like(TREE))[0], TREE)
+
+
+def test_empty_temporary_folder_is_no_checkpoint(saved):
+  shutil.copytree(saved / "2", saved / "9.orbax-checkpoint-tmp")
+  for file in list((saved / "9.orbax-checkpoint-tmp").rglob("*"))[::2]:
+    if file.is_file():
+      file.unlink()
+  assert checkpoint.Checkpoints(saved).latest() == 2
+
+
