@@ -72,8 +72,9 @@ def figure(folder, width: int = 500) -> pathlib.Path:
     for s in sorted(set(onset)):
       axis.axvline(s, color="k", lw=1.3)
     low, high = axis.get_ylim()
-    axis.plot(starts, [high * 0.985] * len(starts), "v", color="k", ms=5, clip_on=False, label="alarm, finetuning starts")
-    axis.plot(stops, [high * 0.985] * len(stops), "^", mfc="w", mec="k", ms=5, clip_on=False, label="finetuning ends")
+    # in_layout: an empty line that is not clipped has no extent, and the layout would collapse
+    axis.plot(starts, [high * 0.985] * len(starts), "v", color="k", ms=5, clip_on=False, in_layout=False, label="alarm, finetuning starts")
+    axis.plot(stops, [high * 0.985] * len(stops), "^", mfc="w", mec="k", ms=5, clip_on=False, in_layout=False, label="finetuning ends")
   axes[0].legend(loc="lower right", fontsize=8, framealpha=0.9)
   axes[0].set_title(f"{config['env']}: {config['fault']} {config['severity']:g} at step {config['onset']:,}; {panels[main]['opr'].shape[0]} streams, mean and "
                     f"standard deviation\narm {main} in colour" + (", arm none in grey" if "none" in panels and main != "none" else "")

@@ -56,8 +56,7 @@ class Runner:
     self.config, self.out = config, pathlib.Path(out)
     self.env = envs.make(config.env, config.physics)
     spec = self.env.spec
-    self.trained = agents.load(config.agent, config.env, len(spec.obs), len(spec.act), config.adapt.lr, config.adapt.last_starts,
-                               config.adapt.lr_decay)
+    self.trained = agents.load(config.agent, config.env, len(spec.obs), len(spec.act), config.adapt.lr, config.adapt.last_starts)
     agent, self.repeat = self.trained.agent, int(self.trained.card.get("repeat", 1))
     self.fault = faults.make(config.fault, spec)
     target = faults.target_index(self.fault, config.target)

@@ -10,13 +10,14 @@ import signal
 import subprocess
 import sys
 import time
+import warnings
 
 import jax
 import numpy as np
 import pyarrow.parquet
 import pytest
 
-from mjx_cl import agents, cli, envs, run, store
+from mjx_cl import agents, cli, envs, plots, run, store
 from mjx_cl.config import RunConfig
 from mjx_cl.dreamer.agent import Agent
 from mjx_cl.envs.walker import Walker
@@ -219,6 +220,32 @@ def test_runs_are_sums_of_the_trace(whole):
     assert (row["outcome"] == "nominal") == (row["arm"] == "none") and (row["updates"] > 0) == (row["arm"] == "detector")
 
 
+# ---- figure --------------------------------------------------------------------------------------------------------------------------
+
+def test_smooth_is_a_trailing_mean_that_leaves_nan_out():
+  rng = np.random.default_rng(0)
+  x = np.where(rng.random((2, 40)) < 0.3, np.nan, rng.normal(size=(2, 40)))
+  x[:, :2] = np.nan
+  want = [[np.nan if np.isnan(part := row[max(0, k - 6):k + 1]).all() else np.nanmean(part) for k in range(40)] for row in x]
+  np.testing.assert_allclose(plots.smooth(x, 7), want, rtol=1e-9, atol=1e-12)  # differences of float64 sums
+
+
+@pytest.mark.parametrize("starts", [[], [60]])
+def test_figure_of_a_run_in_which_little_happened(tmp_path, starts):
+  """No alarm, no residual yet: still a figure, and one whose layout has not collapsed (Matplotlib warns of that)."""
+  steps = 90
+  numbers = np.tile(np.linspace(0, 1, steps), 2)
+  trace = {"arm": ["detector"] * steps + ["none"] * steps, "step": np.tile(np.arange(steps), 2), "reward": numbers}
+  trace |= {k: np.full(2 * steps, np.nan) for k in ("opr", "rpr", "adv_mag", "dyn_loss")} | {"value_loss": numbers}
+  store.write_table(tmp_path / "trace.parquet", trace)
+  store.write_table(tmp_path / "events.parquet", {"step": [40] + starts, "kind": ["onset"] + ["start"] * len(starts), "arm": ["detector"] * (1 + len(starts))})
+  store.write_json(tmp_path / "config.json", {"env": "walker", "fault": "gear", "severity": 0.5, "onset": 40, "control_s": 0.025})
+  with warnings.catch_warnings():
+    warnings.simplefilter("error")
+    assert plots.figure(tmp_path) == tmp_path / "figure.png"
+  assert (tmp_path / "figure.png").read_bytes().startswith(b"\x89PNG") and "figure.tmp.png" not in os.listdir(tmp_path)
+
+
 # ---- kill and resume -----------------------------------------------------------------------------------------------------------------
 
 def resume(argv):
@@ -336,7 +363,8 @@ def test_agents_round_trip(tiny, tmp_path, same):
   agents.save(tmp_path, state, card)
   assert sorted(os.listdir(tmp_path)) == ["agent.npz", "card.json"]
   back = agents.load(str(tmp_path), "walker", 24, 6)
-  assert back.card == card and isinstance(back.agent, Agent) and back.agent.config == tiny.config
+  assert back.card == card and isinstance(back.agent, Agent)
+  assert back.agent.config == dataclasses.replace(tiny.config, warmup=0)  # no second warm-up
   assert same(back.train._replace(opt=()), state._replace(opt=()))  # parameters, slow critic, range and counters in full
   for a, b in zip(jax.tree.leaves(back.train.opt), jax.tree.leaves(state.opt), strict=True):
     assert a.dtype == b.dtype
@@ -346,8 +374,8 @@ def test_agents_round_trip(tiny, tmp_path, same):
 
 
 def test_load_overrides_how_it_goes_on(saved):
-  trained = agents.load(str(saved), "walker", 24, 6, lr=1e-5, last_starts=4)
-  assert (trained.agent.config.lr, trained.agent.config.last_starts) == (1e-5, 4)
+  config = agents.load(str(saved), "walker", 24, 6, lr=1e-5, last_starts=4).agent.config
+  assert (config.lr, config.last_starts, config.warmup) == (1e-5, 4, 0)
 
 
 def test_the_shipped_agents_load():

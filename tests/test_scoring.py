@@ -90,6 +90,7 @@ def test_recovery_step_by_hand():
     trace((1000, 1.0), (2000, 0.2), (1500, 1.0), (600, 0.0), (5000, 0.95)),     # a dip during the hold: counted from the second rise
     trace((1000, 1.0), (2000, 0.2), (1500, 1.0), (80, 0.0), (5000, 1.0)),       # a dip too small to bring the mean below
     trace((400, 0.1), (600, 1.0), (100, 0.3), (4000, 1.0)),                     # low before onset
+    trace((50, 0.0), (3950, 1.0), (500, 0.0), (5000, 1.0)),                     # a bad start, then the fall long after onset
     trace((1000, 1.0), (500, 0.0), (2899, 1.0)),                                # the hold just fits
     trace((1000, 1.0), (500, 0.0), (2898, 1.0)),                                # one step short: censored
 ])

@@ -87,11 +87,11 @@ def update(state: PhaseState, signals, posture, alarm, alarm_step, now, acts, ac
   better = full & (reward > state.best + 0.05 * acceptance)
   best = jnp.where(better, reward, state.best)
   best_at = jnp.where(better, now, state.best_at)
-  stuck = full & (age >= config.give_up) & (now - best_at >= config.give_up // 3) & ~accepted
+  stuck = full & (age >= config.give_up) & (now - best_at >= config.give_up // 3) & (~accepted | (age >= 5 * config.give_up // 4))
 
   stop = full & jnp.all(ok) & accepted
-  below = full & jnp.all(ok) & ~accepted & stuck
-  hopeless = stuck & ~below
+  below = jnp.all(ok) & ~accepted & stuck
+  hopeless = stuck & ~below & ~stop
   spent = adapting & (age >= config.budget) & ~stop & ~stuck
   decision = jnp.select([begins, stop, below, hopeless, spent], [START, STOP, ABORT_BELOW, ABORT_HOPELESS, ABORT_BUDGET], NOTHING)
   phase = jnp.select([begins, stop, below | hopeless | spent], [ADAPTING, CONVERGED, ABORTED], state.phase)

@@ -92,7 +92,7 @@ class Agent:
     self.dec = heads.Decoder(s.units, obs_size)
     self.rew, self.con = heads.Head(1, s.units, config.bins, 0.0), heads.Head(1, s.units, 1, 1.0)
     self.pol, self.val = heads.PolicyHead(s.units, act_size), heads.Head(3, s.units, config.bins, 0.0)
-    self.optimizer = optim.laprop(config.lr, config.warmup, config.agc, decay=config.decay)
+    self.optimizer = optim.laprop(config.lr, config.warmup, config.agc)
     self.stoch_size = s.stoch * s.classes
 
   # ---- parameters ----------------------------------------------------------------------------------------------------------------

@@ -21,16 +21,14 @@ def agc(clip: float = 0.3, floor: float = 1e-3) -> optax.GradientTransformation:
   return optax.GradientTransformation(lambda params: optax.EmptyState(), update)
 
 
-def laprop(lr: float, warmup: int, clip: float = 0.3, beta1: float = 0.9, beta2: float = 0.999, eps: float = 1e-20, decay: int = 0):
+def laprop(lr: float, warmup: int, clip: float = 0.3, beta1: float = 0.9, beta2: float = 0.999, eps: float = 1e-20):
   """AGC, RMS scaling, then momentum (LaProp order), then the learning rate with linear warm-up from 0.
 
     nu <- beta2 nu + (1 - beta2) g^2;  u = g / (sqrt(nu / (1 - beta2^t)) + eps)
     mu <- beta1 mu + (1 - beta1) u;    theta <- theta - lr_t mu / (1 - beta1^t)
-    lr_t = lr min(1, t / warmup) / (1 + t / decay), t from 0; the last factor only where decay > 0
+    lr_t = lr min(1, t / warmup), t from 0
   """
-  def schedule(t):
-    ramp = jnp.minimum(1.0, t / warmup) if warmup else 1.0
-    return lr * ramp / (1.0 + t / decay) if decay else lr * ramp
+  schedule = optax.linear_schedule(0.0, lr, warmup) if warmup else optax.constant_schedule(lr)
   return optax.chain(
       agc(clip), optax.scale_by_rms(beta2, eps, eps_in_sqrt=False, bias_correction=True), optax.ema(beta1, debias=True),
       optax.scale_by_learning_rate(schedule))
