@@ -177,8 +177,8 @@ class Trainer:
     if enough:
       self.owed += CHUNK * self.config.envs * self.config.ratio / size
       count = min(int(self.owed), self.config.updates - self.updates)
-      self.owed -= int(self.owed)
       count = 1 << (count.bit_length() - 1) if count else 0  # few static lengths: the rest is owed
+      self.owed -= count
       if count:
         key, key_learn = jax.random.split(self.state.key)
         train, replay, metrics = self.learn[self.phase](self.state.train, self.state.replay, key_learn, self._weights(), count)

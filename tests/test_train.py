@@ -24,7 +24,7 @@ _collect = {}
 def make_trainer(env, out, dreamer=DREAMER, **config):
   """A small Trainer; those of one kind share their compiled rollout."""
   trainer = train.Trainer(env, dreamer, TrainConfig(**dict(dict(envs=ENVS, updates=10_000, ratio=1.0, capacity=256), **config)), out)
-  key = (id(env), bool(trainer.expert))
+  key = (id(env), bool(trainer.expert), trainer.config.demo_noise)
   trainer.collect = _collect.setdefault(key, trainer.collect)
   return trainer
 

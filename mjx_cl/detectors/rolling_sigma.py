@@ -12,51 +12,59 @@ from mjx_cl.errors import UserError
 
 class RollingSigmaState(NamedTuple):
   """Attributes:
-    buffer: float32 (window,), the last samples. count: int32 (), samples seen. run: int32 (), samples in a row beyond the threshold.
+    recent: float32 (smooth,), the last samples. buffer: float32 (window + lag,), the last smoothed samples.
+    count: int32 (), samples seen. run: int32 (), smoothed samples in a row beyond the threshold.
   """
+  recent: jax.Array
   buffer: jax.Array
   count: jax.Array
   run: jax.Array
 
 
-def rolling_sigma(window: int = 1000, threshold: float = 3.0, patience: int = 1, two_sided: bool = True, warmup: int = 500) -> Detector:
-  """Rolling mean and standard deviation of the last `window` samples, the present one not among them.
+def rolling_sigma(window: int = 1000, threshold: float = 3.0, patience: int = 1, two_sided: bool = True, warmup: int = 500, smooth: int = 1,
+                  lag: int = 0) -> Detector:
+  """Rolling mean and standard deviation of the `window` samples before the present one.
 
-    z = (x - mean) / max(std, 1e-6),  score = |z| (two-sided) or z
-    fired = score > threshold `patience` times in a row; then the run starts anew, the window is kept
+    y_t = mean of x_{t-smooth+1..t};   mean, std over y_{t-lag-window..t-lag-1}
+    z = (y_t - mean) / max(std, 1e-6),  score = |z| (two-sided) or z
+    fired when score > threshold for the `patience`-th time in a row: one alarm per excursion, the next needs a score below first
 
-  Every sample enters the window, alarms or not, as the paper's rolling statistics do.
+  Every sample enters the window, alarms or not, as the paper's rolling statistics do. smooth = 1 and lag = 0 are the paper's rule.
 
   Args:
     window: samples of the rolling statistics [control steps]. The paper gives none.
     threshold: decision level [rolling std]; 3 in the paper.
     patience: how many in a row.
     two_sided: also a fall below the mean fires, the literal "deviation"; False: a rise alone.
-    warmup: nothing fires before so many samples; at most `window`.
+    warmup: reference samples needed before anything fires; at most `window`.
+    smooth: samples of the trailing mean that is tested; a gait makes single residuals swing, so a shift shows in their mean.
+    lag: the newest samples that the reference leaves out, so that a change cannot raise its own threshold.
   Returns:
     Detector whose update takes x, float32 (), and gives Alarm(fired: bool (), score: float32 ()).
-  Blind to: a change slower than the window, which the reference absorbs; with `patience`, a change that comes and goes faster.
+  Blind to: a change slower than window + lag, which the reference absorbs; with `patience`, a change that comes and goes faster.
   Reference: the paper, section on change detection.   Example: _, out = jax.lax.scan(det.update, det.init(), xs)
   """
-  if not (window >= 2 and patience >= 1 and threshold > 0 and 2 <= min(warmup, window)):
-    raise UserError(f"rolling_sigma needs window >= 2, patience >= 1, threshold > 0, warmup >= 2; got {window}, {patience}, {threshold}, {warmup}")
-  warmup = min(warmup, window)
+  if not (window >= 2 and patience >= 1 and threshold > 0 and min(warmup, window) >= 2 and smooth >= 1 and lag >= 0):
+    raise UserError("rolling_sigma needs window >= 2, patience >= 1, threshold > 0, warmup >= 2, smooth >= 1, lag >= 0; got "
+                    f"{window}, {patience}, {threshold}, {warmup}, {smooth}, {lag}")
+  warmup, size = min(warmup, window), window + lag
 
   def init():
-    return RollingSigmaState(jnp.zeros(window), jnp.int32(0), jnp.int32(0))
+    return RollingSigmaState(jnp.zeros(smooth), jnp.zeros(size), jnp.int32(0), jnp.int32(0))
 
   def update(state, x):
-    x = jnp.asarray(x, jnp.float32)
-    held = jnp.arange(window) < state.count
-    number = jnp.maximum(1, jnp.minimum(state.count, window))
+    recent = state.recent.at[state.count % smooth].set(jnp.asarray(x, jnp.float32))
+    y = jnp.sum(recent) / jnp.minimum(state.count + 1, smooth)
+    age = (state.count - 1 - jnp.arange(size)) % size  # 0 is the newest smoothed sample before this one
+    held = (age >= lag) & (age < state.count)
+    number = jnp.maximum(1, jnp.sum(held))
     mean = jnp.sum(jnp.where(held, state.buffer, 0.0)) / number
     std = jnp.sqrt(jnp.sum(jnp.where(held, jnp.square(state.buffer - mean), 0.0)) / number)
-    z = (x - mean) / jnp.maximum(std, 1e-6)
+    z = (y - mean) / jnp.maximum(std, 1e-6)
     score = jnp.abs(z) if two_sided else z
-    ready = state.count >= warmup
+    ready = state.count - lag >= warmup
     run = jnp.where(ready & (score > threshold), state.run + 1, 0)
-    fired = run >= patience
-    new = RollingSigmaState(state.buffer.at[state.count % window].set(x), state.count + 1, jnp.where(fired, 0, run))
-    return new, Alarm(fired, jnp.where(ready, score, jnp.nan))
+    new = RollingSigmaState(recent, state.buffer.at[state.count % size].set(y), state.count + 1, run)
+    return new, Alarm(run == patience, jnp.where(ready, score, jnp.nan))
 
   return Detector(init, update)
