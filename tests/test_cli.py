@@ -267,7 +267,8 @@ def test_overwrite_replaces_a_run_and_nothing_else(mjx, begun):
   assert sorted(os.listdir(out)) == ["config.json", "notes.txt", "work"]
 
 
-@pytest.mark.parametrize("wrong", [["--fault", "geer"], ["--detector", "cusum"], ["--target", "elbow"], ["--agent", "wlaker"], ["--severity", "2"], ["--set", "a=1"]])
+@pytest.mark.parametrize("wrong", [["--fault", "geer"], ["--detector", "cusum"], ["--target", "elbow"], ["--agent", "wlaker"],
+                                   ["--severity", "2"], ["--set", "a=1"]])
 def test_a_mistake_beside_overwrite_loses_nothing(refused, begun, wrong):
   argv, out = begun
   (out / "trace.parquet").write_text("a night's work")

@@ -17,7 +17,8 @@ from mjx_cl.monitor import Residual
 # one detector a file, named as the file; a map over one float32
 SCALAR = {m.name: f for m in pkgutil.iter_modules(detectors.__path__)
           if (f := getattr(importlib.import_module(f"mjx_cl.detectors.{m.name}"), m.name, None)) is not None}
-ALL = {f"{k} (residual)": lambda k=k: detectors.make(k) for k in detectors.DETECTORS} | {f"{k} (scalar)": lambda f=f: on("opr", f()) for k, f in SCALAR.items()}
+ALL = {f"{k} (residual)": lambda k=k: detectors.make(k) for k in detectors.DETECTORS}
+ALL |= {f"{k} (scalar)": lambda f=f: on("opr", f()) for k, f in SCALAR.items()}
 STREAMS, STEPS = 3, 700
 
 
@@ -106,22 +107,22 @@ def test_a_step_change_is_found(case):
 
 # ---- rolling_sigma -------------------------------------------------------------------------------------------------------------------
 
-def slow_rolling_sigma(xs, window, threshold, patience, two_sided, warmup):
+def slow_rolling_sigma(xs, window, threshold, patience, two_sided, warmup, smooth=1, lag=0):
   """The docstring in NumPy and float64, one sample at a time."""
   seen, run, fired, scores = [], 0, [], []
-  for x in xs:
-    held = np.array(seen[-window:])
-    if len(held) < min(warmup, window):
+  for t in range(len(xs)):
+    y = np.mean(xs[max(0, t + 1 - smooth):t + 1])
+    held = np.array(seen[:len(seen) - lag][-window:]) if lag < len(seen) else np.array([])
+    if t - lag < min(warmup, window):
       fired.append(False)
       scores.append(np.nan)
     else:
-      z = (x - held.mean()) / max(held.std(), 1e-6)
+      z = (y - held.mean()) / max(held.std(), 1e-6)
       score = abs(z) if two_sided else z
       run = run + 1 if score > threshold else 0
-      fired.append(run >= patience)
+      fired.append(run == patience)
       scores.append(score)
-      run = 0 if run >= patience else run
-    seen.append(x)
+    seen.append(y)
   return np.array(fired), np.array(scores)
 
 
@@ -131,6 +132,8 @@ def slow_rolling_sigma(xs, window, threshold, patience, two_sided, warmup):
     dict(window=30, threshold=0.5, patience=3, two_sided=False, warmup=30),
     dict(window=20, threshold=1.0, patience=2, two_sided=True, warmup=500),  # a warm-up beyond the window ends with it
     dict(window=2, threshold=1.5, patience=1, two_sided=True, warmup=2),
+    dict(window=40, threshold=1.5, patience=1, two_sided=False, warmup=10, smooth=7, lag=13),
+    dict(window=40, threshold=1.2, patience=3, two_sided=True, warmup=40, smooth=4, lag=1),
 ])
 def test_rolling_sigma_equals_the_loop(settings):
   rng = np.random.default_rng(0)
@@ -142,6 +145,22 @@ def test_rolling_sigma_equals_the_loop(settings):
     np.testing.assert_allclose(alarms.score, scores, rtol=1e-3, atol=1e-4)  # float32 sums of at most 50 samples of size 5
   assert fired.any() and not fired.all()
   np.testing.assert_array_equal(alarms.fired, fired)
+
+
+def test_one_alarm_per_excursion():
+  """Ten samples beyond the threshold are one alarm; the next needs a sample below first."""
+  quiet = jax.random.normal(jax.random.key(0), (200,)).clip(-2, 2)
+  xs = jnp.concatenate([quiet, jnp.full(10, 50.0), quiet[:5], jnp.full(10, 90.0)])
+  detector = rolling_sigma(window=100, threshold=4.0, warmup=50, lag=30)
+  fired = jax.lax.scan(detector.update, detector.init(), xs)[1].fired
+  assert np.flatnonzero(fired).tolist() == [200, 215]
+
+
+def test_lag_keeps_a_change_out_of_its_own_reference():
+  xs = jnp.concatenate([jax.random.normal(jax.random.key(0), (200,)), 3.0 + jax.random.normal(jax.random.key(1), (60,))])
+  last = {lag: float(jax.lax.scan(d.update, d.init(), xs)[1].score[-1]) for lag in (0, 80)
+          for d in [rolling_sigma(window=100, threshold=4.0, warmup=50, smooth=20, lag=lag)]}
+  assert last[80] > 3 * last[0] > 0
 
 
 def test_a_constant_stream_has_a_floor_under_its_deviation():
@@ -176,8 +195,8 @@ def test_arl0_of_three_sigma_is_the_published_370():
   np.testing.assert_allclose(arl0, exact, rtol=0.09)
 
 
-@pytest.mark.parametrize("settings", [dict(window=1), dict(window=0), dict(patience=0), dict(threshold=0), dict(threshold=-1), dict(threshold=float("nan")),
-                                      dict(warmup=1), dict(warmup=-5)])
+@pytest.mark.parametrize("settings", [dict(window=1), dict(window=0), dict(patience=0), dict(threshold=0), dict(threshold=-1),
+                                      dict(threshold=float("nan")), dict(warmup=1), dict(warmup=-5), dict(smooth=0), dict(lag=-1)])
 def test_bad_settings_are_refused(settings):
   with pytest.raises(UserError, match="rolling_sigma needs"):
     rolling_sigma(**settings)
@@ -199,8 +218,8 @@ def test_an_unknown_setting_is_named():
 
 
 def test_calibrated_settings_can_be_overridden():
-  assert detectors.make("rolling_sigma").init()[0].buffer.shape == (detectors.CALIBRATED["window"],)
-  assert detectors.make("rolling_sigma", window=300).init()[0].buffer.shape == (300,)
+  assert detectors.make("rolling_sigma").init()[0].buffer.shape == (detectors.CALIBRATED["window"] + detectors.CALIBRATED["lag"],)
+  assert detectors.make("rolling_sigma", window=300, lag=20).init()[0].buffer.shape == (320,)
   assert detectors.make("rolling_sigma_plain").init()[0].buffer.shape == (1000,)
 
 

@@ -50,8 +50,8 @@ def make_rows(steps, resets=0.1, seed=1, agent=Stub):
   shape = (steps, GROUPS, MEMBERS)
   normal = lambda *more: jnp.asarray(rng.normal(size=shape + more), jnp.float32)
   done, kind = rng.random(shape) < resets, rng.random(shape) < 0.5
-  return Row(None, None, None, normal(agent.act_size), normal(agent.size.deter), jnp.asarray(rng.integers(0, CLASSES, shape + (agent.size.stoch,))),
-             normal(), None, normal(agent.obs_size), jnp.asarray(done & kind), jnp.asarray(done & ~kind), None, None, None, None)
+  stoch = jnp.asarray(rng.integers(0, CLASSES, shape + (agent.size.stoch,)))
+  return Row(None, None, None, normal(agent.act_size), normal(agent.size.deter), stoch, normal(), None, normal(agent.obs_size), jnp.asarray(done & kind), jnp.asarray(done & ~kind), None, None, None, None)
 
 
 def part(rows, start, stop):
@@ -87,7 +87,8 @@ def expect(rows, n, least, form, actions):
       one = Row(*(None if x is None else np.asarray(x)[:, g, m] for x in rows))
       gain = float(Stub.params["gain"][g])
       one = one._replace(deter=one.deter.astype(float))
-      scaled = slow(one._replace(final_obs=one.final_obs / gain, reward=one.reward / gain), n, least, form, actions)  # |g p - x| = |g| |p - x / g|
+      one = one._replace(final_obs=one.final_obs / gain, reward=one.reward / gain)  # |g p - x| = |g| |p - x / g|
+      scaled = slow(one, n, least, form, actions)
       out[:, g, m] = abs(gain) * scaled
   return out
 
@@ -162,8 +163,8 @@ def test_opr_is_the_mean_over_variables_and_blind_to_none():
   np.testing.assert_array_equal(a.rpr, b.rpr)
 
 
-@pytest.mark.parametrize("settings, word", [(dict(form="papers"), "paper, streaming"), (dict(actions="own"), "recorded, policy"), (dict(least=0), "least"),
-                                            (dict(n=4, least=5), "least")])
+@pytest.mark.parametrize("settings, word", [(dict(form="papers"), "paper, streaming"), (dict(actions="own"), "recorded, policy"),
+                                            (dict(least=0), "least"), (dict(n=4, least=5), "least")])
 def test_wrong_settings_are_refused(settings, word):
   with pytest.raises(UserError, match=word):
     Monitor(Stub(), **settings)

@@ -49,7 +49,8 @@ def child(argv, save_every_s):
 
 def spawn(argv, save_every_s=60.0):
   code = f"import sys, test_run; test_run.child(sys.argv[1:], {save_every_s})"
-  return subprocess.Popen([sys.executable, "-c", code, *argv], cwd=pathlib.Path(__file__).parent, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+  here = pathlib.Path(__file__).parent
+  return subprocess.Popen([sys.executable, "-c", code, *argv], cwd=here, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
 @pytest.fixture(scope="session")
@@ -94,16 +95,16 @@ def test_all_files_are_there_with_their_columns(whole):
   out, _, _ = whole
   assert sorted(os.listdir(out)) == ["config.json", "events.parquet", "figure.png", "runs.parquet", "summary.json", "trace.parquet"]
   assert list(table(out, "trace")) == [
-      "stream", "arm", "seed", "fault", "step", "episode", "phase", "fault_active", "severity", "reward", "opr", "rpr", "score", "alarm", "terminated",
-      "truncated", "valid", "dyn_loss", "adv_mag", "value_loss", "updates"]
+      "stream", "arm", "seed", "fault", "step", "episode", "phase", "fault_active", "severity", "reward", "opr", "rpr", "score", "alarm",
+      "terminated", "truncated", "valid", "dyn_loss", "adv_mag", "value_loss", "updates"]
   assert {"stream", "step", "kind", "reason", "fault"} <= set(table(out, "events"))
-  assert {"arm", "onset", "alarm_step", "latency_steps", "latency_s", "false_alarms", "adapt_start", "adapt_stop", "outcome", "recovery_step", "reward_pre",
-          "reward_drop", "reward_final", "return_lost", "terminations", "updates", "wall_s"} <= set(table(out, "runs"))
+  assert {"arm", "onset", "alarm_step", "latency_steps", "latency_s", "false_alarms", "adapt_start", "adapt_stop", "outcome", "recovery_step",
+          "reward_pre", "reward_drop", "reward_final", "return_lost", "terminations", "updates", "wall_s"} <= set(table(out, "runs"))
 
 
 def test_config_tells_how_it_was_made(whole, saved):
   config = json.loads((whole[0] / "config.json").read_text())
-  assert (config["command"], config["env"], config["severity"], config["onset"], config["arms"]) == ("run", "walker", 0.5, ONSET, ["detector", "none"])
+  assert [config[k] for k in ("command", "env", "severity", "onset", "arms")] == ["run", "walker", 0.5, ONSET, ["detector", "none"]]
   assert config["settings"] == {"window": 100, "warmup": 30} and config["adapt"]["patience"] == 4 and config["physics"] in ("native", "mjx")
   assert config["versions"]["jax"] == jax.__version__ and config["machine"]["cores"] == os.cpu_count() and "git_commit" in config
   assert config["agent_card"] == json.loads((saved / "card.json").read_text())
@@ -119,15 +120,16 @@ def test_summary_has_every_aggregate_with_its_interval(whole):
   summary = json.loads((whole[0] / "summary.json").read_text())
   assert set(summary["arms"]) == {"detector", "none"}
   for arm in summary["arms"].values():
-    for name in ("alarms", "false_alarm_streams", "latency_median_steps", "miss_probability", "converged", "aborted_by_rule", "aborted_by_budget", "recovered",
-                 "recovery_median_steps", "reward_pre", "reward_drop", "reward_final", "return_lost"):
+    for name in ("alarms", "false_alarm_streams", "latency_median_steps", "miss_probability", "converged", "aborted_by_rule", "aborted_by_budget",
+                 "recovered", "recovery_median_steps", "reward_pre", "reward_drop", "reward_final", "return_lost"):
       ci = arm[name + "_ci"]
       assert name in arm and (ci is None or len(ci) == 2)
       if arm[name] is not None and ci is not None and None not in ci:
         assert ci[0] <= arm[name] <= ci[1], name
     assert arm["seeds"] == 2 and 0 <= arm["affected"] <= 2
   assert all(summary[k] == v for k, v in summary["arms"]["detector"].items())  # stands at the top level too
-  assert set(summary["wall_share"]) == {"physics", "acting", "monitor", "updates", "other"} and sum(summary["wall_share"].values()) == pytest.approx(1.0)
+  assert set(summary["wall_share"]) == {"physics", "acting", "monitor", "updates", "other"}
+  assert sum(summary["wall_share"].values()) == pytest.approx(1.0)
   assert summary["wall_s"] > 0 and 0 <= summary["invalid_share"] < 0.5
 
 
@@ -238,7 +240,8 @@ def test_figure_of_a_run_in_which_little_happened(tmp_path, starts):
   trace = {"arm": ["detector"] * steps + ["none"] * steps, "step": np.tile(np.arange(steps), 2), "reward": numbers}
   trace |= {k: np.full(2 * steps, np.nan) for k in ("opr", "rpr", "adv_mag", "dyn_loss")} | {"value_loss": numbers}
   store.write_table(tmp_path / "trace.parquet", trace)
-  store.write_table(tmp_path / "events.parquet", {"step": [40] + starts, "kind": ["onset"] + ["start"] * len(starts), "arm": ["detector"] * (1 + len(starts))})
+  events = {"step": [40] + starts, "kind": ["onset"] + ["start"] * len(starts), "arm": ["detector"] * (1 + len(starts))}
+  store.write_table(tmp_path / "events.parquet", events)
   store.write_json(tmp_path / "config.json", {"env": "walker", "fault": "gear", "severity": 0.5, "onset": 40, "control_s": 0.025})
   with warnings.catch_warnings():
     warnings.simplefilter("error")
@@ -353,7 +356,8 @@ def used(tiny):
   state = jax.jit(tiny.init)(jax.random.key(1))
   leaves, tree = jax.tree.flatten(state)
   rng = np.random.default_rng(0)
-  leaves = [(rng.normal(size=x.shape) * 10.0 ** rng.uniform(-12, 3)).astype(np.float32) if x.dtype == np.float32 else np.full(x.shape, 77, x.dtype) for x in leaves]
+  draw = lambda x: (rng.normal(size=x.shape) * 10.0 ** rng.uniform(-12, 3)).astype(np.float32)
+  leaves = [draw(x) if x.dtype == np.float32 else np.full(x.shape, 77, x.dtype) for x in leaves]
   return jax.tree.unflatten(tree, leaves)
 
 

@@ -161,7 +161,8 @@ def test_interval_of_a_censored_median_has_null_for_infinity():
   assert low == 1.0 and high is None
 
 
-@pytest.mark.parametrize("hits, n, want", [(81, 263, (0.2553, 0.3662)), (15, 148, (0.0624, 0.1605)), (0, 20, (0.0, 0.1611)), (1, 29, (0.0061, 0.1718))])
+@pytest.mark.parametrize("hits, n, want", [(81, 263, (0.2553, 0.3662)), (15, 148, (0.0624, 0.1605)), (0, 20, (0.0, 0.1611)),
+                                           (1, 29, (0.0061, 0.1718))])
 def test_wilson_equals_newcombe(hits, n, want):
   """Newcombe 1998, Statistics in Medicine 17, 857-872, table I, method 3, printed to four places."""
   np.testing.assert_allclose(bootstrap.wilson(hits, n), want, atol=5e-5)

@@ -268,6 +268,23 @@ def test_damaged_checkpoint_is_one_clear_line(saved, kind):
   assert "\n" not in str(e.value) and "checkpoint 2" in str(e.value) and str(saved) in str(e.value)
 
 
+def test_any_one_damaged_file_is_noticed_or_harmless(saved, same):
+  files = [f for f in sorted((saved / "2").rglob("*")) if f.is_file()]
+  noticed = 0
+  for file in files:
+    whole = file.read_bytes()
+    for kind in ("truncated", "removed"):
+      DAMAGE[kind](file)
+      try:
+        tree, meta = checkpoint.Checkpoints(saved).load(like(TREE))
+        assert same(tree, TREE | {"n": jnp.int32(2)}) and meta == {"number": 2}, file.name
+      except FileError as e:
+        noticed += 1
+        assert "\n" not in str(e)
+      file.write_bytes(whole)
+  assert noticed >= 2 and len(files) > 2
+
+
 @pytest.mark.parametrize("other", [{"w": jnp.zeros((2, 4))}, {"w": jnp.zeros((3, 2))}, {"w": jnp.zeros(6)}, {"more": jnp.zeros(2)}])
 def test_checkpoint_of_another_size_is_one_clear_line(saved, other):
   with pytest.raises(FileError) as e:

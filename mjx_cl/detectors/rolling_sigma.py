@@ -55,7 +55,8 @@ def rolling_sigma(window: int = 1000, threshold: float = 3.0, patience: int = 1,
   def update(state, x):
     recent = state.recent.at[state.count % smooth].set(jnp.asarray(x, jnp.float32))
     y = jnp.sum(recent) / jnp.minimum(state.count + 1, smooth)
-    age = (state.count - 1 - jnp.arange(size)) % size  # 0 is the newest smoothed sample before this one
+    behind = (state.count + size - 1) % size - jnp.arange(size)
+    age = jnp.where(behind < 0, behind + size, behind)  # 0 is the newest smoothed sample before this one
     held = (age >= lag) & (age < state.count)
     number = jnp.maximum(1, jnp.sum(held))
     mean = jnp.sum(jnp.where(held, state.buffer, 0.0)) / number
