@@ -263,15 +263,18 @@ def do_train(args: Train) -> None:
   dreamer = replace(preset.dreamer, **rest)
   if args.seeds < 1:
     raise UserError(f"seeds must be above 0; got {args.seeds}")
-  from mjx_cl import envs, store, train
+  from mjx_cl import agents, demonstrator, envs, run, store, train
+  env = envs.make(args.env, args.physics)
+  if args.demonstrator not in (None, "ppo"):  # whatever can be refused is refused before an earlier training is touched
+    demonstrator.load(args.demonstrator)
+  if args.agent:
+    agents.load(args.agent, args.env, len(env.spec.obs), len(env.spec.act))
   state = store.claim_folder(args.out, args.resume, args.overwrite, done_marker="agent/card.json")
   if state == "done":
     say(f"{args.out}: this training is finished")
     return
-  from mjx_cl import run
   if state == "new" and args.overwrite:
     run.clear(train.pathlib.Path(args.out))
-  env = envs.make(args.env, args.physics)
   command = "mjx-cl " + " ".join(sys.argv[1:]) if len(sys.argv) > 1 else "mjx-cl train"
   trainer = train.build(env, dreamer, train_config, args.out, args.seed, args.seeds, args.demonstrator, args.agent, args.preset, command, state == "resume")
   display = TrainDisplay(train_config.updates)

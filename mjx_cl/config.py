@@ -121,8 +121,8 @@ class AdaptConfig:
     ratio: replayed steps per post-alarm record, 16 in the paper.
     start_windows: windows that the post-alarm replay must hold before the first update.
     lr: learning rate while adapting, None: the agent's own. Measured on seeds 100 to 104 with the right hip's gear halved, reward 3,000 to
-      8,000 steps after onset (0.92 before, 0.45 without adaptation): 3e-4 with the agent's 16 starts 0.2, with all starts and falling
-      0.45; 2e-4 with all starts 0.78 (moments kept) and 0.78 (fresh); an earlier agent at 1e-4 with all starts 0.65.
+      8,000 steps after onset (0.92 before, 0.45 without adaptation): 2e-4 with all starts 0.78 (moments kept) and 0.78 (fresh). An earlier agent:
+      3e-4 with its 16 starts 0.2, 1e-4 with all starts 0.65.
     last_starts: imagination starts while adapting, the last k states of each sequence, 0 all; None: the agent's own. The gradient of
       some 150 updates must do: with 16 of 64 states its noise undoes the policy.
     fresh_moments: forget the optimiser's moments at an alarm. Kept ones were gathered on the gradients of a trained agent; those after an event

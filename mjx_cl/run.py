@@ -277,7 +277,7 @@ class Runner:
       starts = [e["step"] for e in own if e["kind"] == "start"]
       ends = [e for e in own if e["kind"] in ("stop", "abort")]
       outcome = "nominal" if not starts else "adapting"
-      if starts and ends:
+      if starts and ends and ends[-1]["step"] > starts[-1]:
         reason = ends[-1]["reason"]
         outcome = "converged" if ends[-1]["kind"] == "stop" else "aborted_by_budget" if reason == phase_lib.REASONS[phase_lib.ABORT_BUDGET] else "aborted_by_rule"
       affected = None if drop.get(seed) is None else bool(drop[seed] >= 0.1)

@@ -176,7 +176,8 @@ class Trainer:
     enough = int(np.min(jax.vmap(lambda r: replay_lib.windows(r, self.dreamer.length + 1))(self.state.replay))) >= size
     if enough:
       self.owed += CHUNK * self.config.envs * self.config.ratio / size
-      count = min(int(self.owed), self.config.updates - self.updates)
+      kept = 0 if self.phase == "pure" else self.config.pure  # the last phase gets its updates in full
+      count = max(0, min(int(self.owed), self.config.updates - self.updates - kept))
       count = 1 << (count.bit_length() - 1) if count else 0  # few static lengths: the rest is owed
       self.owed -= count
       if count:

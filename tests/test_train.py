@@ -160,7 +160,6 @@ def test_phases_follow_one_another(short_walker, tmp_path, expert_path):
   assert sum(n for (n, _), name in zip(learn.calls, names) if name == "pure") >= 32
 
 
-@pytest.mark.xfail(strict=True, reason="a chunk's updates are not cut at `updates - pure`, so the last phase can lose up to a chunk of them")
 def test_at_least_pure_updates_are_pure(short_walker, tmp_path, expert_path):
   trainer, learn = phases(short_walker, tmp_path, expert_path, updates=100, clone=20, fade=30, pure=50)
   while not trainer.done:
