@@ -95,7 +95,7 @@ class Runner:
     """Lives one chunk and logs it."""
     begin = time.perf_counter()
     physics = getattr(self.env.physics, "seconds", 0.0)
-    streams, rows = self.rollout.chunk(self.state.loop.train.params, self.state.streams, CHUNK)
+    streams, rows = self.rollout.chunk(self.state.loop.acting, self.state.streams, CHUNK)
     rows = jax.block_until_ready(rows)
     acted = time.perf_counter()
     physics = getattr(self.env.physics, "seconds", 0.0) - physics

@@ -23,6 +23,7 @@ class LoopState(NamedTuple):
 
   Attributes:
     train: TrainState of each stream.
+    acting: the parameters that act and predict, a moving average of train.params while adapting, equal to them otherwise.
     replay: Replay with one environment each, post-alarm records only.
     history: monitor history, leading (n - 1, groups, 1).
     detector: state of the detector.
@@ -32,6 +33,7 @@ class LoopState(NamedTuple):
     executed: int32, updates taken since the run began.
   """
   train: TrainState
+  acting: Any
   replay: replay_lib.Replay
   history: History
   detector: Any
@@ -77,7 +79,7 @@ class Loop:
     empty = replay_lib.init(1, self.capacity, a.obs_size, a.act_size, a.size.deter, a.size.stoch)
     rows = max(1, self.config.refit // self.repeat)
     past = Residual(jnp.zeros((rows, groups)), jnp.zeros((rows, groups)), jnp.zeros((rows, groups, a.obs_size)), jnp.zeros((rows, groups), bool))
-    return LoopState(spread(train), spread(empty), self.monitor.init(groups, 1), spread(self.detector.init()), spread(phase_lib.init(self.config)),
+    return LoopState(spread(train), spread(train.params), spread(empty), self.monitor.init(groups, 1), spread(self.detector.init()), spread(phase_lib.init(self.config)),
                      past, jnp.zeros(groups), jnp.zeros(groups, jnp.int32))
 
   def _digest(self, state: LoopState, rows, now, acts, keys):
@@ -93,7 +95,7 @@ class Loop:
     key_monitor, key_eval, key_update = split[:, 0], split[:, 1], split[:, 2]
     length = rows.reward.shape[0]
     before = state.history
-    history, residual = self.monitor.update(state.train.params, state.history, rows, key_monitor)
+    history, residual = self.monitor.update(state.acting, state.history, rows, key_monitor)
     residual = jax.tree.map(lambda x: x[:, :, 0], residual)
     detector, alarms = jax.lax.scan(jax.vmap(self.detector.update), state.detector, residual)
     past = jax.tree.map(lambda a, b: jnp.concatenate([a, b])[-a.shape[0]:], state.past, residual)
@@ -134,9 +136,16 @@ class Loop:
       train = train._replace(opt=jax.lax.cond(jnp.any(begins), lambda o: jax.tree.map(reset, fresh, o), lambda o: o, train.opt))
     train, replay = self._learn(train, replay, key_update, number)
 
+    # the robot acts by a moving average of what it learns, and keeps it when it is done
+    rate = jnp.where(number > 0, self.config.average, 0.0)
+    ended = (was == phase_lib.ADAPTING) & (phase.phase != phase_lib.ADAPTING)
+    wide = lambda x, like: x.reshape((-1,) + (1,) * (like.ndim - 1))
+    acting = jax.tree.map(lambda a, p: a + wide(rate, a) * (p - a), state.acting, train.params)
+    train = train._replace(params=jax.tree.map(lambda a, p: jnp.where(wide(ended, a), a, p), acting, train.params))
+
     # a stream that has converged watches again, its reference refitted on the latest rows
     detector = jax.lax.cond(jnp.any(decision == phase_lib.STOP), self._refit, lambda d, p, s: d, detector, past, decision == phase_lib.STOP)
-    state = LoopState(train, replay, history, detector, phase, past, owed - number, state.executed + number)
+    state = LoopState(train, acting, replay, history, detector, phase, past, owed - number, state.executed + number)
     return state, Digest(residual, alarms.score, alarms.fired, signals, ok, phase.phase, decision, phase.since, state.executed)
 
   @staticmethod

@@ -91,7 +91,7 @@ class Walker:
     self.spec = Spec(
         name="walker", obs=tuple(orientation + [Var("height", "m")] + speeds), act=tuple(Var(j, "1", -1, 1) for j in JOINTS),
         control_s=0.025, episode_steps=1000,
-        acceptance=0.75,        # mean reward per step; one that stands still earns 0.17, one that walks and never falls 0.95
+        acceptance=0.8,         # mean reward per step; one that stands still earns 0.17, one that walks and never falls 0.95
         posture=(14, 0.9),      # mean torso height [m]; 1.2 is standing, 0.3 is lying
         targets=JOINTS)
     self.model = Model(mj={"actuator_gear": jnp.asarray(self.mj_model.actuator_gear, jnp.float32)}, task={})
