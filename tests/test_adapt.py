@@ -392,13 +392,31 @@ def test_fresh_moments_are_fresh_from_the_alarm_on(cheap_story):
 
 def test_a_stream_without_updates_keeps_its_weights_bit_for_bit(story, same):
   begin, told = story
-  before, updates = begin.train, np.zeros(3)
+  before, updates = begin, np.zeros(3)
   for t in told:
     for g in range(3):
-      assert same(of(t.state.train, g), of(before, g)) == (t.digest.updates[g] == updates[g])
-    before, updates = t.state.train, t.digest.updates
+      ended = t.digest.decision[g] > phase_lib.START
+      idle = t.digest.updates[g] == updates[g]
+      assert same(of(t.state.train, g), of(before.train, g)) == (idle and not ended)
+      assert same(of(t.state.acting, g), of(before.acting, g)) or not idle
+    before, updates = t.state, t.digest.updates
   assert same(of(told[-1].state.train, 1), of(begin.train, 1))
-  assert same(of(told[8].state.train, 0), of(told[5].state.train, 0))  # frozen after the stop
+  assert same(of(told[8].state.train, 0), of(told[6].state.train, 0))  # frozen after the stop
+  assert same(of(told[6].state.train.params, 0), of(told[6].state.acting, 0))  # at the average that acts
+
+
+def test_the_robot_acts_by_a_moving_average(story):
+  """acting' = acting + average (newest - acting) in a chunk with updates; it ends where learning goes on from."""
+  begin, told = story
+  before, updates, moved = begin, np.zeros(3), 0
+  for t in told:
+    for g in range(3):
+      if t.digest.updates[g] > updates[g] and t.digest.decision[g] <= phase_lib.START:
+        want = jax.tree.map(lambda a, p: a + 0.1 * (p - a), of(before.acting, g), of(t.state.train.params, g))
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-8), of(t.state.acting, g), want)  # float32
+        moved += 1
+    before, updates = t.state, t.digest.updates
+  assert moved
 
 
 def test_the_detector_is_refitted_after_a_stop(story):
