@@ -293,7 +293,7 @@ class Runner:
     return rows
 
   def _summary(self, runs, trace) -> dict:
-    """summary.json: per arm the aggregates of design.md section 4, each with its interval."""
+    """summary.json: per arm the aggregates, each with its interval; arm `detector` also at the top level."""
     out = {"env": self.config.env, "fault": self.config.fault, "severity": self.config.severity, "onset": self.config.onset, "steps": self.config.steps,
            "detector": self.config.detector}
     arms = {arm: summarise([r for r in runs if r["arm"] == arm], self.config, self.env.spec.control_s) for arm in self.config.arms}

@@ -88,7 +88,7 @@ def test_doctor(mjx):
 
 
 def test_standard_output_is_clean_where_mjx_is_loaded():
-  """`from mujoco import mjx` says on standard output that warp is absent (design.md 6.7)."""
+  """`from mujoco import mjx` says on standard output that warp is absent."""
   code = "import mjx_cl.envs, json; env = mjx_cl.envs.make('walker', 'mjx'); print(json.dumps(env.physics.name))"
   process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
   assert process.returncode == 0 and process.stdout == '"mjx"\n', process.stderr

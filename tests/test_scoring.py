@@ -62,7 +62,7 @@ def test_return_lost_is_the_sum_from_onset():
 # ---- recovery step -------------------------------------------------------------------------------------------------------------------
 
 def slow_recovery(reward, onset, pre):
-  """The definition of design.md section 5, read word for word: a mean and a hold per step, no shared sums."""
+  """The definition in the README, read word for word: a mean and a hold per step, no shared sums."""
   trailing = [np.mean(reward[max(0, k - 999):k + 1]) for k in range(len(reward))]
   below = [k for k in range(onset, len(reward)) if trailing[k] < 0.9 * pre]
   if not below:
