@@ -132,7 +132,7 @@ class Query:
 class List:
   """Names that other commands take."""
   what: Positional[str] = "all"
-  """envs, faults, detectors, presets, agents, arms or all."""
+  """envs, faults, detectors, presets, agents, arms, sizes or all."""
   json: bool = False
 
 
@@ -362,11 +362,11 @@ def do_query(args: Query) -> None:
 
 
 def do_list(args: List) -> None:
-  from mjx_cl import agents, detectors, envs, faults
+  from mjx_cl import agents, detectors, envs, faults, memory
   first = lambda f: (f.__doc__ or "").strip().split("\n")[0]
   tables = {"envs": {k: first(v) for k, v in envs.ENVS.items()}, "faults": {k: first(v) for k, v in faults.FAULTS.items()},
             "detectors": {k: first(v) for k, v in detectors.DETECTORS.items()}, "presets": {k: p.about for k, p in PRESETS.items()},
-            "agents": {k: "shipped" for k in agents.shipped()}, "arms": ARMS}
+            "agents": {k: "shipped" for k in agents.shipped()}, "arms": ARMS, "sizes": memory.table()}
   chosen = tables if args.what == "all" else {args.what: choose("list", args.what, tables)}
   if args.json:
     emit(chosen)

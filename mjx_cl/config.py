@@ -89,6 +89,9 @@ class TrainConfig:
     clone_weight, clone_std: weight of KL(N(demonstrator's action, clone_std^2) || policy), and that deviation.
     fade: updates over which the weight falls to 0 after that.
     pure: least number of last updates with neither the demonstrator's data nor its term.
+    shake: probability that a stretch of 16 control steps is driven by one random action, on `shake_share` of the robots: stumbles and falls
+      to learn from. 0: never, as the authors.
+    shake_share: share of the robots that are shaken; the return of the others is the one reported.
   """
   envs: int = 16
   updates: int = 500_000
@@ -105,10 +108,12 @@ class TrainConfig:
   clone_std: float = 0.2
   fade: int = 2000
   pure: int = 6000
+  shake: float = 0.0
+  shake_share: float = 0.5
 
   def __post_init__(self):
     positive(self, "envs", "updates", "ratio", "capacity", "repeat")
-    fraction(self, "demo_share", "clone_until")
+    fraction(self, "demo_share", "clone_until", "shake", "shake_share")
     if self.demonstrator and self.clone + self.fade + self.pure > self.updates:
       raise UserError(f"clone + fade + pure = {self.clone + self.fade + self.pure} exceeds updates = {self.updates}")
 
@@ -125,6 +130,7 @@ class AdaptConfig:
       3e-4 with its 16 starts 0.2, 1e-4 with all starts 0.65.
     last_starts: imagination starts while adapting, the last k states of each sequence, 0 all; None: the agent's own. The gradient of
       some 150 updates must do: with 16 of 64 states its noise undoes the policy.
+    batch: sequences of one update while adapting, None: the agent's own 16. At the same train ratio fewer sequences mean more updates.
     average: rate per chunk with updates of the moving average of the weights that acts while adapting; 1: the newest weights. On the same
       five streams, reward 5,000 to 10,000 steps after onset: 0.82 with 0.1, 0.78 with 1 (that run ended at 8,000).
     fresh_moments: forget the optimiser's moments at an alarm. Kept ones were gathered on the gradients of a trained agent; those after an event
@@ -145,6 +151,7 @@ class AdaptConfig:
   ratio: float = 16.0
   start_windows: int = 1024
   lr: float | None = 2e-4
+  batch: int | None = None
   last_starts: int | None = 0
   average: float = 0.1
   fresh_moments: bool = False

@@ -17,6 +17,9 @@ from mjx_cl.replay import Record
 from mjx_cl.types import EnvState, Step
 
 
+STRETCH = 16  # control steps under one random action, where a robot is shaken
+
+
 class Stream(NamedTuple):
   """One robot between two decisions.
 
@@ -91,7 +94,7 @@ class Rollout:
     self.deterministic, self.expert, self.expert_noise = deterministic, expert, expert_noise
     self.chunk = functools.partial(jax.jit, static_argnames=("length",))(self._chunk)
 
-  def _decide(self, params, stream: Stream, drive):
+  def _decide(self, params, stream: Stream, drive, shake):
     key = jax.random.fold_in(stream.key, stream.t)
     key_act, key_expert = jax.random.split(jax.random.fold_in(key, 0))
     carry, action = self.agent.act(params, stream.agent, stream.obs, key_act, self.deterministic)
@@ -100,6 +103,11 @@ class Rollout:
       demo, has_demo = self.expert(stream.obs), jnp.bool_(True)
       noisy = demo + self.expert_noise * jax.random.normal(key_expert, demo.shape)
       action = jnp.where(drive, noisy, action)
+      carry = carry._replace(action=action)
+    if shake is not None:
+      key_stretch, key_push = jax.random.split(jax.random.fold_in(jax.random.fold_in(stream.key, stream.t // STRETCH), 3))
+      push = jax.random.uniform(key_push, action.shape, minval=-1.0, maxval=1.0)
+      action = jnp.where(jax.random.uniform(key_stretch) < shake, push, action)
       carry = carry._replace(action=action)
     return carry, action, demo, has_demo
 
@@ -111,23 +119,26 @@ class Rollout:
     env_state, out = self.env.step(ports.model, stream.env, ports.ctrl)
     return stream._replace(env=env_state, t=stream.t + 1, injection=injection), out, severity
 
-  def _chunk(self, params, streams: Stream, length: int, drive=None):
+  def _chunk(self, params, streams: Stream, length: int, drive=None, shake=None):
     """`length` decisions.
 
     Args:
       params: agent parameters with leading (groups,).
       streams: Stream with leading (groups, members).
       drive: bool (groups, members), the expert acts; used only where there is one.
+      shake: float32 (groups, members), probability that a stretch of STRETCH control steps is driven by one random action, uniform in
+        [-1, 1], in place of the policy's; None: never.
     Returns:
       (streams', Row with leading (length, groups, members)).
     """
     if drive is None:
       drive = jnp.zeros(streams.t.shape, bool)
-    decide = nest(self._decide, (0, 0, 0), (None, 0, 0))
+    decide = nest(self._decide, (0, 0, 0, None if shake is None else 0), (None, 0, 0, None if shake is None else 0))
     control = nest(self._control, (0, 0), (0, 0))
+    params = jax.vmap(self.agent.prepare)(params)
 
     def step(streams: Stream, _):
-      carry, action, demo, has_demo = decide(params, streams, drive)
+      carry, action, demo, has_demo = decide(params, streams, drive, shake)
       before = streams
       streams, out, severity = control(streams, action)
       rewards = [out.reward]

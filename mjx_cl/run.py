@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_cl import agents, checkpoint, detectors, envs, faults, scoring, store
+from mjx_cl import agents, checkpoint, detectors, envs, faults, memory, scoring, store
 from mjx_cl.adapt import phase as phase_lib
 from mjx_cl.adapt.loop import Loop, LoopState
 from mjx_cl.config import RunConfig
@@ -56,7 +56,8 @@ class Runner:
     self.config, self.out = config, pathlib.Path(out)
     self.env = envs.make(config.env, config.physics)
     spec = self.env.spec
-    self.trained = agents.load(config.agent, config.env, len(spec.obs), len(spec.act), config.adapt.lr, config.adapt.last_starts)
+    self.trained = agents.load(config.agent, config.env, len(spec.obs), len(spec.act), lr=config.adapt.lr,
+                               last_starts=config.adapt.last_starts, batch=config.adapt.batch)
     agent, self.repeat = self.trained.agent, int(self.trained.card.get("repeat", 1))
     self.fault = faults.make(config.fault, spec)
     target = faults.target_index(self.fault, config.target)
@@ -66,6 +67,7 @@ class Runner:
     self.chunk_steps = CHUNK * self.repeat
     self.chunks = -(-config.steps // self.chunk_steps)
     capacity = (self.chunks + 1) * CHUNK + config.steps // spec.episode_steps + CHUNK
+    memory.check(agent.config.size, len(spec.obs), len(spec.act), capacity, len(config.arms) * config.seeds, ("steps", 1), agent.config.bins)
     self.loop = Loop(agent, monitor, detector, spec, config.adapt, self.repeat, capacity=capacity)
     self.seeds = [config.first_seed + i for i in range(config.seeds)]
     self.labels = [(arm, seed) for arm in config.arms for seed in self.seeds]

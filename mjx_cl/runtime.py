@@ -41,8 +41,26 @@ def cache_dir() -> pathlib.Path:
   return pathlib.Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")).expanduser() / "mjx_cl"
 
 
+def keep_memory() -> bool:
+  """Tells glibc to keep freed memory instead of handing every large block back to the system; True where that was done.
+
+  XLA takes the scratch memory of a program anew at each call. Through mmap every call then touches fresh pages, and the page faults cost
+  about a third of a size1m update (benchmarks/dreamer_update.py, row `allocator`). The process stays as large as its peak. A user who has set
+  MALLOC_MMAP_MAX_, MALLOC_MMAP_THRESHOLD_ or MALLOC_TRIM_THRESHOLD_ is left alone; so is every other C library.
+  """
+  if sys.platform != "linux" or any(name in os.environ for name in ("MALLOC_MMAP_MAX_", "MALLOC_MMAP_THRESHOLD_", "MALLOC_TRIM_THRESHOLD_")):
+    return False
+  import ctypes
+  trim_threshold, mmap_max = -1, -4  # M_TRIM_THRESHOLD and M_MMAP_MAX of malloc.h
+  try:
+    mallopt = ctypes.CDLL(None).mallopt
+  except (AttributeError, OSError):  # no glibc
+    return False
+  return bool(mallopt(mmap_max, 0) and mallopt(trim_threshold, -1))
+
+
 def setup() -> None:
-  """Sets XLA flags, the compile cache and synchronous CPU dispatch. Call before the first JAX computation.
+  """Sets XLA flags, the compile cache, the allocator and synchronous CPU dispatch. Call before the first JAX computation.
 
   Synchronous dispatch: a callback into the physics converts its arguments on a thread of the CPU client, and with
   asynchronous dispatch that conversion can wait for itself (jax issues 24255 and 25861).
@@ -51,6 +69,7 @@ def setup() -> None:
   if _done:
     return
   _done = True
+  keep_memory()
   flags = xla_flags(importlib.metadata.version("jaxlib"), os.environ.get("XLA_FLAGS", ""))
   if flags:
     os.environ["XLA_FLAGS"] = flags

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_cl import checkpoint, demonstrator, faults, replay as replay_lib
+from mjx_cl import checkpoint, demonstrator, faults, memory, replay as replay_lib
 from mjx_cl.config import DreamerConfig, TrainConfig
 from mjx_cl.dreamer.agent import Agent, TrainState, Weights
 from mjx_cl.errors import FileError, UserError
@@ -33,10 +33,11 @@ class Learner(NamedTuple):
   key: jax.Array
 
 
-def make_learn(agent: Agent, batch: int, length: int):
-  """(train, replay, key, weights, updates) -> (train, replay, metrics of the mean over updates), seeds leading, jitted.
+def make_learn(agent: Agent, batch: int, length: int, mesh=None):
+  """(train, replay, key, weights, active (seeds,), updates) -> (train, replay, metrics (seeds,), means over the updates), seeds leading, jitted.
 
-  Seeds run one after another inside the program (`lax.map`): on a CPU that is as fast as vmap or faster, and needs the memory of one.
+  Seeds run one after another inside the program (`lax.map`): on a CPU that is as fast as vmap or faster, and needs the memory of one. A seed
+  that is not active is passed over. With a `mesh` each of its devices does its own share of the seeds.
   """
   def one_seed(train, replay, key, weights, updates):
     def step(state, key):
@@ -48,15 +49,31 @@ def make_learn(agent: Agent, batch: int, length: int):
     (train, replay), metrics = jax.lax.scan(step, (train, replay), jax.random.split(key, updates))
     return train, replay, jax.tree.map(jnp.mean, metrics)
 
+  def every(train, replay, keys, weights, active, updates):
+    run = lambda train, replay, key: one_seed(train, replay, key, weights, updates)
+    shapes = jax.eval_shape(run, *jax.tree.map(lambda x: x[0], (train, replay, keys)))[2]
+    rest = lambda train, replay, key: (train, replay, jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes))
+    return jax.lax.map(lambda x: jax.lax.cond(x[3], run, rest, *x[:3]), (train, replay, keys, active))
+
   @functools.partial(jax.jit, static_argnames=("updates",), donate_argnums=(0, 1))
-  def learn(train, replay, key, weights, updates):
+  def learn(train, replay, key, weights, active, updates):
     seeds = train.updates.shape[0]
     if seeds == 1:  # no copy of the replay
       out = one_seed(*jax.tree.map(lambda x: x[0], (train, replay)), key, weights, updates)
       return jax.tree.map(lambda x: x[None], out)
-    body = lambda x: one_seed(x[0], x[1], x[2], weights, updates)
-    return jax.lax.map(body, (train, replay, jax.random.split(key, seeds)))
+    body = functools.partial(every, updates=updates)
+    if mesh is not None:
+      mine, all_ = jax.sharding.PartitionSpec("seeds"), jax.sharding.PartitionSpec()
+      body = jax.shard_map(body, mesh=mesh, in_specs=(mine, mine, mine, all_, mine), out_specs=mine, check_vma=False)
+    return body(train, replay, jax.random.split(key, seeds), weights, active)
   return learn
+
+
+def seeds_mesh(seeds: int):
+  """A mesh of the most devices that share `seeds` seeds evenly, or None where that is one."""
+  devices = jax.devices()
+  count = max(n for n in range(1, len(devices) + 1) if seeds % n == 0)
+  return jax.sharding.Mesh(np.asarray(devices[:count]), ("seeds",)) if count > 1 else None
 
 
 class Returns:
@@ -98,13 +115,17 @@ class Trainer:
     self.seconds, self.chunks = 0.0, 0
     spec = env.spec
     self.plain = Agent(dreamer, len(spec.obs), len(spec.act))
+    self.mesh = seeds_mesh(seeds)
+    memory.check(dreamer.size, len(spec.obs), len(spec.act), config.envs * config.capacity, seeds, ("capacity", config.envs), dreamer.bins,
+                 1 if self.mesh is None else self.mesh.size)
+    self.failed: dict[int, str] = {}  # seed -> the term that was not finite, and when
     fault = faults.make("none", spec)
     self.collect = {"pure": Rollout(env, self.plain, fault, config.repeat)}
-    self.learn = {"pure": make_learn(self.plain, dreamer.batch, dreamer.length)}
+    self.learn = {"pure": make_learn(self.plain, dreamer.batch, dreamer.length, self.mesh)}
     if self.expert:
       cloning = Agent(dreamer, len(spec.obs), len(spec.act), clone_std=config.clone_std)
       rollout = Rollout(env, cloning, fault, config.repeat, expert=self.expert, expert_noise=config.demo_noise)
-      learn = make_learn(cloning, dreamer.batch, dreamer.length)
+      learn = make_learn(cloning, dreamer.batch, dreamer.length, self.mesh)
       self.collect |= {"clone": rollout, "fade": rollout}
       self.learn |= {"clone": learn, "fade": learn}
     key_init, key_stream, key = jax.random.split(jax.random.key(seed), 3)
@@ -114,22 +135,38 @@ class Trainer:
     streams = nest(lambda k: start(env, agent, fault, k), 0, 0)(keys)
     empty = replay_lib.init(config.envs, config.capacity, len(spec.obs), len(spec.act), size.deter, size.stoch)
     replay = jax.tree.map(lambda x: jnp.broadcast_to(x, (seeds,) + x.shape).copy(), empty)
-    self.state = Learner(train, streams, replay, key)
+    self.state = self._place(Learner(train, streams, replay, key))
     self.returns = Returns((seeds, config.envs))
     self._add = jax.jit(jax.vmap(replay_lib.add), donate_argnums=0)
     self.checkpoints = checkpoint.Checkpoints(self.out / "checkpoints")
 
   # ---- phases --------------------------------------------------------------------------------------------------------------------
 
+  def _place(self, state: Learner) -> Learner:
+    """Weights and replay on the devices that learn on them. The robots stay on the first: physics on a CPU is one batch of the host."""
+    if self.mesh is None:
+      return state
+    spread = jax.sharding.NamedSharding(self.mesh, jax.sharding.PartitionSpec("seeds"))
+    return state._replace(train=jax.device_put(state.train, spread), replay=jax.device_put(state.replay, spread))
+
   @property
   def updates(self) -> int:
-    return int(self.state.train.updates[0])
+    """Updates taken, by the seeds that have not failed."""
+    return int(np.max(np.asarray(self.state.train.updates)))
 
   def _drive(self):
     drive = np.zeros((self.seeds, self.config.envs), bool)
     if self.phase != "pure":
       drive[:, :round(self.config.demo_share * self.config.envs)] = True
     return drive
+
+  def _shake(self):
+    """Probability of a random stretch for each robot, or None; the last robots are shaken, the first are driven by a demonstrator."""
+    if not self.config.shake:
+      return None
+    shake = np.zeros((self.seeds, self.config.envs), np.float32)
+    shake[:, self.config.envs - round(self.config.shake_share * self.config.envs):] = self.config.shake
+    return shake
 
   def _weights(self) -> Weights:
     done, c = self.updates, self.config
@@ -159,13 +196,20 @@ class Trainer:
   def step(self) -> dict:
     """Collects one chunk, takes the updates that it pays for, returns a row of metrics."""
     begin = time.monotonic()
-    drive = self._drive()
-    streams, rows = self.collect[self.phase].chunk(self.state.train.params, self.state.streams, CHUNK, drive)
-    replay = self._add(self.state.replay, *records(rows))
+    drive, shake = self._drive(), self._shake()
+    params, kept = self.state.train.params, records
+    if self.mesh is not None:
+      params = jax.device_put(params, jax.devices()[0])
+      kept = lambda rows: jax.device_put(records(rows), jax.tree.leaves(self.state.replay)[0].sharding)
+    streams, rows = self.collect[self.phase].chunk(params, self.state.streams, CHUNK, drive, shake)
+    replay = self._add(self.state.replay, *kept(rows))
     self.state = self.state._replace(streams=streams, replay=replay)
     expert_returns, own = [], []
     for at, value in self.returns.add(rows):
-      (expert_returns if drive[at] else own).append(value)
+      if drive[at]:
+        expert_returns.append(value)
+      elif shake is None or not shake[at]:
+        own.append(value)
     self.own = (self.own + own)[-200:]
     if expert_returns:
       self.expert_return = float(np.mean(expert_returns)) if not self.expert_return else 0.8 * self.expert_return + 0.2 * float(np.mean(expert_returns))
@@ -182,11 +226,13 @@ class Trainer:
       self.owed -= count
       if count:
         key, key_learn = jax.random.split(self.state.key)
-        train, replay, metrics = self.learn[self.phase](self.state.train, self.state.replay, key_learn, self._weights(), count)
+        active = np.array([g not in self.failed for g in range(self.seeds)])
+        train, replay, metrics = self.learn[self.phase](self.state.train, self.state.replay, key_learn, self._weights(), active, count)
         self.state = self.state._replace(train=train, replay=replay, key=key)
-        row |= {k: float(np.mean(v)) for k, v in metrics.items()}
-        if not all(np.isfinite(v) for k, v in row.items() if isinstance(v, float)):
-          raise FileError(f"numeric failure at update {self.updates}: a metric is not finite; the last checkpoint is intact, --resume goes on from it")
+        metrics = {k: np.asarray(v) for k, v in metrics.items()}
+        self._notice_failures(metrics, active)
+        alive = [g for g in range(self.seeds) if g not in self.failed]
+        row |= {k: float(np.mean(v[alive])) for k, v in metrics.items()} | {"failed_seeds": len(self.failed)}
     end = time.monotonic()
     self.seconds += end - begin
     row |= {"updates": self.updates, "seconds": self.seconds, "collect_s": collected - begin, "learn_s": end - collected}
@@ -194,6 +240,16 @@ class Trainer:
     self.chunks += 1
     self._advance_phase()
     return row
+
+  def _notice_failures(self, metrics: dict[str, np.ndarray], active: np.ndarray) -> None:
+    """Stops every seed that has a metric which is not finite: its weights are those before the update at fault, and stay."""
+    for g in np.flatnonzero(active):
+      bad = [k for k in sorted(metrics, key=lambda k: (not k.startswith("loss/"), k)) if not np.isfinite(metrics[k][g])]
+      if bad:
+        self.failed[int(g)] = f"{bad[0]} is not finite after update {int(np.asarray(self.state.train.updates)[g])}"
+        print(f"mjx-cl: numeric failure of seed {g}: {self.failed[int(g)]}; it stops here, its last sound weights are kept", file=sys.stderr, flush=True)
+    if len(self.failed) == self.seeds:
+      raise FileError(f"numeric failure of every seed: {self.failed[self.seeds - 1]}; the last checkpoint is intact, --resume goes on from it")
 
   @property
   def done(self) -> bool:
@@ -204,7 +260,7 @@ class Trainer:
   def save(self) -> None:
     """Checkpoint (arrays with replay) and metrics.parquet."""
     meta = {"phase": self.phase, "phase_start": self.phase_start, "owed": self.owed, "own": self.own, "expert_return": self.expert_return,
-            "sums": self.returns.sums.tolist(), "seconds": self.seconds}
+            "sums": self.returns.sums.tolist(), "seconds": self.seconds, "failed": {str(g): why for g, why in self.failed.items()}}
     self.write_metrics()  # first: a kill in between leaves rows too many, which resume cuts off
     if self.checkpoints.latest() != self.chunks:
       self.checkpoints.save(self.chunks, self.state, meta)
@@ -222,7 +278,9 @@ class Trainer:
   def resume(self) -> None:
     """Goes on from the newest checkpoint."""
     import pyarrow.parquet
-    self.state, meta = self.checkpoints.load(self.state)
+    state, meta = self.checkpoints.load(self.state)
+    self.state = self._place(state)
+    self.failed = {int(g): why for g, why in meta.get("failed", {}).items()}
     self.phase, self.phase_start, self.owed, self.own = meta["phase"], meta["phase_start"], meta["owed"], meta["own"]
     self.expert_return, self.returns.sums, self.seconds = meta["expert_return"], np.asarray(meta["sums"]), meta["seconds"]
     self.chunks = self.checkpoints.latest()
@@ -263,9 +321,10 @@ def build(env, dreamer: DreamerConfig, config: TrainConfig, out, seed: int, seed
 
 
 def export(trainer: Trainer, episodes: int = 20) -> dict:
-  """Writes OUT/agent of the first seed: weights, moments, counters, and the card with its returns. Returns the card."""
+  """Writes OUT/agent of the first seed that has not failed: weights, moments, counters, and the card with its returns. Returns the card."""
   from mjx_cl import agents, evaluate, store
-  train = jax.tree.map(lambda x: x[0], trainer.state.train)
+  sound = min(set(range(trainer.seeds)) - set(trainer.failed))
+  train = jax.tree.map(lambda x: jax.device_put(x[sound], jax.devices()[0]), trainer.state.train)
   scores = {"first_seed": 0, **evaluate.evaluate(trainer.env, trainer.plain, train.params, episodes, 0, trainer.config.repeat)}
   phases: dict[str, dict] = {}
   for row in trainer.rows:

@@ -273,6 +273,31 @@ def test_loss_equals_numpy(starts, request):
   np.testing.assert_allclose(total, sum(scales[k] * float(metrics[f"loss/{k}"]) for k in TERMS), rtol=1e-5)  # float32 sum of 9
 
 
+@pytest.mark.parametrize("starts", [0, 2])
+def test_both_forms_of_the_behaviour_losses_agree(starts):
+  """State by state (CPU) against large products: value, metrics, and the gradient under unequal weights of policy and the rest."""
+  out = []
+  for stepwise in (True, False):
+    agent = Agent(DreamerConfig(**SMALL, last_starts=starts), OBS, ACT, stepwise=stepwise)
+    params = shake(jax.jit(agent.init)(jax.random.key(0)).params)
+    # small biases on the two-hot heads: predictions stay near 1, not near the bins' 5e8
+    symlog_bins = np.sign(agent.bins) * np.log1p(np.abs(np.asarray(agent.bins)))
+    for name in ("rew", "val"):
+      params[name]["out"]["bias"] -= 4 * jnp.abs(jnp.asarray(symlog_bins) - 0.5)
+    slow = jax.tree.map(lambda x: 0.9 * x, params["val"])
+    grad = jax.jit(jax.value_and_grad(agent.loss, has_aux=True))
+    out.append(grad(params, slow, jnp.array([-1.0, 3.0]), make_batch(ends=True), KEY, Weights(0.0, 0.6)))
+  ((total, (metrics, range_, _, _)), grads), ((total_b, (metrics_b, range_b, _, _)), grads_b) = out
+  np.testing.assert_allclose(total, total_b, rtol=1e-5)  # order of float32 sums
+  np.testing.assert_allclose(range_, range_b, rtol=1e-4)
+  assert metrics.keys() == metrics_b.keys()
+  for name in metrics:
+    np.testing.assert_allclose(metrics[name], metrics_b[name], rtol=1e-3, atol=1e-5, err_msg=name)  # two-hot means sum bins up to 5e8
+  for (path, a), b in zip(jax.tree.leaves_with_path(grads), jax.tree.leaves(grads_b)):
+    assert np.any(np.asarray(b) != 0) or "kernel" not in jax.tree_util.keystr(path)
+    np.testing.assert_allclose(a, b, atol=2e-4 * float(np.max(np.abs(b))) + 1e-7, err_msg=jax.tree_util.keystr(path))
+
+
 # ---- updates ---------------------------------------------------------------------------------------------------------------------
 
 def updater(clone_std):

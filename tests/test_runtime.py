@@ -2,6 +2,8 @@
 import importlib.metadata
 import os
 import pathlib
+import subprocess
+import sys
 
 import jax
 import mujoco
@@ -33,6 +35,30 @@ def test_the_users_own_value_wins(own):
 
 def test_a_flag_with_the_same_beginning_is_another_flag():
   assert runtime.xla_flags("0.10.2", f"{SCHEDULER}_other=1").split() == [f"{SCHEDULER}_other=1", f"{SCHEDULER}=false"]
+
+
+FAULTS_OF_REUSE = """
+import resource
+from mjx_cl import runtime
+assert runtime.keep_memory() is {keeps}
+import numpy as np
+def touch():
+  before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+  x = np.ones(2**24, np.uint8)  # 16 MiB, freed at once
+  del x
+  return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+touch()
+print(touch())
+"""
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="glibc's allocator")
+@pytest.mark.parametrize("keeps", [True, False])
+def test_freed_memory_is_kept_unless_the_user_has_decided(keeps):
+  """A block of 16 MiB that is freed and taken again: no fresh pages where memory is kept, 4,096 (or some huge ones) where it is mapped anew."""
+  env = {k: v for k, v in os.environ.items() if not k.startswith("MALLOC_")} | ({} if keeps else {"MALLOC_MMAP_THRESHOLD_": "131072"})
+  out = subprocess.run([sys.executable, "-c", FAULTS_OF_REUSE.format(keeps=keeps)], env=env, capture_output=True, text=True, check=True)
+  assert (int(out.stdout) < 4) is keeps
 
 
 def test_cache_dir_follows_the_environment(monkeypatch, tmp_path):

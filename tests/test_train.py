@@ -35,7 +35,7 @@ class Counted:
   def __init__(self, metric=0.0):
     self.calls, self.metric = [], metric
 
-  def __call__(self, state, replay, key, weights, updates):
+  def __call__(self, state, replay, key, weights, active, updates):
     self.calls.append((updates, weights))
     return state._replace(updates=state.updates + updates), replay, {"loss/rew": np.full(1, self.metric)}
 

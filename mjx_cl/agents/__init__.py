@@ -59,14 +59,13 @@ def save(folder, train: TrainState, card: dict) -> None:
   os.replace(tmp, folder / "card.json")
 
 
-def load(path: str | None, env_name: str, obs_size: int, act_size: int, lr: float | None = None,
-         last_starts: int | None = None) -> Trained:
+def load(path: str | None, env_name: str, obs_size: int, act_size: int, **departures) -> Trained:
   """Loads an agent by shipped name or folder.
 
   Args:
     path: folder or shipped name; None: the shipped agent named as the environment.
     env_name: robot that it must fit.
-    lr, last_starts: learning rate and imagination starts to go on with, None: those of its own config.
+    departures: fields of its DreamerConfig to go on with otherwise, e.g. lr; None: its own.
   Raises:
     UserError for an agent of another robot or an unknown name; FileError for a broken or foreign file.
   """
@@ -84,7 +83,7 @@ def load(path: str | None, env_name: str, obs_size: int, act_size: int, lr: floa
   if card.get("env") != env_name:
     raise UserError(f"agent {name!r} was trained on {card.get('env')!r}, not on {env_name!r}")
   config = dataclasses.replace(config, warmup=0)  # whatever goes on from here does so at full learning rate
-  config = dataclasses.replace(config, **{k: v for k, v in (("lr", lr), ("last_starts", last_starts)) if v is not None})
+  config = dataclasses.replace(config, **{k: v for k, v in departures.items() if v is not None})
   agent = Agent(config, obs_size, act_size)
   like = jax.eval_shape(agent.init, jax.random.key(0))
   try:

@@ -13,7 +13,7 @@ import numpy as np
 import optax
 
 from mjx_cl.config import DreamerConfig
-from mjx_cl.dreamer import heads, losses, nets, optim, rssm
+from mjx_cl.dreamer import behaviour, heads, losses, nets, optim, rssm
 from mjx_cl.dreamer.sizes import SIZES
 
 sg = jax.lax.stop_gradient
@@ -24,6 +24,13 @@ class Carry(NamedTuple):
   deter: jax.Array
   stoch: jax.Array
   action: jax.Array
+
+
+class Latent(NamedTuple):
+  """Rows of states as a scan carries them: deter (N, D), the same as chunks (blocks, N, D / blocks), and stoch (N, S)."""
+  chunks: jax.Array
+  deter: jax.Array
+  stoch: jax.Array
 
 
 class TrainState(NamedTuple):
@@ -82,9 +89,11 @@ class Agent:
   Args:
     config: DreamerConfig.
     clone_std: deviation of the demonstrator's action in the cloning term, or None: the term is not compiled.
+    stepwise: the form of actor and critic losses (behaviour.py); None: stepwise on a CPU, stacked elsewhere.
   """
 
-  def __init__(self, config: DreamerConfig, obs_size: int, act_size: int, clone_std: float | None = None):
+  def __init__(self, config: DreamerConfig, obs_size: int, act_size: int, clone_std: float | None = None, stepwise: bool | None = None):
+    self.stepwise = jax.default_backend() == "cpu" if stepwise is None else stepwise
     self.config, self.obs_size, self.act_size, self.clone_std = config, obs_size, act_size, clone_std
     self.size = s = SIZES[config.size]
     self.bins = jnp.asarray(nets.two_hot_bins(config.bins))
@@ -109,7 +118,12 @@ class Agent:
     return TrainState(params, jax.tree.map(jnp.copy, params["val"]), self.optimizer.init(params), jnp.zeros(2), jnp.int32(0))
 
   def _apply(self, params, name, *args, **kwargs):
-    return getattr(self, name).apply({"params": params[name]}, *args, **kwargs)
+    own = params[name]
+    return getattr(self, name).apply(own if "params" in own else {"params": own}, *args, **kwargs)
+
+  def prepare(self, params):
+    """The same parameters with what a scan over the core would otherwise re-arrange at every step; every method takes either form."""
+    return {**params, "dyn": rssm.hoist(params["dyn"])} if "params" not in params["dyn"] else params
 
   def _core(self, params, deter, stoch, action):
     return self._apply(params, "dyn", deter, stoch, action, method="core")
@@ -145,6 +159,7 @@ class Agent:
   def observe(self, params, batch: Batch, key: jax.Array):
     """Posterior states of the T trained steps, time-major: deter (T, B, D), stoch (T, B, S), posterior logits (T, B, stoch, classes)."""
     length, rows = batch.obs.shape[1] - 1, batch.obs.shape[0]
+    params = self.prepare(params)
     tokens = self._apply(params, "enc", batch.obs[:, 1:].swapaxes(0, 1))
     uniform = jax.random.uniform(key, (length, rows, self.size.stoch))
 
@@ -166,29 +181,37 @@ class Agent:
     Returns:
       deter (steps + 1, N, D), stoch (steps + 1, N, S), action (steps + 1, N, A); index 0 is the start.
     """
-    params = sg(params)
-    key_z, key_a = jax.random.split(key)
-    rows = deter.shape[0]
-    uniform = jax.random.uniform(key_z, (steps, rows, self.size.stoch))
-    noise = jax.random.normal(key_a, (steps + 1, rows, self.act_size))
-
-    def choose(deter, stoch, noise):
-      mean, std = nets.normal(*self._apply(params, "pol", deter, stoch))
-      return mean + std * noise
+    params, rows = sg(self.prepare(params)), deter.shape[0]
+    uniform, noise = self.draws(key, steps, rows)
 
     def step(state, x):
-      deter, stoch = state
       noise, uniform = x
-      action = choose(deter, stoch, noise)
-      deter = self._core(params, deter, stoch, action)
-      stoch = rssm.sample(self._apply(params, "dyn", deter, method="prior"), uniform).reshape(rows, -1)
-      return (deter, stoch), (deter, stoch, action)
-    start = (sg(deter), sg(stoch))
-    end, (deters, stochs, actions) = jax.lax.scan(step, start, (noise[:-1], uniform))
-    last = choose(*end, noise[-1])
-    deters = jnp.concatenate([start[0][None], deters])
-    stochs = jnp.concatenate([start[1][None], stochs])
-    return sg((deters, stochs, jnp.concatenate([actions, last[None]])))
+      action = self.choose(params, state.deter, state.stoch, noise)
+      return self.follow(params, state, action, uniform), (state.deter, state.stoch, action)
+    end, states = jax.lax.scan(step, self.latent(params, sg(deter), sg(stoch)), (noise[:-1], uniform))
+    last = (end.deter, end.stoch, self.choose(params, end.deter, end.stoch, noise[-1]))
+    return sg(jax.tree.map(lambda x, final: jnp.concatenate([x, final[None]]), states, last))
+
+  def draws(self, key, steps: int, rows: int):
+    """Uniform numbers (steps, rows, stoch) for the prior and normal ones (steps + 1, rows, A) for the policy."""
+    key_z, key_a = jax.random.split(key)
+    return jax.random.uniform(key_z, (steps, rows, self.size.stoch)), jax.random.normal(key_a, (steps + 1, rows, self.act_size))
+
+  def choose(self, params, deter, stoch, noise):
+    """The policy's action (N, A) for standard normal `noise`."""
+    mean, std = nets.normal(*self._apply(params, "pol", deter, stoch))
+    return mean + std * noise
+
+  def latent(self, params, deter, stoch) -> Latent:
+    """Rows (N, D), (N, S) as a scan over the prior carries them."""
+    return Latent(self._apply(params, "dyn", deter, method="cut"), deter, stoch)
+
+  def follow(self, params, state: Latent, action, uniform, pre=(None, None)) -> Latent:
+    """One step of the prior, sampled with numbers `uniform` (N, stoch). `pre`: as in `RSSM.core_cut`."""
+    chunks = self._apply(params, "dyn", state.chunks, state.deter, state.stoch, action, pre, method="core_cut")
+    deter = rssm.join(chunks)
+    stoch = rssm.sample(self._apply(params, "dyn", deter, method="prior"), uniform).reshape(state.stoch.shape)
+    return Latent(chunks, deter, stoch)
 
   def value(self, value_params, deter, stoch):
     """Value logits (..., bins) of a (fast or slow) critic."""
@@ -221,45 +244,28 @@ class Agent:
     # imagination from the last `starts` states of each sequence; states are stopped, so no gradient passes through the dynamics
     starts = c.last_starts or length
     flat = lambda x: x[length - starts:].reshape((starts * rows,) + x.shape[2:])
-    img_deter, img_stoch, img_action = self.imagine(params, flat(deter), flat(stoch), key_imagine, c.imagine)
-    frozen = sg(params)
-    img_rew = nets.two_hot_mean(self._apply(frozen, "rew", img_deter[1:], img_stoch[1:]), self.bins)
-    img_con = jax.nn.sigmoid(self._apply(frozen, "con", img_deter, img_stoch)[..., 0])
-    val_logits = self.value(params["val"], img_deter, img_stoch)
-    val = sg(nets.two_hot_mean(val_logits, self.bins))
-    slow_val = nets.two_hot_mean(self.value(slow, img_deter[:-1], img_stoch[:-1]), self.bins)
-    ret = losses.lambda_return(img_rew, img_con[1:], val[1:], c.lam)
-    omega = sg(jnp.cumprod(img_con, 0))[:-1]
-    range_, scale = losses.update_range(range_, ret, c.range_rate)
-    adv = (ret - val[:-1]) / scale
-    mean, std = nets.normal(*self._apply(params, "pol", img_deter[:-1], img_stoch[:-1]))
-    logp, entropy = nets.normal_logp(mean, std, img_action[:-1]), nets.normal_entropy(std)
-    policy = -omega * (logp * sg(adv) + c.entropy * entropy)
-    value = omega * (nets.two_hot_loss(val_logits[:-1], ret, self.bins) + nets.two_hot_loss(val_logits[:-1], slow_val, self.bins))
+    img = behaviour.behaviour(self, params, slow, range_, flat(deter), flat(stoch), key_imagine, self.stepwise)
 
     # replay value over the last `starts` replayed states; its features are not stopped
     tail = slice(length - starts, None)
-    boot = ret[0].reshape(starts, rows)
+    boot = img.boot.reshape(starts, rows)
     target = losses.replay_return(reward[tail], terminal[tail], last[tail], boot, c.lam, gamma)
     rep_deter, rep_stoch = deter[tail][:-1], stoch[tail][:-1]
     rep_logits = self.value(params["val"], rep_deter, rep_stoch)
     rep_slow = nets.two_hot_mean(self.value(slow, sg(rep_deter), sg(rep_stoch)), self.bins)
     repval = (1.0 - last[tail][:-1]) * (nets.two_hot_loss(rep_logits, target, self.bins) + nets.two_hot_loss(rep_logits, rep_slow, self.bins))
 
-    terms = {"dyn": dyn, "rep": rep, "rec": rec, "rew": rew, "con": con, "policy": policy, "value": value, "repval": repval}
-    terms = {k: jnp.mean(v) for k, v in terms.items()}
+    terms = {"dyn": dyn, "rep": rep, "rec": rec, "rew": rew, "con": con, "repval": repval}
+    terms = {k: jnp.mean(v) for k, v in terms.items()} | {"policy": img.policy, "value": img.value}
     total = (terms["dyn"] + c.rep_scale * terms["rep"] + terms["rec"] + terms["rew"] + terms["con"]
              + weights.policy * terms["policy"] + terms["value"] + c.repval_scale * terms["repval"])
     if self.clone_std is not None:
       terms["clone"] = self._clone_loss(params, sg(deter), sg(stoch), batch)
       total = total + weights.clone * terms["clone"]
-    metrics = {f"loss/{k}": v for k, v in terms.items()} | {
-        "opt/loss": total, "adv": adv.mean(), "adv_std": adv.std(), "adv_mag": jnp.abs(adv).mean(), "ret": ((ret - range_[0]) / scale).mean(),
-        "val": val.mean(), "tar": ret.mean(), "rew": img_rew.mean(), "con": img_con.mean(), "weight": omega.mean(),
-        "ent/action": entropy.mean(), "ret_scale": scale,
-        "dyn_ent": categorical_entropy(prior), "rep_ent": categorical_entropy(logits)}
+    metrics = {f"loss/{k}": v for k, v in terms.items()} | img.metrics | {
+        "opt/loss": total, "dyn_ent": categorical_entropy(prior), "rep_ent": categorical_entropy(logits)}
     stoch = jnp.argmax(stoch.reshape(length, rows, self.size.stoch, self.size.classes), -1)
-    return total, (metrics, range_, sg(deter).swapaxes(0, 1), stoch.swapaxes(0, 1))
+    return total, (metrics, img.range, sg(deter).swapaxes(0, 1), stoch.swapaxes(0, 1))
 
   def _clone_loss(self, params, deter, stoch, batch):
     """Mean over labelled replayed states of KL(N(demo, clone_std^2) || policy) [nats]."""
@@ -270,7 +276,7 @@ class Agent:
     return jnp.sum(kl * has) / jnp.maximum(1.0, jnp.sum(has))
 
   def update(self, state: TrainState, batch: Batch, key: jax.Array, weights: Weights = Weights()):
-    """One gradient step.
+    """One gradient step. Where a loss or the gradient is not finite nothing changes, the counter included; the metrics tell.
 
     Returns:
       (state', metrics, (deter (B, T, D), stoch indices (B, T, stoch)) for the latent refresh).
@@ -282,7 +288,9 @@ class Agent:
     params = optax.apply_updates(state.params, steps)
     slow = jax.tree.map(lambda s, p: (1.0 - self.config.slow_rate) * s + self.config.slow_rate * p, state.slow, params["val"])
     metrics["opt/grad_norm"] = optax.global_norm(grads)
-    return TrainState(params, slow, opt, range_, state.updates + 1), metrics, (deter, stoch)
+    sound = jnp.isfinite(metrics["opt/loss"]) & jnp.isfinite(metrics["opt/grad_norm"])
+    new = TrainState(params, slow, opt, range_, state.updates + 1)
+    return jax.tree.map(lambda a, b: jnp.where(sound, a, b), new, state), metrics, (deter, stoch)
 
   # ---- prediction ----------------------------------------------------------------------------------------------------------------
 
@@ -295,16 +303,13 @@ class Agent:
     Returns:
       xhat_{t+1..t+n} (n, N, O) in raw units (symexp applied) and rhat (n, N).
     """
-    rows, steps = deter.shape[0], actions.shape[0]
-    uniform = jax.random.uniform(key, (steps, rows, self.size.stoch))
+    params = self.prepare(params)
+    uniform = jax.random.uniform(key, (actions.shape[0], deter.shape[0], self.size.stoch))
 
     def step(state, x):
-      deter, stoch = state
-      action, uniform = x
-      deter = self._core(params, deter, stoch, action)
-      stoch = rssm.sample(self._apply(params, "dyn", deter, method="prior"), uniform).reshape(rows, -1)
-      return (deter, stoch), (deter, stoch)
-    _, (deters, stochs) = jax.lax.scan(step, (deter, stoch), (actions, uniform))
+      state = self.follow(params, state, *x)
+      return state, (state.deter, state.stoch)
+    _, (deters, stochs) = jax.lax.scan(step, self.latent(params, deter, stoch), (actions, uniform))
     obs = nets.symexp(self._apply(params, "dec", deters, stochs))
     return obs, nets.two_hot_mean(self._apply(params, "rew", deters, stochs), self.bins)
 

@@ -1,4 +1,7 @@
-"""Encoder, decoder and the four heads. Features of a state: [deter, stoch], for the decoder [stoch, deter]."""
+"""Encoder, decoder and the four heads. Features of a state: [deter, stoch], for the decoder [stoch, deter].
+
+`pre` in place of the features: the output of the first linear layer, where the caller has it already (behaviour.py).
+"""
 from __future__ import annotations
 
 import flax.linen as nn
@@ -33,8 +36,8 @@ class Head(nn.Module):
   outscale: float
 
   @nn.compact
-  def __call__(self, deter, stoch):
-    return Linear(self.out, self.outscale, name="out")(MLP(self.layers, self.units, name="mlp")(deter, stoch))
+  def __call__(self, *features, pre=None):
+    return Linear(self.out, self.outscale, name="out")(MLP(self.layers, self.units, name="mlp")(*features, pre=pre))
 
 
 class PolicyHead(nn.Module):
@@ -43,6 +46,6 @@ class PolicyHead(nn.Module):
   act: int
 
   @nn.compact
-  def __call__(self, deter, stoch):
-    x = MLP(3, self.units, name="mlp")(deter, stoch)
+  def __call__(self, *features, pre=None):
+    x = MLP(3, self.units, name="mlp")(*features, pre=pre)
     return Linear(self.act, 0.01, name="mean")(x), Linear(self.act, 0.01, name="std")(x)

@@ -48,33 +48,39 @@ class Linear(nn.Module):
     return y
 
 
+def mean_square(x: jax.Array) -> jax.Array:
+  """Mean of x^2 over the last axis, kept as an axis of 1. As a product with ones: XLA's CPU backend does not vectorise a reduction over
+  the last axis that it has fused with the square (0.24 ms against 0.05 ms on 1,024 x 512)."""
+  return jnp.square(x) @ jnp.full((x.shape[-1], 1), 1.0 / x.shape[-1], x.dtype)
+
+
 class Norm(nn.Module):
   """RMSNorm over the last axis: x g / sqrt(mean(x^2) + 1e-4), g initially 1."""
 
   @nn.compact
   def __call__(self, x):
     gain = self.param("gain", nn.initializers.ones, (x.shape[-1],))
-    return x * jax.lax.rsqrt(jnp.mean(jnp.square(x), -1, keepdims=True) + 1e-4) * gain
+    return x * jax.lax.rsqrt(mean_square(x) + 1e-4) * gain
 
 
 class Hidden(nn.Module):
-  """Linear -> RMSNorm -> SiLU."""
+  """Linear -> RMSNorm -> SiLU. `pre`: the linear layer's output, where the caller has it already."""
   units: int
 
   @nn.compact
-  def __call__(self, *xs):
-    return nn.silu(Norm(name="norm")(Linear(self.units, name="linear")(*xs)))
+  def __call__(self, *xs, pre=None):
+    return nn.silu(Norm(name="norm")(Linear(self.units, name="linear")(*xs) if pre is None else pre))
 
 
 class MLP(nn.Module):
-  """`layers` hidden layers of width `units`; several inputs are concatenated."""
+  """`layers` hidden layers of width `units`; several inputs are concatenated. `pre`: as in `Hidden`, of the first layer."""
   layers: int
   units: int
 
   @nn.compact
-  def __call__(self, *xs):
+  def __call__(self, *xs, pre=None):
     for i in range(self.layers):
-      xs = (Hidden(self.units, name=f"hidden{i}")(*xs),)
+      xs, pre = (Hidden(self.units, name=f"hidden{i}")(*xs, pre=pre),), None
     return xs[0]
 
 

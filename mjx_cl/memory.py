@@ -1,0 +1,77 @@
+"""Bytes that a training or a run will hold, known before anything is allocated."""
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from mjx_cl.dreamer.sizes import SIZES
+from mjx_cl.errors import UserError
+
+MARGIN = 0.85  # share of the free memory that may be planned for: programs and their scratch memory need the rest
+
+
+class Need(NamedTuple):
+  """Bytes. `record`: one replay record. `weights`: one seed's parameters, slow critic and two moments. `replay`: all records of one seed."""
+  record: int
+  weights: int
+  replay: int
+
+  def total(self, seeds: int) -> int:
+    """Of `seeds` seeds; an update holds one more copy of the weights of the seed at work."""
+    return seeds * (self.weights + self.replay) + self.weights
+
+
+def parameters(size: str, obs_size: int, act_size: int, bins: int = 255) -> tuple[int, int]:
+  """Trainable parameters and those of the slow critic."""
+  import jax
+  from mjx_cl.config import DreamerConfig
+  from mjx_cl.dreamer.agent import Agent, parameter_count
+  state = jax.eval_shape(Agent(DreamerConfig(size=size, bins=bins), obs_size, act_size).init, jax.random.key(0))
+  return parameter_count(state.params), parameter_count(state.slow)
+
+
+def need(size: str, obs_size: int, act_size: int, records: int, bins: int = 255) -> Need:
+  """What one seed with a replay of `records` records holds."""
+  from mjx_cl import replay
+  trained, slow = parameters(size, obs_size, act_size, bins)
+  record = replay.record_bytes(obs_size, act_size, SIZES[size].deter, SIZES[size].stoch)
+  return Need(record, 4 * (3 * trained + slow), records * record)
+
+
+def free() -> int:
+  """Bytes free on the device that computes."""
+  import jax
+  import psutil
+  stats = None if jax.default_backend() == "cpu" else jax.local_devices()[0].memory_stats()
+  return stats["bytes_limit"] - stats["bytes_in_use"] if stats else psutil.virtual_memory().available
+
+
+def check(size: str, obs_size: int, act_size: int, records: int, seeds: int, what: str, bins: int = 255, shards: int = 1) -> Need:
+  """Refuses what would not fit.
+
+  Args:
+    records: of one seed. seeds: of all. what: the setting that bounds the records, and how many robots fill it, e.g. ("capacity", 32).
+    shards: devices over which the seeds are spread.
+  Raises:
+    UserError that names the number which would fit.
+  """
+  setting, robots = what
+  wanted = need(size, obs_size, act_size, records, bins)
+  here = -(-seeds // shards)
+  space = int(MARGIN * free())
+  if wanted.total(here) > space:
+    left = (space - wanted.total(here) + here * wanted.replay) // here // wanted.record // robots
+    fits = f"{setting}={left:,} would fit" if left > 0 else f"not even {setting}=1 fits: fewer seeds or a smaller size would"
+    raise UserError(f"{seeds} seeds of {size} with {records:,} records each need {wanted.total(here) / 2**30:.1f} GiB a device, {space / 2**30:.1f} GiB may be "
+                    f"used; {fits}")
+  return wanted
+
+
+def table(obs_size: int = 24, act_size: int = 6) -> dict[str, str]:
+  """Size -> its memory, in words; observations and actions of the walker by default."""
+  out = {}
+  for size in SIZES:
+    n = need(size, obs_size, act_size, 10**6)
+    trained, _ = parameters(size, obs_size, act_size)
+    out[size] = (f"{trained:,} parameters; {n.weights / 1e6:,.1f} MB a seed with slow critic and moments; {n.record:,} bytes a record, "
+                 f"{n.replay / 1e9:,.1f} GB a million of them")
+  return out

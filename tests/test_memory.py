@@ -1,0 +1,69 @@
+"""Memory that is stated: bytes against what is really allocated, and what would not fit is refused with the number that would."""
+import re
+
+import jax
+import pytest
+
+from mjx_cl import memory, replay
+from mjx_cl.config import PRESETS, RunConfig, TrainConfig
+from mjx_cl.dreamer.agent import Agent
+from mjx_cl.errors import UserError
+
+OBS, ACT = 24, 6
+
+
+def bytes_of(tree):
+  return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(tree))
+
+
+def test_need_is_what_is_allocated():
+  dreamer = PRESETS["tiny"].dreamer
+  agent, size = Agent(dreamer, OBS, ACT), Agent(dreamer, OBS, ACT).size
+  need = memory.need("tiny", OBS, ACT, 4 * 100, dreamer.bins)
+  empty = jax.eval_shape(lambda: replay.init(4, 100, OBS, ACT, size.deter, size.stoch))
+  assert need.record == bytes_of(empty.data) // 400 and need.replay == bytes_of(empty.data)
+  state = jax.eval_shape(agent.init, jax.random.key(0))
+  counters = bytes_of(state) - need.weights
+  assert 0 < counters < 64  # update counters and the return range
+  assert need.total(3) == 3 * (need.replay + need.weights) + need.weights
+
+
+def test_the_number_that_is_named_fits_and_the_next_does_not(monkeypatch):
+  monkeypatch.setattr(memory, "free", lambda: 200 * 2**20)
+  ask = lambda capacity: memory.check("size1m", OBS, ACT, 8 * capacity, 3, ("capacity", 8))
+  with pytest.raises(UserError, match="3 seeds of size1m with 8,000,000 records each need 27.0 GiB a device, 0.2 GiB may be used") as e:
+    ask(1_000_000)
+  fits = int(re.search(r"capacity=([\d,]+) would fit", str(e.value))[1].replace(",", ""))
+  ask(fits)
+  with pytest.raises(UserError):
+    ask(fits + 1)
+  assert ask(fits).replay == 8 * fits * memory.need("size1m", OBS, ACT, 1).record
+
+
+def test_weights_that_do_not_fit_are_said_so(monkeypatch):
+  monkeypatch.setattr(memory, "free", lambda: 2**20)
+  with pytest.raises(UserError, match="not even capacity=1 fits"):
+    memory.check("size12m", OBS, ACT, 10, 1, ("capacity", 1))
+
+
+def test_devices_share_the_seeds(monkeypatch):
+  need = memory.need("size1m", OBS, ACT, 1000)
+  monkeypatch.setattr(memory, "free", lambda: int(need.total(2) / memory.MARGIN) + 1)
+  memory.check("size1m", OBS, ACT, 1000, 4, ("capacity", 1), shards=2)
+  with pytest.raises(UserError):
+    memory.check("size1m", OBS, ACT, 1000, 4, ("capacity", 1))
+
+
+def test_trainer_and_runner_refuse_before_they_allocate(monkeypatch, short_walker, tmp_path):
+  from mjx_cl import run, train
+  monkeypatch.setattr(memory, "free", lambda: 10 * 2**20)
+  with pytest.raises(UserError, match="capacity=[0-9,]+ would fit"):
+    train.Trainer(short_walker, PRESETS["tiny"].dreamer, TrainConfig(capacity=10**7), tmp_path)
+  with pytest.raises(UserError, match="a smaller size would|would fit"):
+    run.Runner(RunConfig(env="walker"), tmp_path)
+  assert not list(tmp_path.iterdir())
+
+
+def test_table_has_every_size():
+  table = memory.table()
+  assert list(table) == list(memory.SIZES) and "640,867 parameters" in table["size1m"] and "1,208 bytes a record" in table["size1m"]

@@ -1,0 +1,28 @@
+"""What the README shows as Python runs as it stands there."""
+import pathlib
+import re
+import subprocess
+import sys
+
+import pytest
+
+README = (pathlib.Path(__file__).parent.parent / "README.md").read_text()
+BLOCKS = re.findall(r"^```python\n(.*?)^```", README, re.S | re.M)
+
+
+def run(code, cwd):
+  done = subprocess.run([sys.executable, "-c", code], cwd=cwd, capture_output=True, text=True)
+  assert done.returncode == 0, done.stderr[-2000:]
+  return done.stdout
+
+
+@pytest.mark.parametrize("block", [b for b in BLOCKS if "Trainer" not in b])
+def test_short_examples_run(block, tmp_path):
+  run(block, tmp_path)
+
+
+def test_the_learner_learns_the_environment_of_the_example(tmp_path):
+  """An untrained policy scores about 8 of 20; the example must end well above, and push towards the goal."""
+  (block,) = [b for b in BLOCKS if "Trainer" in b]
+  out = run(block + "\nprint(float(action[0]))\n", tmp_path).split("\n")
+  assert float(re.search(r"return ([-0-9.]+) of 20", out[0])[1]) > 14 and float(out[1]) > 0
