@@ -1,4 +1,4 @@
-"""Calibrates `rolling_sigma` on the walker: threshold, window, run length, smoothing and lag for ARL0 = 100,000 control steps.
+"""Calibrates `rolling_sigma` on the walker: thresholds, window, run length, smoothing, lag and logarithm for ARL0 = 100,000 control steps.
 
   python benchmarks/calibrate.py --out results/arl0.json
 
@@ -95,25 +95,31 @@ def main() -> None:
   steps = (data["n_opr"].shape[0] - WARMUP) * data["n_opr"].shape[1]
   rows = []
 
-  def judge(zn, zf, **setting):
-    hit = sum(alarms(zn[c], setting["threshold"], setting["patience"], setting["two_sided"]) for c in zn) > 0
-    count = int(hit[WARMUP:].sum())
-    found = sum(alarms(zf[c], setting["threshold"], setting["patience"], setting["two_sided"]) for c in zf) > 0
+  def add(fired_nominal, found, **setting):
+    count = int(fired_nominal[WARMUP:].sum())
     after = found[5000:5501]
     delay = np.where(after.any(0), after.argmax(0), 501)
     rows.append({**setting, "alarms": count, "arl0": steps / count if count else None, "arl0_ci": poisson(count, steps), "few": count < 50,
-                 "nominal_5000_clean": float(1 - hit[WARMUP:5000].any(0).mean()), "within_500": float((delay[affected] <= 500).mean()),
+                 "nominal_5000_clean": float(1 - fired_nominal[WARMUP:5000].any(0).mean()), "within_500": float((delay[affected] <= 500).mean()),
                  "delay_capped": float(np.minimum(delay, 500)[affected].mean())})
   channels = ("opr", "rpr")
-  score = lambda kind, *a: {c: scores(data[f"{kind}_{c}"], *a) for c in channels}
+  score = lambda kind, log, *a: {c: scores(np.log(np.maximum(data[f"{kind}_{c}"].astype(np.float64), 1e-9)) if log else data[f"{kind}_{c}"], *a)
+                                 for c in channels}
   for window in (1000, 4000):  # the paper's rule, then with patience alone
-    zn, zf = score("n", window), score("f", window)
+    zn, zf = score("n", False, window), score("f", False, window)
     for threshold, patience, two_sided in [(3.0, 1, True)] + list(itertools.product((2.0, 3.0, 4.0), (10, 20, 40, 65), (False,))):
-      judge(zn, zf, window=window, smooth=1, lag=0, threshold=threshold, patience=patience, two_sided=two_sided)
-  for window, smooth, lag in itertools.product((2000, 4000), (100, 200, 300), (0, 500)):
-    zn, zf = score("n", window, smooth, lag), score("f", window, smooth, lag)
-    for threshold in np.arange(3.0, 9.01, 0.25):
-      judge(zn, zf, window=window, smooth=smooth, lag=lag, threshold=float(threshold), patience=1, two_sided=False)
+      either = lambda z: sum(alarms(z[c], threshold, patience, two_sided) for c in channels) > 0
+      add(either(zn), either(zf), window=window, smooth=1, lag=0, threshold=threshold, threshold_rpr=threshold, patience=patience, two_sided=two_sided,
+          log=False)
+  levels = np.arange(3.0, 10.01, 0.5)
+  for log, window, smooth in itertools.product((False, True), (2000, 4000), (200, 300, 400)):
+    zn, zf = score("n", log, window, smooth, 500), score("f", log, window, smooth, 500)
+    fired = {(k, c, t): alarms(z[c], t, 1, False) for k, z in (("n", zn), ("f", zf)) for c in channels for t in levels}
+    for level, level_rpr in itertools.product(levels, levels):
+      either = lambda k: fired[k, "opr", level] | fired[k, "rpr", level_rpr]
+      add(either("n"), either("f"), window=window, smooth=smooth, lag=500, threshold=float(level), threshold_rpr=float(level_rpr), patience=1,
+          two_sided=False, log=log)
+    print(f"log {log}, window {window}, smooth {smooth}", file=sys.stderr, flush=True)
   plain = rows[0]
   good = [r for r in rows if r["arl0"] is None or r["arl0"] >= args.goal]
   best = max(good, key=lambda r: (r["within_500"], -r["delay_capped"]))

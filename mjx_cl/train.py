@@ -162,7 +162,7 @@ class Trainer:
 
   def _shake(self):
     """Probability of a random stretch for each robot, or None; the last robots are shaken, the first are driven by a demonstrator."""
-    if not self.config.shake:
+    if not self.config.shake or self.phase != "pure":
       return None
     shake = np.zeros((self.seeds, self.config.envs), np.float32)
     shake[:, self.config.envs - round(self.config.shake_share * self.config.envs):] = self.config.shake

@@ -188,6 +188,29 @@ def toy_rows():
              terminated=terminated, truncated=truncated, severity=ids, episode=end.astype(int), demo=wide(ids + 7, 2), has_demo=~end)
 
 
+def test_shaken_robots_follow_one_random_action_for_a_stretch(short_walker, tiny, tiny_params, plain):
+  """Probability 0 changes no bit, 1 gives constant actions over 16 control steps that differ from stretch to stretch and robot to robot."""
+  roll = Rollout(short_walker, tiny, faults.make("gear", short_walker.spec))
+  begin = streams_of(short_walker, tiny, roll.fault, 2, 3)
+  shake = np.zeros((2, 3), np.float32)
+  shake[1, 1:] = 1.0
+  _, rows = roll.chunk(tiny_params, begin, length=40, shake=shake)
+  _, calm = roll.chunk(tiny_params, begin, length=40, shake=np.zeros((2, 3), np.float32))
+  action, quiet = np.asarray(rows.action), np.asarray(calm.action)
+  _, _, _, unshaken = plain
+  still = shake == 0
+  np.testing.assert_array_equal(action[:, still], quiet[:, still])
+  np.testing.assert_allclose(quiet[:16], np.asarray(unshaken.action), atol=1e-5)  # another program of the same arithmetic
+  pushed = action[:, ~still]  # (40, 2, act)
+  assert np.abs(pushed).max() <= 1.0
+  stretches = [pushed[k:k + 16] for k in (0, 16, 32)]
+  for stretch in stretches:
+    assert np.all(stretch == stretch[0])
+  draws = np.concatenate([stretch[0] for stretch in stretches])
+  assert len(np.unique(draws, axis=0)) == 6 and draws.std() > 0.3
+  assert np.abs(quiet[:, ~still] - pushed).max() > 0.1
+
+
 def test_records_of_decisions_and_of_ends():
   rows = toy_rows()
   made, valid = records(rows)

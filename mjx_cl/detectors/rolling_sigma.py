@@ -22,14 +22,14 @@ class RollingSigmaState(NamedTuple):
 
 
 def rolling_sigma(window: int = 1000, threshold: float = 3.0, patience: int = 1, two_sided: bool = True, warmup: int = 500, smooth: int = 1,
-                  lag: int = 0) -> Detector:
+                  lag: int = 0, log: bool = False) -> Detector:
   """Rolling mean and standard deviation of the `window` samples before the present one.
 
-    y_t = mean of x_{t-smooth+1..t};   mean, std over y_{t-lag-window..t-lag-1}
+    y_t = mean of x_{t-smooth+1..t}, or of ln max(x, 1e-9);   mean, std over y_{t-lag-window..t-lag-1}
     z = (y_t - mean) / max(std, 1e-6),  score = |z| (two-sided) or z
     fired when score > threshold for the `patience`-th time in a row: one alarm per excursion, the next needs a score below first
 
-  Every sample enters the window, alarms or not, as the paper's rolling statistics do. smooth = 1 and lag = 0 are the paper's rule.
+  Every sample enters the window, alarms or not, as the paper's rolling statistics do. smooth = 1, lag = 0 and no logarithm are the paper's rule.
 
   Args:
     window: samples of the rolling statistics [control steps]. The paper gives none.
@@ -39,6 +39,7 @@ def rolling_sigma(window: int = 1000, threshold: float = 3.0, patience: int = 1,
     warmup: reference samples needed before anything fires; at most `window`.
     smooth: samples of the trailing mean that is tested; a gait makes single residuals swing, so a shift shows in their mean.
     lag: the newest samples that the reference leaves out, so that a change cannot raise its own threshold.
+    log: take the logarithm first; a residual is positive and skewed, and single large ones otherwise widen the deviation for a whole window.
   Returns:
     Detector whose update takes x, float32 (), and gives Alarm(fired: bool (), score: float32 ()).
   Blind to: a change slower than window + lag, which the reference absorbs; with `patience`, a change that comes and goes faster.
@@ -53,7 +54,8 @@ def rolling_sigma(window: int = 1000, threshold: float = 3.0, patience: int = 1,
     return RollingSigmaState(jnp.zeros(smooth), jnp.zeros(size), jnp.int32(0), jnp.int32(0))
 
   def update(state, x):
-    recent = state.recent.at[state.count % smooth].set(jnp.asarray(x, jnp.float32))
+    x = jnp.asarray(x, jnp.float32)
+    recent = state.recent.at[state.count % smooth].set(jnp.log(jnp.maximum(x, 1e-9)) if log else x)
     y = jnp.sum(recent) / jnp.minimum(state.count + 1, smooth)
     behind = (state.count + size - 1) % size - jnp.arange(size)
     age = jnp.where(behind < 0, behind + size, behind)  # 0 is the newest smoothed sample before this one
