@@ -137,8 +137,8 @@ class AdaptConfig:
     fresh_moments: forget the optimiser's moments at an alarm. Kept ones were gathered on the gradients of a trained agent; those after an event
       are many times larger, so that each step would be that many times the learning rate until the RMS (memory 1,000 updates) has followed.
     patience: length over which every signal must be settled [chunks of 64 decisions].
-    trend: largest difference of the means of the first and second half of that length [share of the level].
-    fluctuation: largest standard deviation over that length [share of the level], or
+    trend: largest difference of the medians of the first and second half of that length [share of the level].
+    fluctuation: largest spread over that length, the interquartile range / 1.349 [share of the level], or
     excess: ... that many times the nominal deviation, whichever is larger.
     near: OPR and RPR also count as settled while at most this many times their nominal mean.
     least: steps of adaptation before it may converge [control steps].
@@ -157,10 +157,10 @@ class AdaptConfig:
   average: float = 0.1
   fresh_moments: bool = False
   patience: int = 48
-  trend: float = 0.35
-  fluctuation: float = 1.0
+  trend: float = 0.2
+  fluctuation: float = 0.5
   excess: float = 2.0
-  near: float = 1.5
+  near: float = 1.25
   least: int = 6000
   acceptance: float | None = None
   give_up: int = 12_000

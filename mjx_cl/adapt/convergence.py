@@ -12,10 +12,13 @@ SIGNALS = ("opr", "rpr", "reward", "dyn_loss", "adv_mag", "value_loss")
 def settled(ring: jax.Array, count: jax.Array, nominal_mean: jax.Array, nominal_std: jax.Array, config: AdaptConfig) -> jax.Array:
   """Which signals show neither trend nor excess fluctuation over the ring.
 
-    level      = mean of the ring
-    trend      : |mean(second half) - mean(first half)| <= trend level
-    fluctuation: std(ring) <= max(fluctuation level, excess nominal_std)
+    level      = median of the ring
+    trend      : |median(second half) - median(first half)| <= trend level
+    fluctuation: (upper - lower quartile) / 1.349 <= max(fluctuation level, excess nominal_std)
     OPR, RPR   : also settled while level <= near nominal_mean
+
+  Medians and quartiles, because a chunk that holds a stumble or an episode's start is many times the others: with means and deviations one
+  walker whose reward was nominal for 10,000 steps never counted as settled (advantage magnitude, deviation twice the mean).
 
   Args:
     ring: float32 (patience, 6), one row per chunk in any rotation, SIGNALS along the last axis; nan rows are left out.
@@ -28,10 +31,11 @@ def settled(ring: jax.Array, count: jax.Array, nominal_mean: jax.Array, nominal_
   order = jnp.arange(size)
   ring = ring[(count + order) % size]  # oldest first
   half = size // 2
-  level = jnp.nanmean(ring, 0)
-  trend = jnp.abs(jnp.nanmean(ring[half:], 0) - jnp.nanmean(ring[:half], 0))
+  level = jnp.nanmedian(ring, 0)
+  trend = jnp.abs(jnp.nanmedian(ring[half:], 0) - jnp.nanmedian(ring[:half], 0))
   scale = jnp.abs(level)
-  calm = jnp.nanstd(ring, 0) <= jnp.maximum(config.fluctuation * scale, config.excess * nominal_std)
+  spread = jnp.nanquantile(ring, 0.75, axis=0) - jnp.nanquantile(ring, 0.25, axis=0)
+  calm = spread / 1.349 <= jnp.maximum(config.fluctuation * scale, config.excess * nominal_std)
   steady = (trend <= config.trend * scale) & calm
   residual = jnp.arange(len(SIGNALS)) < 2
   return (steady | (residual & (level <= config.near * nominal_mean))) & (count >= size)
