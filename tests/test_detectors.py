@@ -107,9 +107,10 @@ def test_a_step_change_is_found(case):
 
 # ---- rolling_sigma -------------------------------------------------------------------------------------------------------------------
 
-def slow_rolling_sigma(xs, window, threshold, patience, two_sided, warmup, smooth=1, lag=0):
+def slow_rolling_sigma(xs, window, threshold, patience, two_sided, warmup, smooth=1, lag=0, log=False):
   """The docstring in NumPy and float64, one sample at a time."""
   seen, run, fired, scores = [], 0, [], []
+  xs = np.log(np.maximum(xs, 1e-9)) if log else xs
   for t in range(len(xs)):
     y = np.mean(xs[max(0, t + 1 - smooth):t + 1])
     held = np.array(seen[:len(seen) - lag][-window:]) if lag < len(seen) else np.array([])
@@ -134,6 +135,7 @@ def slow_rolling_sigma(xs, window, threshold, patience, two_sided, warmup, smoot
     dict(window=2, threshold=1.5, patience=1, two_sided=True, warmup=2),
     dict(window=40, threshold=1.5, patience=1, two_sided=False, warmup=10, smooth=7, lag=13),
     dict(window=40, threshold=1.2, patience=3, two_sided=True, warmup=40, smooth=4, lag=1),
+    dict(window=40, threshold=1.5, patience=1, two_sided=True, warmup=10, smooth=3, lag=5, log=True),
 ])
 def test_rolling_sigma_equals_the_loop(settings):
   rng = np.random.default_rng(0)
@@ -259,6 +261,16 @@ def test_the_papers_rule_is_either_residual():
   rpr = slow_rolling_sigma(np.asarray(xs.rpr, float), 50, 3.0, 1, True, 20)[0]
   assert (opr & ~rpr).any() or (rpr & ~opr).any()
   np.testing.assert_array_equal(run(xs), opr | rpr)
+
+
+def test_rpr_may_have_its_own_threshold():
+  xs = residuals(jax.random.key(6), 200, invalid=0.0)
+  settings = dict(window=50, warmup=20, threshold=1.5)
+  fired = lambda **more: np.asarray(jax.lax.scan((d := detectors.make("rolling_sigma_plain", **settings, **more)).update, d.init(), xs)[1].fired)
+  opr = slow_rolling_sigma(np.asarray(xs.opr, float), 50, 1.5, 1, True, 20)[0]
+  rpr = slow_rolling_sigma(np.asarray(xs.rpr, float), 50, 2.5, 1, True, 20)[0]
+  np.testing.assert_array_equal(fired(threshold_rpr=2.5), opr | rpr)
+  assert (fired() != fired(threshold_rpr=2.5)).any()
 
 
 def test_one_trace_across_seeds():
