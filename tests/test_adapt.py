@@ -317,7 +317,9 @@ def tell(kind, config=EAGER, used=0):
   agent = kind(dataclasses.replace(PRESETS["tiny"].dreamer, batch=4, length=8, imagine=4), 24, 6)
   loop = Loop(agent, Monitor(agent, n=4, least=2), scripted(), types.SimpleNamespace(acceptance=0.6, posture=None), config, capacity=256)
   train = jax.jit(agent.init)(jax.random.key(0))
-  state = loop.init(train._replace(opt=jax.tree.map(lambda x: x + used, train.opt)), 3)
+  # fresh heads say exactly 0, and a signal whose median is 0 has no scale to be settled on
+  params = jax.tree.map(lambda x: x + 0.01 * jax.random.normal(jax.random.key(x.size), x.shape), train.params)
+  state = loop.init(train._replace(params=params, opt=jax.tree.map(lambda x: x + used, train.opt)), 3)
   state = state._replace(detector=state.detector._replace(at=jnp.asarray(ALARMS)))
   keys = jax.random.split(jax.random.key(1), 3)
   copy = lambda tree: jax.tree.map(lambda x: np.array(x), tree)

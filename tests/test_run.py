@@ -336,8 +336,10 @@ class Stub:
 
 
 @pytest.mark.parametrize("signals, want", [(0, ["step 4", "step 5", "finish"]), (1, ["save"]), (2, None)])
-def test_an_interrupt_is_acted_on_between_two_chunks(tmp_path, monkeypatch, signals, want):
+def test_an_interrupt_is_acted_on_between_two_chunks(tmp_path, monkeypatch, request, signals, want):
   """One signal: the chunk ends, its state is saved. A second one ends the chunk half way, and nothing half is saved."""
+  before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell ignores it for what it starts in the background
+  request.addfinalizer(lambda: signal.signal(signal.SIGINT, before))
   monkeypatch.setattr(run, "Runner", type("Stubbed", (Stub,), {"signals": signals, "notes": (notes := [])}))
   call = lambda: run.execute(RunConfig("walker"), tmp_path / "x")
   if signals:
