@@ -306,18 +306,19 @@ class Agent:
     params = self.prepare(params)
     uniform = jax.random.uniform(key, (actions.shape[0], deter.shape[0], self.size.stoch))
 
-    def step(state, x):
+    def step(state, x):  # decoded where the state is at hand: the stacked states would be a hundred times the predictions
       state = self.follow(params, state, *x)
-      return state, (state.deter, state.stoch)
-    _, (deters, stochs) = jax.lax.scan(step, self.latent(params, deter, stoch), (actions, uniform))
-    obs = nets.symexp(self._apply(params, "dec", deters, stochs))
-    return obs, nets.two_hot_mean(self._apply(params, "rew", deters, stochs), self.bins)
+      return state, self.predict(params, state.deter, state.stoch)
+    return jax.lax.scan(step, self.latent(params, deter, stoch), (actions, uniform))[1]
+
+  def predict(self, params, deter, stoch):
+    """Observation (..., O) in raw units and reward (...) at states."""
+    return nets.symexp(self._apply(params, "dec", deter, stoch)), nets.two_hot_mean(self._apply(params, "rew", deter, stoch), self.bins)
 
   def dream(self, params, deter, stoch, steps: int, key: jax.Array):
     """As `open_loop`, with the actions that the policy imagines for itself."""
     deters, stochs, _ = self.imagine(params, deter, stoch, key, steps)
-    obs = nets.symexp(self._apply(params, "dec", deters[1:], stochs[1:]))
-    return obs, nets.two_hot_mean(self._apply(params, "rew", deters[1:], stochs[1:]), self.bins)
+    return self.predict(params, deters[1:], stochs[1:])
 
 
 def categorical_entropy(logits):
