@@ -204,18 +204,21 @@ class Trainer:
     streams, rows = self.collect[self.phase].chunk(params, self.state.streams, CHUNK, drive, shake)
     replay = self._add(self.state.replay, *kept(rows))
     self.state = self.state._replace(streams=streams, replay=replay)
-    expert_returns, own = [], []
+    expert_returns, own, each = [], [], {g: [] for g in range(self.seeds)}
     for at, value in self.returns.add(rows):
       if drive[at]:
         expert_returns.append(value)
       elif shake is None or not shake[at]:
         own.append(value)
+        each[at[0]].append(value)
     self.own = (self.own + own)[-200:]
     if expert_returns:
       self.expert_return = float(np.mean(expert_returns)) if not self.expert_return else 0.8 * self.expert_return + 0.2 * float(np.mean(expert_returns))
     collected = time.monotonic()
     row = {"updates": self.updates, "records": int(np.sum(np.asarray(self.state.streams.t))) // self.config.repeat // self.seeds, "phase": self.phase,
            "return": float(np.mean(own)) if own else None, "episodes": len(own), "expert_return": self.expert_return or None}
+    if self.seeds > 1:
+      row |= {f"return/{g}": float(np.mean(values)) if values else None for g, values in each.items()}
     size = self.dreamer.batch * self.dreamer.length
     enough = int(np.min(jax.vmap(lambda r: replay_lib.windows(r, self.dreamer.length + 1))(self.state.replay))) >= size
     if enough:

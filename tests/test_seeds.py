@@ -70,6 +70,9 @@ def test_a_seed_that_fails_stops_alone_and_is_named(short_walker, tmp_path, same
   assert same(seed(hurt.state.train, 1), frozen)  # nothing of the update at fault remains
   assert [r["failed_seeds"] for r in rows] == [1, 1] and all(np.isfinite(r["opt/loss"]) for r in rows)
   assert hurt.updates == sound.updates
+  each = [rows[-1][f"return/{g}"] for g in range(SEEDS)]  # returns are kept apart, and all robots have equally many episodes
+  np.testing.assert_allclose(np.mean(each), rows[-1]["return"], rtol=1e-6)
+  assert len(set(each)) == SEEDS
   hurt.save()
   again = make_trainer(short_walker, tmp_path / "hurt")
   again.resume()
