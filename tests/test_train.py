@@ -114,6 +114,18 @@ def test_first_update_waits_for_windows_and_pays_no_backlog(short_walker, tmp_pa
   assert all(n == (8 if ready else 0) for ready, n in counts)
 
 
+def test_published_protocol_starts_after_2048_records(tmp_path):
+  """16 robots, windows of 65: 1,024 of them exist after 128 vector steps. From there one update per record at ratio 1,024: about 498k by 500k records."""
+  from mjx_cl import envs
+  dreamer = replace(PRESETS["tiny"].dreamer, batch=16, length=64)
+  trainer = train.Trainer(envs.make("walker", "native"), dreamer, TrainConfig(envs=16, updates=10**6, ratio=1024.0, capacity=1024), tmp_path)
+  learn = counted(trainer)
+  rows = [trainer.step() for _ in range(3)]
+  assert [r["records"] for r in rows] == [1024, 2048, 3072] and [u for u, _ in learn.calls] == [1024, 1024]
+  chunks = 500_000 // 1024
+  assert abs((chunks - 1) * 1024 - 498_000) < 1000
+
+
 def test_last_chunk_stops_at_the_last_update(short_walker, tmp_path):
   trainer = make_trainer(short_walker, tmp_path, updates=19)
   counted(trainer)
