@@ -128,8 +128,8 @@ class AdaptConfig:
     lr: learning rate while adapting, None: the agent's own.
     batch: sequences of one update while adapting, None: the agent's own 16. At the same train ratio fewer sequences mean more updates: 4 give
       four updates every 64 steps. Right hip's gear halved, seeds 100 to 103, mean reward 4,000 to 8,000 steps after onset, two agents that
-      differ in nothing but their training: 0.72 with 4 sequences at 1e-4, 0.67 with 16 at 2e-4, 0.56 with 4 at 2e-4 (an agent whose training
-      never saw a stumble); 0.84 with 4 at 1e-4 (the shipped one, whose robots were shaken).
+      differ in nothing but their training: 0.73 with 4 sequences at 1e-4, 0.68 with 16 at 2e-4, 0.58 with 4 at 2e-4 (an agent whose training
+      never saw a stumble); 0.85 with 4 at 1e-4 (the shipped one, whose robots were shaken).
     last_starts: imagination starts while adapting, the last k states of each sequence, 0 all; None: the agent's own. The gradient of
       few updates must do: with 16 of 64 states its noise undoes the policy.
     average: rate per chunk with updates of the moving average of the weights that acts while adapting; 1: the newest weights. An earlier
