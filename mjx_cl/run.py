@@ -110,8 +110,9 @@ class Runner:
     updates = digest.updates - self._updates
     self._updates = digest.updates
     self.done_chunks += 1
-    if not np.all(np.isfinite(digest.signals[:, 2:])):
-      bad = [self.labels[g] for g in np.flatnonzero(~np.isfinite(digest.signals[:, 2:]).all(1))]
+    broken = ~np.isfinite(digest.signals[:, 2:]).all(1) | (digest.skipped > 0)
+    if broken.any():
+      bad = [self.labels[g] for g in np.flatnonzero(broken)]
       raise FileError(f"numeric failure at step {now} in stream {bad[0]}: a loss is not finite; the last checkpoint is intact")
     if self.done_chunks > 1:  # the first chunk compiles
       self.seconds["physics"] += physics

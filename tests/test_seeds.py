@@ -49,7 +49,8 @@ def test_seeds_in_one_program_are_a_loop_over_them(short_walker, tmp_path):
   assert np.abs(first[0] - first[1]).max() > 1e-3  # they are different seeds
 
 
-def test_a_seed_that_fails_stops_alone_and_is_named(short_walker, tmp_path, same, capfd):
+def test_a_seed_that_fails_stops_alone_and_is_named(short_walker, tmp_path, same, capfd, monkeypatch):
+  monkeypatch.chdir(tmp_path)  # MuJoCo logs actions that are not finite into the working folder
   sound, hurt = make_trainer(short_walker, tmp_path / "sound"), make_trainer(short_walker, tmp_path / "hurt")
   for trainer in (sound, hurt):
     trainer.step()
@@ -81,7 +82,8 @@ def test_a_seed_that_fails_stops_alone_and_is_named(short_walker, tmp_path, same
   assert same(seed(again.state.train, 1), frozen)
 
 
-def test_when_every_seed_fails_the_training_ends(short_walker, tmp_path):
+def test_when_every_seed_fails_the_training_ends(short_walker, tmp_path, monkeypatch):
+  monkeypatch.chdir(tmp_path)
   trainer = make_trainer(short_walker, tmp_path)
   trainer.step()
   trainer.state = trainer.state._replace(train=trainer.state.train._replace(params=jax.tree.map(lambda x: x * jnp.nan, trainer.state.train.params)))

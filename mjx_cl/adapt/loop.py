@@ -44,7 +44,8 @@ class LoopState(NamedTuple):
 
 
 class Digest(NamedTuple):
-  """What the host logs of a chunk: rows (T, groups) and values (groups,)."""
+  """What the host logs of a chunk: rows (T, groups) and values (groups,). `skipped`: updates of the chunk that changed nothing, because a
+  loss or its gradient was not finite."""
   residual: Residual
   score: jax.Array
   fired: jax.Array
@@ -54,6 +55,7 @@ class Digest(NamedTuple):
   decision: jax.Array
   since: jax.Array
   updates: jax.Array
+  skipped: jax.Array
 
 
 class Loop:
@@ -134,7 +136,9 @@ class Loop:
       fresh = jax.vmap(self.agent.optimizer.init)(train.params)
       reset = lambda new, old: jnp.where(begins.reshape((-1,) + (1,) * (old.ndim - 1)), new, old)
       train = train._replace(opt=jax.lax.cond(jnp.any(begins), lambda o: jax.tree.map(reset, fresh, o), lambda o: o, train.opt))
+    counted = train.updates
     train, replay = self._learn(train, replay, key_update, number)
+    taken = train.updates - counted
 
     # the robot acts by a moving average of what it learns, and keeps it when it is done
     rate = jnp.where(number > 0, self.config.average, 0.0)
@@ -145,8 +149,8 @@ class Loop:
 
     # a stream that has converged watches again, its reference refitted on the latest rows
     detector = jax.lax.cond(jnp.any(decision == phase_lib.STOP), self._refit, lambda d, p, s: d, detector, past, decision == phase_lib.STOP)
-    state = LoopState(train, acting, replay, history, detector, phase, past, owed - number, state.executed + number)
-    return state, Digest(residual, alarms.score, alarms.fired, signals, ok, phase.phase, decision, phase.since, state.executed)
+    state = LoopState(train, acting, replay, history, detector, phase, past, owed - number, state.executed + taken)
+    return state, Digest(residual, alarms.score, alarms.fired, signals, ok, phase.phase, decision, phase.since, state.executed, number - taken)
 
   @staticmethod
   def _counts(replay):

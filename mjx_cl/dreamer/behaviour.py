@@ -6,7 +6,8 @@ With imagined states s_0..s_H (no gradient), R the lambda-return, S the return s
 
 `stacked` keeps all states and puts one large product per layer through each head. `stepwise` reads the heads that need no gradient where the
 state is at hand, inside the imagination, and takes loss and gradient of actor and critic state by state in a second scan: nothing of the size
-(H, starts, bins) is ever written. On 2 CPU cores memory traffic is what costs (benchmarks/README.md); on a GPU large products are better.
+(H, starts, bins) is ever written. On 2 CPU cores memory traffic is what costs (benchmarks/README.md); for a GPU `stacked` is a choice by expectation, not
+measured.
 """
 from __future__ import annotations
 
