@@ -11,10 +11,13 @@ class Model(NamedTuple):
 
   Attributes:
     mj: MuJoCo field name -> array in MjModel's own layout and units, e.g. `actuator_gear` (nu, 6).
-    task: whatever is no MuJoCo field (motor law, reward weights), name -> array.
+    task: whatever is no MuJoCo field (motor law, tyre, reward weights), name -> array.
+    force: float32 (nv,), generalised force applied from outside [N, N m], or None: none is applied.
+  An environment lists all leaves that faults may own; `rollout` passes on those `mj` leaves and the force that its fault owns, no others.
   """
   mj: dict[str, jax.Array]
   task: dict[str, jax.Array]
+  force: jax.Array | None = None
 
 
 class Step(NamedTuple):
@@ -53,6 +56,10 @@ class Spec(NamedTuple):
     acceptance: mean reward per control step from which the task counts as done well enough [reward].
     posture: index into obs and the least mean value that counts as upright, or None where no posture is asked for.
     targets: what a joint-wise fault can name, in actuator order.
+    act_groups: (name, indices into act), such as the joints of one leg.
+    obs_groups: (name, indices into obs), such as all joint speeds.
+    feet: (name, indices), what touches the ground: geoms of the MuJoCo model, or axles of a model that is none.
+    bodies: (name, indices), bodies whose mass may change, the trunk first; empty where there are none by name.
   """
   name: str
   obs: tuple[Var, ...]
@@ -62,6 +69,10 @@ class Spec(NamedTuple):
   acceptance: float
   posture: tuple[int, float] | None
   targets: tuple[str, ...]
+  act_groups: tuple[tuple[str, tuple[int, ...]], ...] = ()
+  obs_groups: tuple[tuple[str, tuple[int, ...]], ...] = ()
+  feet: tuple[tuple[str, tuple[int, ...]], ...] = ()
+  bodies: tuple[tuple[str, tuple[int, ...]], ...] = ()
 
 
 class EnvState(NamedTuple):

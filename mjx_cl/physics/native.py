@@ -15,6 +15,7 @@ import mujoco
 import numpy as np
 
 from mjx_cl.errors import UserError
+from mjx_cl.physics import DERIVING
 
 
 def float64_bits(x: jax.Array) -> jax.Array:
@@ -39,16 +40,18 @@ class Native:
     substeps: physics steps of one `step`.
     outputs: MjData fields to return. `qpos` and `qvel` are current; a derived field (xpos, sensordata, ...) makes every call end
       with mj_forward so that it is current too.
+    law: motor law, evaluated before every physics step, see physics.Law; None: `ctrl` goes to the actuators as it is. With a law the outputs
+      also hold `ctrl` (nu,), what the law gave last, and `qvel_before` (nv,), the velocity before the last physics step.
   """
   name = "native"
 
-  def __init__(self, mj_model: mujoco.MjModel, substeps: int, outputs: tuple[str, ...] = ("qpos", "qvel")):
+  def __init__(self, mj_model: mujoco.MjModel, substeps: int, outputs: tuple[str, ...] = ("qpos", "qvel"), law=None):
     try:
       import mjbatch
     except ImportError:
       raise UserError("physics 'native' needs the package mjbatch (pip install mjbatch==0.1.4; Linux and macOS)") from None
     self._mjbatch = mjbatch
-    self.mj_model, self.substeps, self.outputs = mj_model, substeps, tuple(outputs)
+    self.mj_model, self.substeps, self.outputs, self.law = mj_model, substeps, tuple(outputs), law
     self._forward = any(o not in ("qpos", "qvel") for o in outputs)
     data = mujoco.MjData(mj_model)
     spec = mujoco.mjtState.mjSTATE_INTEGRATION
@@ -57,6 +60,8 @@ class Native:
     self._template = row.view(np.uint32).copy()
     self._qpos_at = mujoco.mj_stateSize(mj_model, mujoco.mjtState.mjSTATE_TIME)
     self._shapes = {o: np.shape(getattr(data, o)) for o in self.outputs}
+    if law is not None:
+      self._shapes |= {"ctrl": (mj_model.nu,), "qvel_before": (mj_model.nv,)}
     self._batches: dict[int, object] = {}
     self._lock = threading.Lock()
     self.seconds = 0.0  # spent in callbacks since the start, for a run's wall_share
@@ -68,36 +73,65 @@ class Native:
     row = jnp.asarray(self._template)
     return row.at[at:at + nq].set(float64_bits(qpos)).at[at + nq:at + nq + nv].set(float64_bits(qvel))
 
-  def step(self, fields: dict[str, jax.Array], state: jax.Array, ctrl: jax.Array):
+  def step(self, fields: dict[str, jax.Array], state: jax.Array, ctrl: jax.Array, task=None, force=None):
     """`substeps` x mj_step of one robot; a vmap of it steps all robots in one call on all threads."""
     shapes = {o: jax.ShapeDtypeStruct(s, jnp.float32) for o, s in self._shapes.items()}
     result = (jax.ShapeDtypeStruct(self._template.shape, jnp.uint32), shapes)
-    return jax.pure_callback(self._host_step, result, fields, state, ctrl, vmap_method="broadcast_all")
+    task = {} if self.law is None else dict(task or {})
+    return jax.pure_callback(self._host_step, result, fields, state, ctrl, task, force, vmap_method="broadcast_all")
 
-  def _host_step(self, fields, state, ctrl):
+  def _host_step(self, fields, state, ctrl, task, force):
     begin = time.perf_counter()
     state = np.asarray(state)
     lead, width = state.shape[:-1], state.shape[-1]
     num = int(np.prod(lead, dtype=np.int64))
+    flat = lambda x: np.asarray(x).reshape((num,) + np.shape(x)[len(lead):])
     with self._lock:
-      batch, views = self._batch(num, tuple(sorted(fields)))
+      batch, views = self._batch(num, tuple(sorted(fields)), force is not None)
+      self._write_fields(batch, views, fields, num)
       views["state"][...] = np.ascontiguousarray(state.reshape(num, width)).view(np.float64)
-      views["ctrl"][...] = np.asarray(ctrl).reshape(num, -1)
-      for name, value in fields.items():
-        view = views["field " + name]
-        view[...] = np.asarray(value).reshape(view.shape)
-      batch.step(nstep=self.substeps)
+      if force is not None:
+        views["force"][...] = flat(force)
+      extra = {}
+      if self.law is None:
+        views["ctrl"][...] = flat(ctrl)
+        batch.step(nstep=self.substeps)
+      else:
+        task, ctrl = {k: flat(v) for k, v in task.items()}, flat(ctrl)
+        qpos, qvel = views["qpos"], views["qvel"]
+        for k in range(self.substeps):
+          views["ctrl"][...] = self.law(np, task, ctrl, qpos, qvel)
+          if k == self.substeps - 1:
+            extra = {"ctrl": np.array(views["ctrl"], np.float32), "qvel_before": np.array(qvel, np.float32)}
+          batch.step(nstep=1)
+        extra = {k: v.reshape(lead + v.shape[1:]) for k, v in extra.items()}
       out = {o: np.array(views["out " + o], np.float32).reshape(lead + self._shapes[o]) for o in self.outputs}
       rows = np.array(views["state"]).view(np.uint32).reshape(lead + (width,))
       self.seconds += time.perf_counter() - begin
-      return rows, out
+      return rows, out | extra
 
-  def _batch(self, num: int, fields: tuple[str, ...]):
-    key = (num, fields)
+  def _write_fields(self, batch, views, fields, num: int) -> None:
+    """Model fields of every robot, in double precision where they are the nominal ones; constants derived of a changed mass are renewed."""
+    stale = np.zeros(num, bool)
+    for name, value in fields.items():
+      view, own = views["field " + name], views["nominal " + name]
+      value = np.asarray(value).reshape(view.shape)
+      value = np.where(value == own.astype(np.float32), own, value)  # float32 cannot hold every nominal value: severity 0 is the model itself
+      if name in DERIVING:
+        stale |= (view != value).reshape(num, -1).any(1)
+      view[...] = value
+    if stale.any():
+      batch.set_const(np.flatnonzero(stale))
+
+  def _batch(self, num: int, fields: tuple[str, ...], force: bool):
+    key = (num, fields, force)
     if key not in self._batches:
       batch = self._mjbatch.Batch(self.mj_model, num, forward=self._forward)
-      views = {"state": batch.bind("state"), "ctrl": batch.bind("ctrl")}
+      views = {"state": batch.bind("state"), "ctrl": batch.bind("ctrl"), "qpos": batch.bind("qpos"), "qvel": batch.bind("qvel")}
+      if force:
+        views["force"] = batch.bind("qfrc_applied")
       views |= {"field " + f: batch.expand(f) for f in fields}
+      views |= {"nominal " + f: np.array(views["field " + f][0]) for f in fields}
       views |= {"out " + o: batch.bind(o) for o in self.outputs}
       self._batches[key] = (batch, views)
     return self._batches[key]
