@@ -25,7 +25,8 @@ GAP = 4.0            # a closing gap above this many median spacings leaves the 
 SHAPES = {
     "oval": ((0, 0), (4.5, -0.2), (9.1, -0.2), (11.3, 2.8), (8.9, 5.6), (4.5, 5.7), (0, 5.7), (-2.2, 3.1)),
     "kidney": ((0, 0), (-3.3, 3.1), (-2.2, 7.5), (1.7, 8.6), (5.6, 6.7), (9.4, 8.6), (13.5, 7.5), (14.5, 2.7), (11.2, 0), (5.6, -0.7)),
-    "chicane": ((0, 0), (4.5, 0), (7.8, 1.8), (11.4, 0.3), (15.4, 0), (18.1, 2.9), (16.1, 6), (12.3, 6.1), (8.9, 8), (4.9, 6.9), (-0.1, 6.1), (-2.5, 3.1)),
+    "chicane": ((0, 0), (4.5, 0), (7.8, 1.8), (11.4, 0.3), (15.4, 0), (18.1, 2.9), (16.1, 6), (12.3, 6.1), (8.9, 8), (4.9, 6.9), (-0.1, 6.1),
+                (-2.5, 3.1)),
     "hairpin": ((0, 0), (-1.4, 2.2), (0.5, 4.8), (4.5, 4.5), (6.3, 6.7), (4.1, 9.4), (0.3, 9), (-1.4, 11.2), (0.1, 13.7), (7.4, 13.2), (11.4, 10.9),
                 (11.8, 5.7), (9.5, 0.5), (5.3, 0)),
     "bean": ((0, 0), (3.7, -1.4), (7.4, -0.4), (8.9, 2.9), (7, 5.8), (6.4, 9.1), (3.5, 10.9), (-0.2, 9.7), (-1, 6.1), (-2.3, 2.8)),
@@ -166,7 +167,7 @@ def check(track: Track) -> str | None:
 def generate(shape: str | int) -> Track:
   """One of SHAPES by name, or a track drawn from a seed; 2.2 m wide, radius of the centre line at least 1.6 m.
 
-  Drawn: 9 to 12 waypoints around a point at even angles, radius *U(0.62, 1.38) of 5 to 8 m, left or right turning; the first valid draw of 25 to 60 m.
+  Drawn: 9 to 12 waypoints at even angles around a point, radius 5 to 8 m *U(0.62, 1.38), turning left or right; the first valid line of 25 to 60 m.
   """
   if not isinstance(shape, int):
     return build(shape, np.array(choose("track", shape, SHAPES), float), WIDTH / 2, WIDTH / 2)
