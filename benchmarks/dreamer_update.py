@@ -155,7 +155,7 @@ def roller():
   from mjx_cl.dreamer.agent import Agent
   from mjx_cl.rollout import Rollout, nest, start
   env = envs.make("walker", "native")
-  agent, fault = Agent(PRESETS["cpu"].dreamer, 24, 6), faults.make("gear", env.spec)
+  agent, fault = Agent(PRESETS["cpu"].dreamer, 24, 6), faults.make("gear", env)
   rollout = Rollout(env, agent, fault)
   params = jax.jit(jax.vmap(lambda k: agent.init(k).params))(jax.random.split(jax.random.key(0), STREAMS))
   streams = nest(lambda k: start(env, agent, fault, k), 0, 0)(jax.random.split(jax.random.key(1), (STREAMS, 1)))

@@ -16,7 +16,7 @@ def evaluate(env, agent, params, episodes: int, seed: int = 0, repeat: int = 1, 
   Returns:
     episodes, return_mean, return_iqm, return_ci (95 % bootstrap of the IQM over episodes of this one agent), returns, terminations.
   """
-  fault = faults.make("none", env.spec)
+  fault = faults.make("none", env)
   rollout = Rollout(env, agent, fault, repeat, deterministic)
   keys = jnp.stack([jax.random.key(seed + i) for i in range(episodes)])[None]
   streams = nest(lambda k: start(env, agent, fault, k), 0, 0)(keys)

@@ -28,7 +28,7 @@ def record(env, trained, keys, steps: int, fault: str = "none", severity: float 
     opr, rpr, reward float32 (steps, streams); valid bool (steps, streams); variables float32 (steps, streams, O); target int (streams,).
   """
   agent = trained.agent
-  the_fault = faults_lib.make(fault, env.spec)
+  the_fault = faults_lib.make(fault, env)
   rollout = Rollout(env, agent, the_fault, int(trained.card.get("repeat", 1)))
   monitor = Monitor(agent, form=form)
   streams = nest(lambda k: start(env, agent, the_fault, k, severity, onset, target=target), 0, 0)(keys[None])
@@ -44,5 +44,5 @@ def record(env, trained, keys, steps: int, fault: str = "none", severity: float 
     out["reward"].append(np.asarray(rows.reward)[:, 0])
     progress(min(steps, (chunk + 1) * CHUNK), steps)
   result = {k: np.concatenate(v)[:steps] for k, v in out.items()}
-  result["target"] = np.asarray(streams.injection.state)[0]
+  result["target"] = np.asarray(streams.injection.target)[0, :, 0]
   return result

@@ -46,7 +46,7 @@ class Row(NamedTuple):
     obs (O,), first (), reward_in (), action (A,), deter (D,), stoch (stoch,) int: at the decision.
     reward (): sum over the control steps of the decision; rewards (repeat,): one by one.
     final_obs (O,), terminated (), truncated (): of arriving.
-    severity (): true severity in force. episode int32 (). demo (A,), has_demo ().
+    severity (): true severity in force, the greatest where there are several faults. episode int32 (). demo (A,), has_demo ().
   """
   obs: jax.Array
   first: jax.Array
@@ -65,11 +65,16 @@ class Row(NamedTuple):
   has_demo: jax.Array
 
 
-def start(env, agent, fault, key: jax.Array, severity=0.0, onset=0, duration=faults_lib.schedule.FOREVER, target=-1) -> Stream:
-  """A fresh stream; its robot, fault target and every later draw come from `key`."""
+def start(env, agent, fault, key: jax.Array, severity=0.0, onset=0, duration=faults_lib.FOREVER, target=-1, plan: faults_lib.Plan | None = None) -> Stream:
+  """A fresh stream; its robot, fault target and every later draw come from `key`.
+
+  Args:
+    fault: Fault or tuple of F. severity, onset, duration, target: () or (F,). plan: in place of severity, onset and duration.
+  """
   key_env, key_fault, key = jax.random.split(key, 3)
   env_state, obs = env.init(env.model, key_env)
-  injection = faults_lib.Injection(fault.init(key_fault, target), jnp.float32(severity), jnp.int32(onset), jnp.int32(duration))
+  injection = faults_lib.begin(fault, key_fault, faults_lib.plan(severity, onset, duration) if plan is None else plan, target)
+  injection, obs = faults_lib.sense(fault, injection, jnp.int32(0), jax.random.fold_in(key, 0), env.model, obs, True)
   return Stream(env_state, agent.carry(), obs, jnp.float32(0), jnp.bool_(True), key, jnp.int32(0), jnp.int32(0), injection)
 
 
@@ -82,7 +87,7 @@ class Rollout:
   """Acting, physics and fault for (groups, members) streams.
 
   Args:
-    env, agent, fault: what is joined.
+    env, agent, fault: what is joined; `fault` may be a tuple.
     repeat: control steps per decision.
     deterministic: the policy's mean instead of a sample.
     expert: a demonstrator, obs -> action, or None.
@@ -91,6 +96,7 @@ class Rollout:
 
   def __init__(self, env, agent, fault, repeat: int = 1, deterministic: bool = False, expert=None, expert_noise: float = 0.0):
     self.env, self.agent, self.fault, self.repeat = env, agent, fault, repeat
+    self.model = faults_lib.owned_model(faults_lib.as_tuple(fault), env.model)
     self.deterministic, self.expert, self.expert_noise = deterministic, expert, expert_noise
     self.chunk = functools.partial(jax.jit, static_argnames=("length",))(self._chunk)
 
@@ -112,12 +118,17 @@ class Rollout:
     return carry, action, demo, has_demo
 
   def _control(self, stream: Stream, action):
-    """One control step of one robot under its fault."""
-    key = jax.random.fold_in(jax.random.fold_in(stream.key, stream.t), 1)
-    ports = faults_lib.Ports(self.env.model, ctrl=action)
-    injection, ports, severity = faults_lib.inject(self.fault, stream.injection, stream.t, key, ports)
+    """One control step of one robot under its faults."""
+    now = jax.random.fold_in(stream.key, stream.t)
+    injection, ports, severity = self._drive(stream, now, action)
     env_state, out = self.env.step(ports.model, stream.env, ports.ctrl)
-    return stream._replace(env=env_state, t=stream.t + 1, injection=injection), out, severity
+    injection, obs = faults_lib.sense(self.fault, injection, stream.t + 1, jax.random.fold_in(now, 4), self.model, out.final_obs)
+    out = out._replace(obs=obs, final_obs=obs)
+    return stream._replace(env=env_state, t=stream.t + 1, injection=injection), out, jnp.max(severity)
+
+  def _drive(self, stream: Stream, now, action):
+    ports = faults_lib.Ports(self.model, ctrl=action, first=stream.first)
+    return faults_lib.drive(self.fault, stream.injection, stream.t, jax.random.fold_in(now, 1), ports)
 
   def _chunk(self, params, streams: Stream, length: int, drive=None, shake=None):
     """`length` decisions.
@@ -161,9 +172,12 @@ class Rollout:
   def _reset(self, streams: Stream, done):
     """Starts a new episode where `done`; keys fold in the step, so a reset is reproducible."""
     def one(stream: Stream, done):
-      env_state, obs = self.env.init(self.env.model, jax.random.fold_in(jax.random.fold_in(stream.key, stream.t), 2))
+      now = jax.random.fold_in(stream.key, stream.t)
+      _, ports, _ = self._drive(stream, now, jnp.zeros(len(self.env.spec.act)))  # a task that has changed draws its episodes otherwise
+      env_state, obs = self.env.init(ports.model, jax.random.fold_in(now, 2))
+      injection, obs = faults_lib.sense(self.fault, stream.injection, stream.t, jax.random.fold_in(now, 5), self.model, obs, True)
       new = stream._replace(env=env_state, agent=self.agent.carry(), obs=obs, reward=jnp.float32(0), first=jnp.bool_(True),
-                            episode=stream.episode + 1)
+                            episode=stream.episode + 1, injection=injection)
       return jax.tree.map(lambda a, b: a if jnp.issubdtype(a.dtype, jax.dtypes.prng_key) else jnp.where(done, a, b), new, stream)
     return nest(one, (0, 0), (0, 0))(streams, done)
 

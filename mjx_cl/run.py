@@ -59,7 +59,7 @@ class Runner:
     self.trained = agents.load(config.agent, config.env, len(spec.obs), len(spec.act), lr=config.adapt.lr,
                                last_starts=config.adapt.last_starts, batch=config.adapt.batch)
     agent, self.repeat = self.trained.agent, int(self.trained.card.get("repeat", 1))
-    self.fault = faults.make(config.fault, spec)
+    self.fault = faults.make(config.fault, self.env)
     target = faults.target_index(self.fault, config.target)
     detector = detectors.make(config.detector, **config.settings)
     monitor = Monitor(agent, n=15, form=config.form, actions=config.actions)
@@ -203,7 +203,7 @@ class Runner:
     from mjx_cl import plots
     steps = self.config.steps
     trace = {k: v[:steps] if v.shape[0] >= steps else v for k, v in self._trace().items()}
-    targets = np.asarray(self.state.streams.injection.state).reshape(self.groups, -1)[:, 0]
+    targets = np.asarray(self.state.streams.injection.target).reshape(self.groups, -1)[:, 0]
     names = [f"{self.config.fault}:{self.fault.targets[int(t)]}" for t in targets]
     table = self._trace_table(trace, names)
     events = self._events(trace, names)

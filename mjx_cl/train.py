@@ -119,7 +119,7 @@ class Trainer:
     memory.check(dreamer.size, len(spec.obs), len(spec.act), config.envs * config.capacity, seeds, ("capacity", config.envs), dreamer.bins,
                  1 if self.mesh is None else self.mesh.size)
     self.failed: dict[int, str] = {}  # seed -> the term that was not finite, and when
-    fault = faults.make("none", spec)
+    fault = faults.make("none", env)
     self.collect = {"pure": Rollout(env, self.plain, fault, config.repeat)}
     self.learn = {"pure": make_learn(self.plain, dreamer.batch, dreamer.length, self.mesh)}
     if self.expert:

@@ -38,11 +38,12 @@ class Step(NamedTuple):
 
 
 class Var(NamedTuple):
-  """One scalar of an observation or action: name, unit and bounds."""
+  """One scalar of an observation or action: name, unit, bounds, and `scale`, its typical deviation while the healthy robot is at work."""
   name: str
   unit: str
   low: float = float("-inf")
   high: float = float("inf")
+  scale: float = 1.0
 
 
 class Spec(NamedTuple):

@@ -51,7 +51,7 @@ def at(tree, *index):
 @pytest.fixture(scope="module")
 def plain(short_walker, tiny, tiny_params):
   """(run, first streams, last streams, rows of 16 decisions); `run` makes two chunks of 8, which must join without a seam."""
-  fault = faults.make("gear", short_walker.spec)
+  fault = faults.make("gear", short_walker)
   roll = Rollout(short_walker, tiny, fault)
   begin = streams_of(short_walker, tiny, fault, 2, 3)
 
@@ -72,7 +72,7 @@ def test_shapes_are_time_major(plain, tiny):
 def test_same_key_twice_gives_equal_bits(plain, same, short_walker, tiny):
   run, begin, end, rows = plain
   assert same(run(begin), (end, rows))
-  _, other = run(streams_of(short_walker, tiny, faults.make("gear", short_walker.spec), 2, 3, seed=1))
+  _, other = run(streams_of(short_walker, tiny, faults.make("gear", short_walker), 2, 3, seed=1))
   assert not np.isclose(other.action, rows.action).any()
   assert len(np.unique(np.asarray(rows.action).reshape(-1, 6)[:, 0])) == 16 * 6  # streams of one batch differ too
 
@@ -122,7 +122,7 @@ def repeated(tiny, tiny_params):
   """Action repeat 2, episodes of 5 control steps (so that one ends inside a decision), and a demonstrator that drives the first robot."""
   env = envs.make("walker", "native")
   env.spec = env.spec._replace(episode_steps=5)
-  fault = faults.make("gear", env.spec)
+  fault = faults.make("gear", env)
   roll = Rollout(env, tiny, fault, repeat=2, expert=lambda obs: jnp.tanh(obs[:6] + obs[15:21]))
   begin, params = streams_of(env, tiny, fault, 1, 2), at(tiny_params, slice(0, 1))
   end, rows = roll.chunk(params, begin, length=8, drive=jnp.array([[True, False]]))
@@ -190,7 +190,7 @@ def toy_rows():
 
 def test_shaken_robots_follow_one_random_action_for_a_stretch(short_walker, tiny, tiny_params, plain):
   """Probability 0 changes no bit, 1 gives constant actions over 16 control steps that differ from stretch to stretch and robot to robot."""
-  roll = Rollout(short_walker, tiny, faults.make("gear", short_walker.spec))
+  roll = Rollout(short_walker, tiny, faults.make("gear", short_walker))
   begin = streams_of(short_walker, tiny, roll.fault, 2, 3)
   shake = np.zeros((2, 3), np.float32)
   shake[1, 1:] = 1.0

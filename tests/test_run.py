@@ -413,7 +413,7 @@ def test_eval_sums_the_rewards_of_one_episode_each(saved, short_walker, monkeypa
     signal.signal(signal.SIGTERM, before)
   result = json.loads(capsys.readouterr().out)
   trained = agents.load(str(saved), "walker", 24, 6)
-  fault = faults.make("none", short_walker.spec)
+  fault = faults.make("none", short_walker)
   keys = jnp.stack([jax.random.key(s) for s in (5, 6, 7)])[None]
   streams = nest(lambda k: start(short_walker, trained.agent, fault, k), 0, 0)(keys)
   rows = Rollout(short_walker, trained.agent, fault).chunk(jax.tree.map(lambda x: x[None], trained.train.params), streams, 12)[1]

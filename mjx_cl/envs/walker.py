@@ -57,20 +57,23 @@ def observe(qpos: jax.Array, qvel: jax.Array) -> jax.Array:
   return jnp.concatenate([orientation, 1.3 + qpos[:1], qvel])
 
 
-def reward(qpos: jax.Array, qvel: jax.Array, mass: jax.Array) -> jax.Array:
-  """Walk reward in [0, 1], float32 ().
+REWARD_TERMS = {"standing": 3.0, "upright": 1.0, "move": 5.0}  # weights
+
+
+def reward(qpos: jax.Array, qvel: jax.Array, mass: jax.Array, weights=tuple(REWARD_TERMS.values()), speed_asked=WALK_SPEED) -> jax.Array:
+  """Walk reward in [0, 1], float32 (), for weights (3, 1, 5) of REWARD_TERMS and the speed asked for [m/s].
 
     standing = 1 if height >= 1.2 m else 0.1 ** (((1.2 - height) / 0.6) ** 2)
     upright  = (1 + cos(torso angle)) / 2
-    reward   = (3 standing + upright) / 4 * (5 clip(v_x, 0, 1) + 1) / 6            v_x = centre-of-mass velocity [m/s]
+    reward   = (3 standing + upright) / 4 * (5 clip(v_x / speed asked, 0, 1) + 1) / 6       v_x = centre-of-mass velocity [m/s]
   """
   height = 1.3 + qpos[0]
   short = jnp.maximum(STAND_HEIGHT - height, 0.0) / 0.6
   standing = jnp.exp(jnp.log(0.1) * short * short)
   upright = (1.0 + jnp.cos(qpos[2])) / 2.0
   _, speed = jax.jvp(lambda q: center_x(q, mass), (qpos,), (qvel,))
-  move = jnp.clip(speed / WALK_SPEED, 0.0, 1.0)
-  return (3.0 * standing + upright) / 4.0 * (5.0 * move + 1.0) / 6.0
+  move = jnp.clip(speed / speed_asked, 0.0, 1.0)
+  return (weights[0] * standing + weights[1] * upright) / 4.0 * (weights[2] * move + 1.0) / 6.0
 
 
 class Walker:
@@ -93,8 +96,16 @@ class Walker:
         control_s=0.025, episode_steps=1000,
         acceptance=0.8,         # mean reward per step; one that stands still earns 0.17, one that walks and never falls 0.95
         posture=(14, 0.9),      # mean torso height [m]; 1.2 is standing, 0.3 is lying
-        targets=JOINTS)
-    self.model = Model(mj={"actuator_gear": jnp.asarray(self.mj_model.actuator_gear, jnp.float32)}, task={})
+        targets=JOINTS, act_groups=(("right_leg", (0, 1, 2)), ("left_leg", (3, 4, 5)), ("all", tuple(range(6)))),
+        obs_groups=(("orientations", tuple(range(14))), ("height", (14,)), ("velocities", tuple(range(15, 24)))),
+        feet=(("right_foot", (self.mj_model.geom("right_foot").id,)), ("left_foot", (self.mj_model.geom("left_foot").id,))),
+        bodies=tuple((b, (self.mj_model.body(b).id,)) for b in BODIES))
+    self.reward_terms = tuple(REWARD_TERMS)
+    self.model = Model(
+        mj=physics_lib.leaves(self.mj_model, "actuator_gear", "geom_friction", "body_mass", "body_inertia", "body_ipos", "dof_damping",
+                              "dof_frictionloss", "jnt_range", "gravity"),
+        task={"reward_weights": jnp.asarray(list(REWARD_TERMS.values()), jnp.float32), "command_range": jnp.asarray([WALK_SPEED], jnp.float32)},
+        force=jnp.zeros(self.mj_model.nv))
 
   def init(self, model: Model, key: jax.Array) -> tuple[EnvState, jax.Array]:
     """A fresh episode drawn from `key`: state and observation (24,)."""
@@ -108,8 +119,10 @@ class Walker:
 
   def step(self, model: Model, state: EnvState, action: jax.Array) -> tuple[EnvState, Step]:
     """One control step with action (6,), clipped to [-1, 1]."""
-    inner, out = self.physics.step(model.mj, state.physics, jnp.clip(action, -1.0, 1.0))
+    inner, out = self.physics.step(model.mj, state.physics, jnp.clip(action, -1.0, 1.0), force=model.force)
     obs = observe(out["qpos"], out["qvel"])
     step = state.step + 1
-    result = Step(obs, reward(out["qpos"], out["qvel"], self._mass), jnp.bool_(False), step >= self.spec.episode_steps, obs)
+    mass = model.mj["body_mass"][1:] if "body_mass" in model.mj else self._mass
+    earned = reward(out["qpos"], out["qvel"], mass, model.task["reward_weights"], model.task["command_range"][0])
+    result = Step(obs, earned, jnp.bool_(False), step >= self.spec.episode_steps, obs)
     return EnvState(inner, step), result

@@ -1,16 +1,61 @@
-"""What can break (one function per fault) and when (`schedule.py`). `FAULTS` is the one table."""
+"""What can break (one function per fault), when (`schedule.py`), and named settings (`presets.py`). `FAULTS` is the one table.
+
+A robot may have several faults in one compiled program, at once or one after the other: wherever a Fault is taken, a tuple of them is too. Their
+severities, onsets, schedules and targets are arrays, so any mix over a batch of robots is one trace.
+"""
 from __future__ import annotations
 
+import importlib.metadata
+
 from mjx_cl.errors import UserError, choose
-from mjx_cl.faults.actuator import gear
-from mjx_cl.faults.base import Fault, Injection, Ports, inject, none
+from mjx_cl.faults.actuator import ACTUATOR
+from mjx_cl.faults.base import (Fault, Injection, Ports, State, as_tuple, begin, drive, fault, none, owned_model, sense)
+from mjx_cl.faults.body import BODY
+from mjx_cl.faults.contact import CONTACT
+from mjx_cl.faults.schedule import FOREVER, SCHEDULES, Plan, plan
+from mjx_cl.faults.sensor import SENSOR
+from mjx_cl.faults.task import TASK
+from mjx_cl.faults.transfer import TRANSFER
 
-FAULTS = {"none": none, "gear": gear}
+FAMILIES = {"actuator": ACTUATOR, "body": BODY, "contact": CONTACT, "sensor": SENSOR, "transfer": TRANSFER, "task": TASK}
+FAULTS = {"none": none} | {name: make for family in FAMILIES.values() for name, make in family.items()}
 
 
-def make(name: str, spec) -> Fault:
-  """Builds fault `name` for a robot whose Spec is `spec`."""
-  return choose("fault", name, FAULTS)(spec)
+def _plugins() -> None:
+  """Adds the faults of other packages (entry-point group `mjx_cl.faults`); a name that is taken is an error."""
+  for entry in importlib.metadata.entry_points(group="mjx_cl.faults"):
+    if entry.name in FAULTS:
+      raise UserError(f"fault {entry.name!r} of {entry.value} has a name that is taken")
+    FAULTS[entry.name] = entry.load()
+    FAMILIES.setdefault("plugin", {})[entry.name] = FAULTS[entry.name]
+
+
+_plugins()
+
+
+def family(name: str) -> str:
+  """Name of the family of fault `name`."""
+  return next((f for f, members in FAMILIES.items() if name in members), "none")
+
+
+def make(name: str, env) -> Fault:
+  """Builds fault `name` for the robot `env`.
+
+  Raises:
+    UserError for an unknown name, or a fault that has nothing to act on in this robot.
+  """
+  return choose("fault", name, FAULTS)(env)
+
+
+def available(env) -> dict[str, Fault]:
+  """Every fault that `env` can have, by name."""
+  out = {}
+  for name, build in FAULTS.items():
+    try:
+      out[name] = build(env)
+    except UserError:
+      continue
+  return out
 
 
 def target_index(fault: Fault, target: str | None) -> int:

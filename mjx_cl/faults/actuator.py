@@ -1,29 +1,185 @@
-"""Faults of motors and transmissions."""
+"""Faults of motors, transmissions and the line that brings them their commands.
+
+Commands are in the agent's own units, [-1, 1] of the range. A target is one actuator, a group (one leg) or all. Where a fault remembers, an
+episode's start fills its memory anew with the first command.
+"""
 from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from mjx_cl.faults.base import Fault, Ports
+from mjx_cl.errors import UserError
+from mjx_cl.faults.base import Fault, actuator_targets, fault, require
+
+MOST_DELAY = 9       # control steps at severity 1: the hard level of realworldrl_suite
+LOCK_DAMPING = 1e4   # [N m s/rad] at severity 1: a joint under 100 N m creeps at 0.01 rad/s
 
 
-def gear(spec) -> Fault:
+def dofs(env, name: str) -> np.ndarray:
+  """Index of the degree of freedom that each actuator drives, int (A,)."""
+  model = getattr(env, "mj_model", None)
+  if model is None or len(env.spec.targets) != model.nu:
+    raise UserError(f"fault {name!r} needs a robot with one motor per joint, which {env.spec.name!r} is not")
+  return model.jnt_dofadr[model.actuator_trnid[:, 0]]
+
+
+def gear(env) -> Fault:
   """One joint's gear ratio falls: a motor of the same command gives (1 - severity) of its torque.
 
     gear_j' = gear_j (1 - severity)
 
-  Severity: lost share of the gear ratio, 0 nominal, 1 no torque at all; the paper halves the gear, severity 0.5. Target: a joint, or drawn
-  uniformly from the stream's key. Owns `mj.actuator_gear` [ratio], (nu, 6). Not visible to: a robot that does not load the joint.
-  Source: the paper's walker experiment.
+  Severity: lost share of the gear ratio [1], 0 to 1; the paper halves the gear, severity 0.5. Target: a joint (drawn), a leg or all.
+  Owns `mj.actuator_gear` [ratio], (nu, 6). Not visible to: a robot that does not load the joint. Source: the paper's walker experiment.
   """
-  def init(key, target=-1):
-    return jnp.where(jnp.asarray(target) < 0, jax.random.randint(key, (), 0, len(spec.targets)), target).astype(jnp.int32)
+  names, mask, single = actuator_targets(env)
 
-  def apply(joint, severity, key, ports: Ports):
-    del key
+  def act(target, memory, severity, key, ports):
     value = ports.model.mj["actuator_gear"]
-    hit = (jnp.arange(value.shape[0]) == joint)[:, None]
-    changed = jnp.where(hit, value * (1.0 - severity), value)
-    return joint, ports._replace(model=ports.model._replace(mj=ports.model.mj | {"actuator_gear": changed}))
+    return memory, {"mj.actuator_gear": jnp.where(mask[target][:, None], value * (1.0 - severity), value)}
+  return fault("gear", env, ("mj.actuator_gear",), names, act, drawn=single)
 
-  return Fault("gear", ("mj.actuator_gear",), spec.targets, init, apply)
+
+def torque_loss(env) -> Fault:
+  """A motor gives less torque than it computes (worn magnets, a dropped phase), after its own limits.
+
+    torque_j' = torque_j (1 - severity)
+
+  Severity: lost share [1], 0 to 1 (no torque). Target: a joint, a leg or all. Owns `task.strength` [1], (A,), or `mj.actuator_gear` where
+  the motor has no law of its own (the walker). Source: torque factors 0.9 to 1.1 in training and 0 for a crippled leg, facts 4.2.
+  """
+  names, mask, single = actuator_targets(env)
+  leaf = "task.strength" if "strength" in env.model.task else "mj.actuator_gear"
+
+  def act(target, memory, severity, key, ports):
+    kind, name = leaf.split(".")
+    value = getattr(ports.model, kind)[name]
+    hit = mask[target].reshape((-1,) + (1,) * (value.ndim - 1))
+    return memory, {leaf: jnp.where(hit, value * (1.0 - severity), value)}
+  return fault("torque_loss", env, (leaf,), names, act, drawn=single)
+
+
+def velocity_limit(env) -> Fault:
+  """A drive reaches less speed: its torque falls to zero at a lower one.
+
+    v_j' = v_j (1 - 0.95 severity)
+
+  Severity: 1 leaves 5 % of the limit [rad/s; the car: m/s]; the paper's third is severity 0.7018. Target: a joint, a leg or all. Owns
+  `task.velocity_limit`, (A,). Not visible to: a gait below the lower limit. Source: the paper's quadruped experiment.
+  """
+  names, mask, single = actuator_targets(env)
+
+  def act(target, memory, severity, key, ports):
+    value = ports.model.task["velocity_limit"]
+    return memory, {"task.velocity_limit": jnp.where(mask[target], value * (1.0 - 0.95 * severity), value)}
+  return fault("velocity_limit", env, ("task.velocity_limit",), names, act, drawn=single)
+
+
+def joint_lock(env) -> Fault:
+  """A joint seizes: it is damped until it hardly moves.
+
+    damping_j' = damping_j + 1e4 severity^4 [N m s/rad]
+
+  Severity: 0.25, 0.5, 0.75 add 39, 625, 3,164; 1 holds the joint (0.01 rad/s under 100 N m). Target: a joint, a leg or all. Owns
+  `mj.dof_damping`, (nv,); the integrators treat it implicitly, so it stays stable. Source: locked and crippled joints, facts 4.2.
+  """
+  names, mask, single = actuator_targets(env)
+  at = dofs(env, "joint_lock")
+
+  def act(target, memory, severity, key, ports):
+    value = ports.model.mj["dof_damping"]
+    extra = jnp.where(mask[target], LOCK_DAMPING * severity**4, 0.0)
+    return memory, {"mj.dof_damping": value.at[at].add(extra)}
+  return fault("joint_lock", env, ("mj.dof_damping",), names, act, drawn=single)
+
+
+def _command(name, env, change, memory=(), not_monotone=""):
+  """A fault of the command alone; change(hit (A,), memory, severity, key, ports) -> (memory', ctrl')."""
+  names, mask, single = actuator_targets(env)
+
+  def act(target, memory, severity, key, ports):
+    hit = mask[target]
+    memory, value = change(hit, memory, severity, key, ports)
+    return memory, {"ctrl": jnp.where(hit, value, ports.ctrl)}
+  return fault(name, env, ("ctrl",), names, act, memory, single, not_monotone)
+
+
+def stuck(env) -> Fault:
+  """A command sticks at the value that it had when the fault began.
+
+    u_j' = (1 - severity) u_j + severity u_j(onset)
+
+  Severity: share of the held value [1]; 1 is stuck altogether. Target: an actuator, a group or all. Owns `ctrl`. Memory: the held command;
+  an episode's start sets it anew. Not visible to: a constant command. Source: stuck actuators of realworldrl_suite, facts 4.5.
+  """
+  def change(hit, held, severity, key, ports):
+    held = jnp.where((severity > 0) & ~ports.first, held, ports.ctrl)
+    return held, (1.0 - severity) * ports.ctrl + severity * held
+  return _command("stuck", env, change, jnp.zeros(len(env.spec.act)))
+
+
+def offset(env) -> Fault:
+  """A constant is added to a command (a slipped encoder, a bent linkage).
+
+    u_j' = clip(u_j + 0.5 severity, -1, 1)
+
+  Severity: 1 adds half of the half-range [1]. Target: an actuator, a group or all. Owns `ctrl`. Not visible to: a command at its upper
+  bound. Source: motor offsets, facts 4.2.
+  """
+  return _command("offset", env, lambda hit, m, severity, key, ports: (m, jnp.clip(ports.ctrl + 0.5 * severity, -1.0, 1.0)))
+
+
+def dead_band(env) -> Fault:
+  """Small commands do nothing (play, stiction); larger ones are short by the band.
+
+    u_j' = sign(u_j) max(|u_j| - 0.5 severity, 0)
+
+  Severity: 1 is a band of half the half-range [1]. Target: an actuator, a group or all. Owns `ctrl`.
+  """
+  def change(hit, m, severity, key, ports):
+    return m, jnp.sign(ports.ctrl) * jnp.maximum(jnp.abs(ports.ctrl) - 0.5 * severity, 0.0)
+  return _command("dead_band", env, change)
+
+
+def command_dropout(env) -> Fault:
+  """A command is lost now and then: the actuator gets 0 in that control step.
+
+    P(u_j' = 0) = 0.5 severity, each actuator and step alone
+
+  Severity: 1 loses every other command [probability]. Target: an actuator, a group or all. Owns `ctrl`. Source: dropped commands;
+  realworldrl_suite drops observations with 0.01 to 0.1, facts 4.5.
+  """
+  def change(hit, m, severity, key, ports):
+    return m, jnp.where(jax.random.uniform(key, hit.shape) < 0.5 * severity, 0.0, ports.ctrl)
+  return _command("command_dropout", env, change)
+
+
+def command_delay(env) -> Fault:
+  """A command arrives late.
+
+    u_j'(t) = u_j(t - d),   d = ceil(9 severity) control steps
+
+  Severity: 1/3, 2/3, 1 are the 3, 6, 9 steps of realworldrl_suite's easy, medium, hard. Target: an actuator, a group or all. Owns `ctrl`.
+  Memory: the last 9 commands; an episode's start fills it with its first command. Source: facts 4.5.
+  """
+  def change(hit, line, severity, key, ports):
+    line = jnp.where(ports.first, jnp.broadcast_to(ports.ctrl, line.shape), jnp.concatenate([ports.ctrl[None], line[:-1]]))
+    return line, line[jnp.ceil(MOST_DELAY * severity).astype(jnp.int32)]
+  return _command("command_delay", env, change, jnp.zeros((MOST_DELAY + 1, len(env.spec.act))), "an older command may be nearer to the present one")
+
+
+def command_noise(env) -> Fault:
+  """Gaussian noise on a command.
+
+    u_j' = clip(u_j + n, -1, 1),   n ~ N(0, severity^2)
+
+  Severity: standard deviation [half-ranges]; 0.1, 0.3, 1.0 are realworldrl_suite's levels. Target: an actuator, a group or all. Owns
+  `ctrl`. Source: facts 4.5.
+  """
+  def change(hit, m, severity, key, ports):
+    return m, jnp.clip(ports.ctrl + severity * jax.random.normal(key, hit.shape), -1.0, 1.0)
+  return _command("command_noise", env, change)
+
+
+ACTUATOR = {"gear": gear, "torque_loss": torque_loss, "velocity_limit": velocity_limit, "joint_lock": joint_lock, "stuck": stuck, "offset": offset,
+            "dead_band": dead_band, "command_dropout": command_dropout, "command_delay": command_delay, "command_noise": command_noise}

@@ -1,12 +1,89 @@
-"""When a fault acts: a factor in [0, 1] on its severity, as a pure function of the control step."""
+"""When a fault acts: a factor in [0, 1] on its severity, as a pure function of the control step. `SCHEDULES` is the one table."""
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
+from mjx_cl.errors import UserError
+
 FOREVER = 2**31 - 1  # a duration that no run outlasts
+
+SCHEDULES = {
+    "abrupt": "from the onset on in full",
+    "ramp": "grows linearly over `period` control steps from the onset on, then stays",
+    "intermittent": "on for `share` of every `period`, off for the rest",
+    "cyclic": "rises and falls as (1 - cos) / 2 with `period`",
+    "random_walk": "starts at 0; every `period` a normal step of deviation `share`, reflected at 0 and 1",
+}
+
+
+class Plan(NamedTuple):
+  """When and how strongly faults act; arrays () or (F,), all of them traced: they change between calls without a new compilation.
+
+  Attributes:
+    severity: float32, at most reached.
+    onset, duration: int32, control steps; FOREVER is never repaired.
+    kind: int32, index into SCHEDULES.
+    period: int32, control steps, at least 1. share: float32 in [0, 1].
+  """
+  severity: jax.Array
+  onset: jax.Array
+  duration: jax.Array
+  kind: jax.Array
+  period: jax.Array
+  share: jax.Array
+
+
+def plan(severity=0.0, onset=0, duration=FOREVER, schedule="abrupt", period=1000, share=0.5) -> Plan:
+  """A Plan from numbers or arrays; `schedule` is a name or an array of indices."""
+  if isinstance(schedule, str):
+    if schedule not in SCHEDULES:
+      raise UserError(f"unknown schedule {schedule!r}; choose from: {', '.join(SCHEDULES)}")
+    schedule = list(SCHEDULES).index(schedule)
+  i, f = lambda x: jnp.asarray(x, jnp.int32), lambda x: jnp.asarray(x, jnp.float32)
+  return Plan(f(severity), i(onset), i(duration), i(schedule), i(period), f(share))
+
+
+def spread(plan: Plan, faults: int) -> Plan:
+  """Plan with every leaf (F,)."""
+  return Plan(*(jnp.broadcast_to(x, (faults,)) for x in plan))
 
 
 def abrupt(t: jax.Array, onset: jax.Array, duration: jax.Array) -> jax.Array:
   """1 for onset <= t < onset + duration, else 0, float32 (). `onset`, `duration` in control steps; FOREVER is never repaired."""
   return ((t >= onset) & (t - onset < duration)).astype(jnp.float32)
+
+
+def factor(plan: Plan, walk: jax.Array, t: jax.Array) -> jax.Array:
+  """Share of the severity that is in force at control step t, float32, of the shape of the plan's leaves.
+
+    abrupt 1;  ramp min(1, (since + 1) / period);  intermittent 1 if (since mod period) < share period else 0;
+    cyclic (1 - cos(2 pi (since + 1) / period)) / 2;  random walk: `walk`                                    since = t - onset
+  Exactly 0 before the onset and from onset + duration on.
+  """
+  since = t - plan.onset
+  phase = jnp.mod(since, plan.period).astype(jnp.float32)
+  period = plan.period.astype(jnp.float32)
+  ramp = jnp.minimum(1.0, (since + 1).astype(jnp.float32) / period)
+  on = (phase < plan.share * period).astype(jnp.float32)
+  wave = 0.5 - 0.5 * jnp.cos(2 * jnp.pi * (phase + 1) / period)
+  kinds = jnp.stack([jnp.ones_like(ramp), ramp, on, wave, jnp.broadcast_to(walk, ramp.shape)])
+  chosen = jnp.take_along_axis(kinds, plan.kind[None], 0)[0]
+  return jnp.where(abrupt(t, plan.onset, plan.duration) > 0, chosen, 0.0)
+
+
+def severity(plan: Plan, walk: jax.Array, t: jax.Array) -> jax.Array:
+  """Severity in force, float32 in [0, 1]."""
+  return plan.severity * factor(plan, walk, t)
+
+
+def walk(plan: Plan, value: jax.Array, t: jax.Array, key: jax.Array) -> jax.Array:
+  """Where the random walk stands at control step t: a new step at the onset and every `period` after it, reflected at 0 and 1."""
+  since = t - plan.onset
+  due = (since >= 0) & (jnp.mod(since, plan.period) == 0)
+  moved = value + plan.share * jax.random.normal(key, value.shape)
+  moved = jnp.abs(moved)                                    # reflected at 0
+  moved = jnp.clip(1.0 - jnp.abs(1.0 - moved), 0.0, 1.0)    # and at 1
+  return jnp.where(due, moved, value)

@@ -29,3 +29,10 @@ def make(name: str, mj_model, substeps: int, outputs: tuple[str, ...] = ("qpos",
     from mjx_cl.physics.mjx import Mjx
     return Mjx(mj_model, substeps, outputs, law)
   raise UserError(f"unknown physics {name!r}; choose from: auto, native, mjx")
+
+
+def leaves(mj_model, *names: str) -> dict:
+  """Nominal values of model fields as float32 arrays, for types.Model.mj; `gravity` is mjOption's."""
+  import jax.numpy as jnp
+  value = lambda name: mj_model.opt.gravity if name == "gravity" else getattr(mj_model, name)
+  return {name: jnp.asarray(value(name), jnp.float32) for name in names}

@@ -1,0 +1,174 @@
+"""Faults of the body: masses, where they sit, joints. Masses bring their derived constants (mj_setConst, physics.DERIVING)."""
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_cl.errors import UserError
+from mjx_cl.faults.actuator import dofs
+from mjx_cl.faults.base import Fault, actuator_targets, fault
+
+
+def _bodies(env, name: str):
+  """(names, bool mask (targets, nbody)) of spec.bodies."""
+  if not env.spec.bodies or getattr(env, "mj_model", None) is None:
+    raise UserError(f"fault {name!r} needs bodies with a name and a mass, which robot {env.spec.name!r} does not have")
+  size = env.mj_model.nbody
+  return tuple(n for n, _ in env.spec.bodies), jnp.asarray([[i in hit for i in range(size)] for _, hit in env.spec.bodies])
+
+
+def payload(env) -> Fault:
+  """The trunk carries a load, spread as its own mass is.
+
+    m' = m (1 + 0.4 severity M / m),  I' = I m' / m                       M whole mass, m the trunk's
+
+  Severity: 1 is a load of 40 % of the whole robot [kg]: quadruped 20.9 kg (its randomisation in training is +-5 kg, severity 0.24), walker
+  11.4, car 1.5. Target: trunk. Owns `mj.body_mass`, `mj.body_inertia`, or `task.mass`, `task.inertia` where there is no MuJoCo model.
+  Source: payloads, facts 4.2.
+  """
+  if "mass" in env.model.task:
+    def act(target, memory, severity, key, ports):
+      grown = 1.0 + 0.4 * severity
+      return memory, {"task.mass": ports.model.task["mass"] * grown, "task.inertia": ports.model.task["inertia"] * grown}
+    return fault("payload", env, ("task.mass", "task.inertia"), ("trunk",), act)
+  _, mask = _bodies(env, "payload")
+  mass = np.asarray(env.mj_model.body_mass)
+  trunk = int(env.spec.bodies[0][1][0])
+  share = float(mass.sum() / mass[trunk])
+
+  def act(target, memory, severity, key, ports):
+    grown = jnp.where(jnp.arange(mass.size) == trunk, 1.0 + 0.4 * severity * share, 1.0)
+    return memory, {"mj.body_mass": ports.model.mj["body_mass"] * grown, "mj.body_inertia": ports.model.mj["body_inertia"] * grown[:, None]}
+  return fault("payload", env, ("mj.body_mass", "mj.body_inertia"), ("trunk",), act)
+
+
+def com(env) -> Fault:
+  """The trunk's centre of mass moves.
+
+    r' = r + 0.5 severity g e,   g = sqrt(trace(I) / (2 m)) radius of gyration, e the direction
+
+  Severity: 1 moves it by half the radius of gyration [m]: quadruped 0.13 (VCMS trains with 0.1), walker 0.10. Target: forward, backward, left,
+  right, up, down as far as the robot can move there. Owns `mj.body_ipos`. Source: facts 4.2.
+  """
+  _bodies(env, "com")
+  model, trunk = env.mj_model, int(env.spec.bodies[0][1][0])
+  gyration = float(np.sqrt(model.body_inertia[trunk].sum() / 2 / model.body_mass[trunk]))
+  names, directions = heading_targets(env, ("forward", "backward", "left", "right", "up", "down"))
+
+  def act(target, memory, severity, key, ports):
+    value = ports.model.mj["body_ipos"]
+    return memory, {"mj.body_ipos": value.at[trunk].add(0.5 * severity * gyration * directions[target])}
+  return fault("com", env, ("mj.body_ipos",), names, act)
+
+
+def limb_mass(env) -> Fault:
+  """A limb grows heavier (mud, ice), its inertia with it.   m_b' = m_b (1 + 2 severity)
+
+  Severity: 1 triples the mass [kg], the upper end of Nagabandi et al.'s arm, facts 4.2. Target: a body other than the trunk. Owns
+  `mj.body_mass`, `mj.body_inertia`.
+  """
+  names, mask = _bodies(env, "limb_mass")
+  names, mask = names[1:], mask[1:]
+
+  def act(target, memory, severity, key, ports):
+    grown = jnp.where(mask[target], 1.0 + 2.0 * severity, 1.0)
+    return memory, {"mj.body_mass": ports.model.mj["body_mass"] * grown, "mj.body_inertia": ports.model.mj["body_inertia"] * grown[:, None]}
+  return fault("limb_mass", env, ("mj.body_mass", "mj.body_inertia"), names, act)
+
+
+def joint_damping(env) -> Fault:
+  """A joint grows stiff in motion.   damping_j' = damping_j + 10 severity [N m s/rad]
+
+  Severity: 1 adds 10, the upper end of realworldrl_suite's walker (nominal 0.1). Target: a joint, a leg or all. Owns `mj.dof_damping`.
+  Source: facts 4.5.
+  """
+  names, mask, single = actuator_targets(env)
+  at = dofs(env, "joint_damping")
+
+  def act(target, memory, severity, key, ports):
+    return memory, {"mj.dof_damping": ports.model.mj["dof_damping"].at[at].add(jnp.where(mask[target], 10.0 * severity, 0.0))}
+  return fault("joint_damping", env, ("mj.dof_damping",), names, act, drawn=single)
+
+
+def joint_friction(env) -> Fault:
+  """Dry friction in a joint.   frictionloss_j' = frictionloss_j + 0.25 severity tau_j [N m]
+
+  Severity: 1 adds a quarter of the motor's greatest torque tau_j. Target: a joint, a leg or all. Owns `mj.dof_frictionloss`. MJX builds no
+  friction constraint for a model that has none and refuses it there; C MuJoCo (physics native) does.
+  """
+  names, mask, single = actuator_targets(env)
+  at = dofs(env, "joint_friction")
+  model = env.mj_model
+  torque = jnp.asarray(np.abs(model.actuator_gear[:, 0] * model.actuator_ctrlrange[:, 1]), jnp.float32)
+  if not (np.asarray(torque) > 0).all():
+    raise UserError(f"fault 'joint_friction' needs motors with a greatest torque (ctrlrange), which robot {env.spec.name!r} does not state")
+  if env.physics.name == "mjx" and not (model.dof_frictionloss > 0).any():
+    raise UserError("fault 'joint_friction': MJX builds no friction constraint for a model whose joints have none, so it would do nothing; "
+                    "choose physics native")
+
+  def act(target, memory, severity, key, ports):
+    return memory, {"mj.dof_frictionloss": ports.model.mj["dof_frictionloss"].at[at].add(jnp.where(mask[target], 0.25 * severity * torque, 0.0))}
+  return fault("joint_friction", env, ("mj.dof_frictionloss",), names, act, drawn=single)
+
+
+def range_loss(env) -> Fault:
+  """A joint's range shrinks towards the angle at which the robot stands.   low' = low + 0.95 severity (q0 - low), high alike
+
+  Severity: 1 leaves 5 % of the range [rad]. Target: a joint, a leg or all, of those that have limits. Owns `mj.jnt_range`. Not visible to: a
+  gait that does not come near the limits.
+  """
+  names, mask, single = actuator_targets(env)
+  dofs(env, "range_loss")
+  model = env.mj_model
+  joints = model.actuator_trnid[:, 0]
+  if not model.jnt_limited[joints].all():
+    raise UserError(f"fault 'range_loss' needs joints with limits; these have none in robot {env.spec.name!r}: "
+                    + ", ".join(env.spec.targets[i] for i in np.flatnonzero(~model.jnt_limited[joints].astype(bool))))
+  stance = getattr(env, "stance", None)  # joint angles of standing, in actuator order
+  stance = model.qpos0[model.jnt_qposadr[joints]] if stance is None else np.asarray(stance)
+  middle = jnp.asarray(np.clip(stance, *model.jnt_range[joints].T), jnp.float32)[:, None]
+
+  def act(target, memory, severity, key, ports):
+    value = ports.model.mj["jnt_range"]
+    mine = value[joints]
+    shrunk = mine + 0.95 * severity * (middle - mine)
+    return memory, {"mj.jnt_range": value.at[joints].set(jnp.where(mask[target][:, None], shrunk, mine))}
+  return fault("range_loss", env, ("mj.jnt_range",), names, act, drawn=single)
+
+
+DIRECTIONS = {"forward": (1, 0, 0), "backward": (-1, 0, 0), "left": (0, 1, 0), "right": (0, -1, 0), "up": (0, 0, 1), "down": (0, 0, -1)}
+
+
+def heading_targets(env, names):
+  """(names, unit vectors (targets, 3)) of the directions in which the robot's trunk is free to move."""
+  free = np.abs(force_map(env)).sum(1) > 0
+  kept = [n for n in names if free[np.flatnonzero(DIRECTIONS[n])[0]]]
+  return tuple(kept), jnp.asarray([DIRECTIONS[n] for n in kept], jnp.float32)
+
+
+def force_map(env) -> np.ndarray:
+  """(3, nv): a force F (world axes) [N] on the trunk is the generalised force F @ map.
+
+  The trunk's slide joints, or the translations of its free joint (the force then acts at the body's origin). Without a MuJoCo model the
+  force's first two entries are along x and y of the world.
+  """
+  import mujoco
+  model = getattr(env, "mj_model", None)
+  if model is None:
+    size = 0 if env.model.force is None else env.model.force.shape[0]
+    out = np.zeros((3, size), np.float32)
+    for axis in range(min(2, size)):
+      out[axis, axis] = 1.0
+    return out
+  out = np.zeros((3, model.nv), np.float32)
+  trunk = int(env.spec.bodies[0][1][0]) if env.spec.bodies else 1
+  for j in range(model.body_jntadr[trunk], model.body_jntadr[trunk] + model.body_jntnum[trunk]):
+    at = model.jnt_dofadr[j]
+    if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE:
+      out[:, at:at + 3] = np.eye(3)
+    elif model.jnt_type[j] == mujoco.mjtJoint.mjJNT_SLIDE:
+      out[:, at] = model.jnt_axis[j]
+  return out
+
+
+BODY = {"payload": payload, "com": com, "limb_mass": limb_mass, "joint_damping": joint_damping, "joint_friction": joint_friction, "range_loss": range_loss}

@@ -1,0 +1,190 @@
+"""Proof that every fault acts: what it changes, from when on, by how much, and what it costs. `mjx-cl certify` writes it down.
+
+All lanes of a robot (every fault, severity and target) live in one compiled program, under the same actions, beside the robot without any fault.
+"""
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_cl import faults as faults_lib
+from mjx_cl.faults import schedule
+
+SEVERITIES = (0.0, 0.25, 0.5, 0.75, 1.0)
+AFTER = (1, 10, 100)  # control steps at which the size of the difference is reported
+ROUNDING = 1e-4       # largest relative difference of the same nominal robot in two programs: XLA folds constants, which shifts last bits
+SLACK = 0.9           # a difference counts as not smaller from this share of the one before on
+
+
+class Lane(NamedTuple):
+  """One robot of the proof: fault, target, severity."""
+  fault: str
+  target: str
+  severity: float
+
+
+class Certificate(NamedTuple):
+  """What one lane shows.
+
+  Attributes:
+    robot, fault, family, target, severity: what was set; the row of fault `none` holds the nominal robot in this program against a program
+      without any fault, diff_1 the largest relative difference.
+    identical: bit-identical to the nominal robot in all steps (must hold at severity 0).
+    early: something differs before the onset (must not be).
+    first_step: first control step, counted from the onset, whose outcome differs; None: none does.
+    diff_1, diff_10, diff_100: root mean square over channels of (x - x_nominal) / scale, so many steps after that first one (1 = itself);
+      for a fault that only changes the reward, |r - r_nominal|.
+    monotone: at the step at which the greatest severity first differs, the differences do not fall with severity; None: single severity.
+    reason: why it need not be monotone.
+  """
+  robot: str
+  fault: str
+  family: str
+  target: str
+  severity: float
+  identical: bool
+  early: bool
+  first_step: int | None
+  diff_1: float | None
+  diff_10: float | None
+  diff_100: float | None
+  monotone: bool | None
+  reason: str
+
+
+def lanes(faults: dict[str, faults_lib.Fault], severities=SEVERITIES, targets: int = 8) -> list[Lane]:
+  """Every severity on the first target, and severity 1 on up to `targets` more that may be drawn."""
+  out = []
+  for name, f in faults.items():
+    out += [Lane(name, f.targets[0], s) for s in severities]
+    out += [Lane(name, t, 1.0) for t in f.targets[1:min(f.drawn, targets + 1)]]
+  return out
+
+
+def actions(env, steps: int, seed: int) -> np.ndarray:
+  """A vigorous, smooth command signal, float32 (steps, A) in [-1, 1]: sines of drawn frequency and phase."""
+  rng = np.random.default_rng(seed)
+  t = np.arange(steps)[:, None] * env.spec.control_s
+  hertz, phase = rng.uniform(0.5, 2.5, (2, 1, len(env.spec.act))), rng.uniform(0, 2 * np.pi, (2, 1, len(env.spec.act)))
+  return np.clip(0.9 * np.sin(2 * np.pi * hertz[0] * t + phase[0]) + 0.4 * np.sin(2 * np.pi * hertz[1] * t + phase[1]), -1, 1).astype(np.float32)
+
+
+def live(env, faults: tuple, model, key: jax.Array, injection, signal: jax.Array):
+  """One robot of nominal `model` under `signal` (T, A), never reset. Returns (obs (T, O), reward (T,), terminated (T,)) of arriving."""
+  key_env, key = jax.random.split(key)
+  state, obs = env.init(model, key_env)
+  injection, _ = faults_lib.sense(faults, injection, jnp.int32(0), key, model, obs, True)
+
+  def step(carry, x):
+    state, injection = carry
+    t, action = x
+    now = jax.random.fold_in(key, t)
+    injection, ports, _ = faults_lib.drive(faults, injection, t, jax.random.fold_in(now, 1), faults_lib.Ports(model, ctrl=action, first=t == 0))
+    state, out = env.step(ports.model, state, ports.ctrl)
+    injection, obs = faults_lib.sense(faults, injection, t + 1, jax.random.fold_in(now, 4), model, out.final_obs)
+    return (state, injection), (obs, out.reward, out.terminated)
+  times = jnp.arange(signal.shape[0])
+  return jax.lax.scan(step, (state, injection), (times, signal))[1]
+
+
+def program(env, faults: tuple):
+  """(model, key, plans, targets, signal) -> (obs, reward, terminated) of every lane and of the same robot in a program without faults, jitted.
+
+  plans and targets lead with (lanes,). The nominal model is an argument: as a constant it would be folded.
+  """
+  none = faults_lib.none(env)
+
+  def run(model, key, plans, targets, signal):
+    one = lambda plan, target: live(env, faults, model, key, faults_lib.begin(faults, jax.random.key(0), plan, target), signal)
+    plain = live(env, (none,), faults_lib.owned_model((none,), env.model), key, faults_lib.begin(none, jax.random.key(0), faults_lib.plan()), signal)
+    return jax.vmap(one)(plans, targets), plain
+  return jax.jit(run)
+
+
+def plans(faults: dict[str, faults_lib.Fault], chosen: list[Lane], onset: int):
+  """Plan (lanes, F) and targets (lanes, F): each lane has its one fault, the others rest at severity 0."""
+  names = list(faults)
+  severity, target = np.zeros((len(chosen), len(names)), np.float32), np.zeros((len(chosen), len(names)), np.int32)
+  for i, lane in enumerate(chosen):
+    f = names.index(lane.fault)
+    severity[i, f], target[i, f] = lane.severity, faults[lane.fault].targets.index(lane.target)
+  full = lambda value, dtype: jnp.full(severity.shape, value, dtype)
+  plan = schedule.Plan(jnp.asarray(severity), full(onset, jnp.int32), full(faults_lib.FOREVER, jnp.int32), full(0, jnp.int32), full(1000, jnp.int32),
+                       full(0.5, jnp.float32))
+  return plan, jnp.asarray(target)
+
+
+def certify(env, faults: dict[str, faults_lib.Fault] | None = None, severities=SEVERITIES, chosen: list[Lane] | None = None, onset: int = 40,
+            steps: int = 400, seed: int = 0) -> list[Certificate]:
+  """Certificates of `faults` (all that the robot can have) on `env`, under one signal.
+
+  Args:
+    chosen: lanes, in place of those that `severities` give.
+    onset, steps: control steps; a fault must act within steps - onset - 100.
+  """
+  if faults is None:
+    faults = {k: f for k, f in faults_lib.available(env).items() if k != "none"}
+  chosen = lanes(faults, severities) if chosen is None else chosen
+  nominal = Lane(next(iter(faults)), next(iter(faults.values())).targets[0], 0.0)
+  plan, target = plans(faults, chosen + [nominal], onset)
+  run = program(env, tuple(faults.values()))
+  model = faults_lib.owned_model(tuple(faults.values()), env.model)
+  rows, plain = jax.tree.map(np.asarray, run(model, jax.random.key(seed), plan, target, jnp.asarray(actions(env, steps, seed))))
+  return compare(env, faults, chosen, rows, plain, onset)
+
+
+def compare(env, faults, chosen, rows, plain, onset) -> list[Certificate]:
+  """Rows of the lanes, the last of which is the nominal robot, against that one; it is held against the program without faults."""
+  obs, reward, terminated = (x[:-1] for x in rows)
+  rounding = max(float(np.max(np.abs(rows[k][-1] - plain[k]) / (1.0 + np.abs(plain[k])))) for k in (0, 1))
+  plain = tuple(x[-1] for x in rows)
+  scale = np.asarray([v.scale for v in env.spec.obs])
+  bits = lambda x: np.ascontiguousarray(x, np.float32).view(np.uint32)
+  differs = (bits(obs) != bits(plain[0])[None]).any(-1) | (bits(reward) != bits(plain[1])[None]) | (terminated != plain[2][None])  # (lanes, T)
+  size = np.sqrt(np.mean(((obs - plain[0][None]) / scale) ** 2, -1))
+  size = np.where(size > 0, size, np.abs(reward - plain[1][None]))
+  # an outcome of step t is read at t + 1: a sensor that fails at the onset already shows in the outcome of the step before
+  out = [Certificate(env.spec.name, "none", "none", "all", 0.0, rounding < ROUNDING, False, None, rounding, None, None, None, "")]
+  for i, lane in enumerate(chosen):
+    begin = onset - 1 if faults[lane.fault].senses else onset
+    at = np.flatnonzero(differs[i])
+    first = int(at[0]) if at.size else None
+    values = [float(size[i, first + k - 1]) if first is not None and first + k - 1 < size.shape[1] else None for k in AFTER]
+    out.append(Certificate(
+        env.spec.name, lane.fault, faults_lib.family(lane.fault), lane.target, lane.severity, not at.size, first is not None and first < begin,
+        None if first is None else first - begin, *values, monotone(chosen, differs, size, i), faults[lane.fault].not_monotone))
+  return out
+
+
+def monotone(chosen: list[Lane], differs: np.ndarray, size: np.ndarray, i: int) -> bool | None:
+  """Whether the differences do not fall with severity at the step at which the greatest severity of this fault and target first differs."""
+  same = sorted((lane.severity, k) for k, lane in enumerate(chosen) if (lane.fault, lane.target) == (chosen[i].fault, chosen[i].target))
+  if len(same) < 2:
+    return None
+  last = same[-1][1]
+  if not differs[last].any():
+    return False
+  at = int(np.argmax(differs[last]))
+  values = [size[k, at] for _, k in same]
+  return bool(all(b >= SLACK * a for a, b in zip(values, values[1:])))
+
+
+def faulty(rows: list[Certificate]) -> list[str]:
+  """What is wrong, one line each; empty where every fault does what it claims."""
+  out = []
+  for c in rows:
+    who = f"{c.robot}: fault {c.fault}, target {c.target}, severity {c.severity:g}"
+    if c.fault == "none" and not c.identical:
+      out.append(f"{c.robot}: with all faults at severity 0 it is not the robot without faults (relative difference {c.diff_1:.1e})")
+    elif c.severity == 0 and not c.identical:
+      out.append(f"{who} is not the nominal robot bit for bit (step {c.first_step} from the onset)")
+    if c.severity > 0 and c.identical:
+      out.append(f"{who} changes nothing")
+    if c.early:
+      out.append(f"{who} changes something before the onset")
+    if c.severity == 1 and c.monotone is False and not c.reason:
+      out.append(f"{who}: its difference falls with severity, and no reason is given")
+  return out

@@ -1,0 +1,114 @@
+"""Faults between the robot and the world: grip, slope, pushes, wind."""
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_cl.errors import UserError
+from mjx_cl.faults.base import Fault, fault
+from mjx_cl.faults.body import force_map, heading_targets
+
+PUSH_EVERY = 100  # control steps between two pushes
+PUSH_FOR = 4      # control steps that one lasts
+
+
+def friction(env) -> Fault:
+  """Grip is lost: under all feet (a slippery ground) or under one foot, wheel or axle (a sock).
+
+    mu_i' = mu_i (1 - 0.95 severity)
+
+  Severity: 1 leaves 5 % of the friction coefficient [1]. Target: all, or a foot, wheel or axle. Owns `mj.geom_friction` (n, 3) of the touching
+  geoms, which must have priority over the floor (MuJoCo takes the greater of two equal ones otherwise, and the fault would do nothing), or
+  `task.friction`, one per axle. Source: friction figures, facts 4.3 and 4.5.
+  """
+  feet = list(env.spec.feet)
+  if not feet:
+    raise UserError(f"fault 'friction' needs feet or wheels with a name, which robot {env.spec.name!r} does not have")
+  everything = tuple(sorted({i for _, hit in feet for i in hit}))
+  feet = [("all", everything)] + feet
+  names = tuple(name for name, _ in feet)
+  if "friction" in env.model.task:
+    leaf, size = "task.friction", env.model.task["friction"].shape[0]
+  else:
+    leaf, size = "mj.geom_friction", env.mj_model.ngeom
+    check_priority(env, everything)
+  mask = jnp.asarray([[i in hit for i in range(size)] for _, hit in feet])
+
+  def act(target, memory, severity, key, ports):
+    kind, name = leaf.split(".")
+    value = getattr(ports.model, kind)[name]
+    hit = mask[target].reshape((-1,) + (1,) * (value.ndim - 1))
+    return memory, {leaf: jnp.where(hit, value * (1.0 - 0.95 * severity), value)}
+  return fault("friction", env, (leaf,), names, act)
+
+
+def check_priority(env, geoms) -> None:
+  """Raises UserError where a foot's friction is masked by what it stands on."""
+  import mujoco
+  model = env.mj_model
+  floor = [g for g in range(model.ngeom) if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_PLANE]
+  masked = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, g) or str(g) for g in geoms
+            if any(model.geom_priority[g] <= model.geom_priority[f] for f in floor)]
+  if masked:
+    raise UserError(f"fault 'friction': the floor masks the friction of {', '.join(masked)} in robot {env.spec.name!r}; give these geoms a higher priority")
+
+
+def slope(env) -> Fault:
+  """The ground is no longer level: gravity tilts, the ground stays where it is.
+
+    g' = |g| (sin(a) e - cos(a) z),   a = 20 degrees severity, e the direction downhill
+
+  Severity: 1 is a slope of 20 degrees. Target: forward (downhill ahead), backward, left, right. Owns `mj.gravity` (3,) [m/s^2], or
+  `task.gravity`.
+  """
+  names, directions = heading_targets(env, ("forward", "backward", "left", "right"))
+  leaf = "task.gravity" if "gravity" in env.model.task else "mj.gravity"
+
+  def act(target, memory, severity, key, ports):
+    kind, name = leaf.split(".")
+    value = getattr(ports.model, kind)[name]
+    angle = jnp.deg2rad(20.0) * severity
+    tilted = jnp.linalg.norm(value) * (jnp.sin(angle) * directions[target] - jnp.cos(angle) * jnp.asarray([0.0, 0.0, 1.0]))
+    return memory, {leaf: tilted}
+  return fault("slope", env, (leaf,), names, act)
+
+
+def whole_mass(env) -> float:
+  """Mass of the nominal robot [kg]."""
+  return float(np.asarray(env.model.task["mass"])) if "mass" in env.model.task else float(env.mj_model.body_mass.sum())
+
+
+def wind(env) -> Fault:
+  """A steady force on the trunk.   F = 0.3 severity M g e [N]
+
+  Severity: 1 is 30 % of the weight. Target: the direction of the wind in the world: forward (+x), backward, left, right. Owns `force` (nv,).
+  """
+  names, directions = heading_targets(env, ("forward", "backward", "left", "right"))
+  newton, onto = 0.3 * 9.81 * whole_mass(env), jnp.asarray(force_map(env))
+
+  def act(target, memory, severity, key, ports):
+    return memory, {"force": ports.model.force + severity * newton * directions[target] @ onto}
+  return fault("wind", env, ("force",), names, act)
+
+
+def push(env) -> Fault:
+  """Blows to the trunk: every 100 control steps, for 4, each in a direction drawn anew.
+
+    F = severity M dv / (4 dt) e [N],   dv = 1.5 m/s, e = forward or backward (and sideways where the robot can move there)
+
+  Severity: 1 is a change of speed of 1.5 m/s per blow (Isaac Lab trains with 0.5, severity 1/3). Target: trunk. Owns `force` (nv,). Memory: the
+  direction of the latest blow. Source: pushes, facts 1.6 and 4.2.
+  """
+  _, directions = heading_targets(env, ("forward", "backward", "left", "right"))
+  newton, onto = 1.5 * whole_mass(env) / (PUSH_FOR * env.spec.control_s), jnp.asarray(force_map(env))
+
+  def act(target, memory, severity, key, ports):
+    phase = jnp.mod(ports.since, PUSH_EVERY)
+    which = jnp.where(phase == 0, jax.random.randint(key, (), 0, directions.shape[0]), memory)
+    blow = jnp.where(phase < PUSH_FOR, severity * newton, 0.0)
+    return which, {"force": ports.model.force + blow * directions[which] @ onto}
+  return fault("push", env, ("force",), ("trunk",), act, jnp.int32(0))
+
+
+CONTACT = {"friction": friction, "slope": slope, "wind": wind, "push": push}

@@ -1,0 +1,117 @@
+"""Faults of what the robot senses. They act where an observation arrives: the agent, its replay and the monitor see the same faulty one.
+
+`scale` of a channel is spec.obs[i].scale, its typical deviation on the healthy robot [unit of the channel]. A target is a group of channels, all, or
+one channel; a target that is not named is drawn from the groups. Where a fault remembers, an episode's start fills its memory anew.
+"""
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from mjx_cl.errors import UserError
+from mjx_cl.faults.base import Fault, channel_targets, fault
+
+MOST_DELAY = 9        # control steps at severity 1
+DRIFT_STEPS = 2000    # control steps until a drift is complete
+
+
+def _sensor(name, env, change, memory=(), not_monotone=""):
+  """A fault of the observation alone; change(memory, severity, key, ports, scale) -> (memory', obs')."""
+  names, mask, single = channel_targets(env)
+  scale = jnp.asarray([v.scale for v in env.spec.obs], jnp.float32)
+
+  def act(target, memory, severity, key, ports):
+    memory, value = change(memory, severity, key, ports, scale)
+    return memory, {"obs": jnp.where(mask[target], value, ports.obs)}
+  return fault(name, env, ("obs",), names, act, memory, single, not_monotone)
+
+
+def bias(env) -> Fault:
+  """A constant is added to a reading.   x_i' = x_i + 2 severity scale_i
+
+  Severity: 1 is two typical deviations [unit of the channel]. Owns `obs`.
+  """
+  return _sensor("bias", env, lambda m, severity, key, ports, scale: (m, ports.obs + 2.0 * severity * scale))
+
+
+def drift(env) -> Fault:
+  """A reading wanders off in a straight line.   x_i' = x_i + 2 severity scale_i min(1, (since + 1) / 2,000)
+
+  Severity: 1 ends two typical deviations off, 2,000 control steps after the onset. Owns `obs`.
+  """
+  def change(m, severity, key, ports, scale):
+    share = jnp.clip((ports.since + 1) / DRIFT_STEPS, 0.0, 1.0)
+    return m, ports.obs + 2.0 * severity * scale * share
+  return _sensor("drift", env, change)
+
+
+def scale(env) -> Fault:
+  """A sensor's gain falls.   x_i' = x_i (1 - 0.9 severity)
+
+  Severity: 1 leaves a tenth of the reading. Owns `obs`. Not visible to: a channel that reads 0.
+  """
+  return _sensor("scale", env, lambda m, severity, key, ports, _: (m, ports.obs * (1.0 - 0.9 * severity)))
+
+
+def noise(env) -> Fault:
+  """Gaussian noise on a reading.   x_i' = x_i + n,  n ~ N(0, (severity scale_i)^2)
+
+  Severity: standard deviation [typical deviations]; realworldrl_suite's levels are 0.1, 0.3, 1.0 in raw units. Owns `obs`. Source: facts 4.5.
+  """
+  return _sensor("noise", env, lambda m, severity, key, ports, scale: (m, ports.obs + severity * scale * jax.random.normal(key, scale.shape)))
+
+
+def dropout(env) -> Fault:
+  """A reading is lost now and then: 0 in its place.   P(x_i' = 0) = 0.5 severity, each channel and step alone
+
+  Severity: 1 loses every other reading [probability]; realworldrl_suite has 0.01, 0.05, 0.1. Owns `obs`. Not visible to: a channel that
+  reads 0. Source: facts 4.5.
+  """
+  return _sensor("dropout", env, lambda m, severity, key, ports, _: (
+      m, jnp.where(jax.random.uniform(key, ports.obs.shape) < 0.5 * severity, 0.0, ports.obs)))
+
+
+def freeze(env) -> Fault:
+  """A reading stands still: it is not renewed.   P(x_i'(t) = x_i'(t - 1)) = severity, each channel and step alone
+
+  Severity: probability that a reading is held for another step; 1 holds it for ever. Owns `obs`. Memory: the last reading; an episode's
+  start renews it. Not visible to: a channel that does not change. Source: stuck sensors of realworldrl_suite, facts 4.5.
+  """
+  def change(held, severity, key, ports, _):
+    hold = (jax.random.uniform(key, ports.obs.shape) < severity) & ~jnp.asarray(ports.first)
+    value = jnp.where(hold, held, ports.obs)
+    return value, value
+  return _sensor("freeze", env, change, jnp.zeros(len(env.spec.obs)))
+
+
+def delay(env) -> Fault:
+  """A reading arrives late.   x_i'(t) = x_i(t - d),  d = ceil(9 severity) control steps
+
+  Severity: 1/3, 2/3, 1 are the 3, 6, 9 steps of realworldrl_suite's easy, medium, hard. Owns `obs`. Memory: the last 9 readings; an
+  episode's start fills it with its first reading. Source: facts 4.5.
+  """
+  def change(line, severity, key, ports, _):
+    line = jnp.where(ports.first, jnp.broadcast_to(ports.obs, line.shape), jnp.concatenate([ports.obs[None], line[:-1]]))
+    return line, line[jnp.ceil(MOST_DELAY * severity).astype(jnp.int32)]
+  return _sensor("delay", env, change, jnp.zeros((MOST_DELAY + 1, len(env.spec.obs))), "an older reading may be nearer to the present one")
+
+
+def lidar_loss(env) -> Fault:
+  """Beams of a sector return nothing: they read the greatest range.   x_i' = high_i for the first ceil(severity n) of the sector's n beams
+
+  Severity: share of the sector that is blind [1]; 1 is all of it. Target: a group of beams. Owns `obs`. Not visible to: beams that see no wall.
+  """
+  beams = [(name, index) for name, index in env.spec.obs_groups if name.startswith("lidar")]
+  if not beams:
+    raise UserError(f"fault 'lidar_loss' needs a lidar, which robot {env.spec.name!r} does not have")
+  size = len(env.spec.obs)
+  mask = jnp.asarray([[i in hit for i in range(size)] for _, hit in beams])
+  rank = jnp.asarray([[hit.index(i) / len(hit) if i in hit else 2.0 for i in range(size)] for _, hit in beams])  # place in the sector
+  high = jnp.asarray([v.high if v.high < 1e9 else 0.0 for v in env.spec.obs], jnp.float32)
+
+  def act(target, memory, severity, key, ports):
+    return memory, {"obs": jnp.where(mask[target] & (rank[target] < severity), high, ports.obs)}
+  return fault("lidar_loss", env, ("obs",), [name for name, _ in beams], act)
+
+
+SENSOR = {"bias": bias, "drift": drift, "scale": scale, "noise": noise, "dropout": dropout, "freeze": freeze, "delay": delay, "lidar_loss": lidar_loss}

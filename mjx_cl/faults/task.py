@@ -1,0 +1,35 @@
+"""Changes of the task itself: what is rewarded, what is asked for."""
+from __future__ import annotations
+
+import jax.numpy as jnp
+
+from mjx_cl.errors import UserError
+from mjx_cl.faults.base import Fault, fault
+
+
+def reward_weight(env) -> Fault:
+  """One term of the reward loses its weight.   w_k' = w_k (1 - severity)
+
+  Severity: lost share [1]. Target: a term of the reward (env.reward_terms). Owns `task.reward_weights`. Not visible to: the observation.
+  """
+  terms = getattr(env, "reward_terms", ())
+  if not terms:
+    raise UserError(f"fault 'reward_weight' needs a reward of weighted terms, which robot {env.spec.name!r} does not have")
+
+  def act(target, memory, severity, key, ports):
+    value = ports.model.task["reward_weights"]
+    return memory, {"task.reward_weights": jnp.where(jnp.arange(value.shape[0]) == target, value * (1.0 - severity), value)}
+  return fault("reward_weight", env, ("task.reward_weights",), terms, act)
+
+
+def command_range(env) -> Fault:
+  """More is asked for: commands (or the speed to reach) leave the range of the training.   range' = range (1 + severity)
+
+  Severity: 1 doubles it [m/s, rad/s]. Target: command. Owns `task.command_range`.
+  """
+  def act(target, memory, severity, key, ports):
+    return memory, {"task.command_range": ports.model.task["command_range"] * (1.0 + severity)}
+  return fault("command_range", env, ("task.command_range",), ("command",), act)
+
+
+TASK = {"reward_weight": reward_weight, "command_range": command_range}
