@@ -209,14 +209,16 @@ def load_csv(path) -> Track:
     if min(rows[-1][2:]) <= 0 or sum(rows[-1][2:]) < MIN_WIDTH:
       raise FileError(f"track {path}, line {number}: too narrow, {sum(rows[-1][2:]):g} m; at least {MIN_WIDTH} m, with the centre line inside")
   table = np.array(rows).reshape(-1, 4)
-  table = table[np.linalg.norm(table[:, :2] - np.roll(table[:, :2], 1, 0), axis=1) > 1e-6]  # a repeated point, the first as the last included
+  table = table[np.linalg.norm(table[:, :2] - np.roll(table[:, :2], -1, 0), axis=1) > 1e-6]  # a repeated point, the first as the last included
   if len(table) < MIN_POINTS:
     raise FileError(f"track {path}: {len(table)} different points, at least {MIN_POINTS} are needed")
   gap = np.linalg.norm(np.roll(table[:, :2], -1, 0) - table[:, :2], axis=1)
   if gap[-1] > GAP * np.median(gap):
     raise FileError(f"track {path}: not closed, {gap[-1]:.2f} m from the last point to the first, {np.median(gap):.2f} m between others")
+  if _crossing(table[:, :2]):
+    raise FileError(f"track {path}: the centre line crosses itself")
   track = build(path.stem, table[:, :2], table[:, 2], table[:, 3])
-  wrong = "the centre line crosses itself" if _crossing(table[:, :2]) else check(track)
+  wrong = check(track)
   if wrong:
     raise FileError(f"track {path}: {wrong}")
   return track
