@@ -121,6 +121,42 @@ class Plot:
 
 
 @dataclass(frozen=True)
+class Render:
+  """A moving picture of an agent at work: GIF, or MP4 with mjx-cl[video]; red border while a fault acts."""
+  env: Positional[str]
+  """Robot, see `mjx-cl list envs`."""
+  out: str | None = None
+  """File that ends in .gif or .mp4; default: ENV.gif."""
+  agent: str | None = None
+  """Trained agent: shipped name or folder; `none` stands still, `random` moves at random."""
+  fault: str = "none"
+  """Fault, see `mjx-cl list faults`."""
+  target: str = "random"
+  """Joint or part that the fault hits."""
+  severity: float = 0.5
+  """In [0, 1]."""
+  onset: int = 200
+  """First control step that the fault acts in."""
+  duration: int | None = None
+  """Control steps until the fault is repaired; default: never."""
+  steps: int = 400
+  """Control steps in all."""
+  seed: int = 0
+  width: int = 480
+  """Pixels."""
+  height: int = 360
+  """Pixels."""
+  fps: float = 20.0
+  """Pictures per second, at the robot's own pace."""
+  view: str = "auto"
+  """robot (MuJoCo), top (a car on its track, with its lidar) or auto."""
+  physics: str = "auto"
+  deterministic: bool = False
+  """Act by the policy's mean instead of a sample."""
+  json: bool = False
+
+
+@dataclass(frozen=True)
 class Query:
   """SQL over a run's files: trace, events, runs are views."""
   folder: Positional[str]
@@ -143,7 +179,7 @@ class Doctor:
 
 
 Command = (Annotated[Run, tyro.conf.subcommand("run")] | Annotated[Train, tyro.conf.subcommand("train")] | Annotated[Eval, tyro.conf.subcommand("eval")]
-           | Annotated[Plot, tyro.conf.subcommand("plot")] | Annotated[Query, tyro.conf.subcommand("query")]
+           | Annotated[Plot, tyro.conf.subcommand("plot")] | Annotated[Render, tyro.conf.subcommand("render")] | Annotated[Query, tyro.conf.subcommand("query")]
            | Annotated[List, tyro.conf.subcommand("list")] | Annotated[Doctor, tyro.conf.subcommand("doctor")])
 
 
@@ -347,6 +383,27 @@ def do_plot(args: Plot) -> None:
   print(plots.figure(args.folder))
 
 
+def do_render(args: Render) -> None:
+  from mjx_cl import adapters, agents, envs, render
+  out = args.out or f"{args.env}.gif"
+  render.check(out, args.steps, args.width, args.height, args.fps, args.seed)
+  env = envs.make(args.env, args.physics)
+  acting = {"seed": args.seed, "deterministic": args.deterministic, "severity": args.severity, "onset": args.onset, "duration": args.duration}
+  if args.agent in ("none", "random"):
+    acting["agent"] = adapters.Puppet(len(env.spec.act), float(args.agent == "random"))
+  elif args.agent is None and args.env not in agents.shipped():
+    raise UserError(f"no agent is shipped for {args.env}; give a folder, or --agent none (stands still), --agent random")
+  else:
+    trained = agents.load(args.agent, args.env, len(env.spec.obs), len(env.spec.act))
+    acting |= {"agent": trained.agent, "params": trained.train.params, "repeat": int(trained.card.get("repeat", 1))}
+  result = render.render(env, out, args.steps, args.width, args.height, args.fps, args.fault, args.target, view=args.view,
+                         say=lambda text: say(f"mjx-cl: {text}"), **acting)
+  if args.json:
+    emit({"env": args.env, "agent": args.agent or args.env, "fault": args.fault, **result})
+  else:
+    print(f"{result['file']}: {result['frames']} pictures, {result['fps']:g} a second, drawn by {result['drawn_by']}")
+
+
 def do_query(args: Query) -> None:
   from mjx_cl import store
   names, rows = store.query(args.folder, args.sql)
@@ -387,7 +444,7 @@ def do_doctor(args: Doctor) -> None:
       print(f"{name:16s} {value if not isinstance(value, dict) else ', '.join(f'{k} {v}' for k, v in value.items())}")
 
 
-DO = {Run: do_run, Train: do_train, Eval: do_eval, Plot: do_plot, Query: do_query, List: do_list, Doctor: do_doctor}
+DO = {Run: do_run, Train: do_train, Eval: do_eval, Plot: do_plot, Render: do_render, Query: do_query, List: do_list, Doctor: do_doctor}
 
 
 def parse(argv: list[str] | None):

@@ -1,7 +1,7 @@
 """A model-free policy that shows the way: brax PPO on this package's environments.
 
-Used by the `cpu` preset alone (the agent's card names it); `paper` does without. `BraxEnv` adapts one of our environments to
-`brax.envs.Env`. The trained policy is kept as a plain .npz of its layers, so that using one needs no brax.
+Used by the `cpu` preset alone (the agent's card names it); `paper` does without. The trained policy is kept as a plain .npz of its layers, so
+that using one needs no brax.
 """
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_cl.errors import FileError, UserError
+from mjx_cl.adapters import brax_env
+from mjx_cl.errors import FileError
 
 
 class Policy(NamedTuple):
@@ -61,40 +62,6 @@ def load(path: str | os.PathLike) -> Policy:
       return Policy(jnp.asarray(z["mean"]), jnp.asarray(z["std"]), layers)
   except (OSError, KeyError, ValueError, zipfile.BadZipFile) as e:
     raise FileError(f"cannot read demonstrator {path}: {e}") from None
-
-
-def brax_env(env):
-  """Our environment as a `brax.envs.Env` on the nominal model.
-
-  brax's own wrappers do the vmap, the time limit and the autoreset; its autoreset restarts every robot from its own first state.
-  """
-  try:
-    from brax.envs import base
-  except ImportError:
-    raise UserError("the demonstrator needs brax: pip install 'mjx-cl[brax]'") from None
-
-  class BraxEnv(base.Env):
-    def reset(self, rng):
-      state, obs = env.init(env.model, rng)
-      zero = jnp.float32(0)
-      return base.State(state, obs, zero, zero, {})
-
-    def step(self, state, action):
-      inner, out = env.step(env.model, state.pipeline_state, action)
-      return state.replace(pipeline_state=inner, obs=out.final_obs, reward=out.reward, done=out.terminated.astype(jnp.float32))
-
-    @property
-    def observation_size(self):
-      return len(env.spec.obs)
-
-    @property
-    def action_size(self):
-      return len(env.spec.act)
-
-    @property
-    def backend(self):
-      return "mjx_cl"
-  return BraxEnv()
 
 
 def _to_policy(params) -> Policy:
