@@ -35,14 +35,16 @@ def pieces(track):
 
 
 def brute_scan(track, angles, x, y, yaw, most):
-  """Nearest crossing of each ray with any wall piece, by solving o + t d = a + u (b - a) for t and u."""
+  """Nearest crossing of each ray with any wall piece, by solving o + t d = a + u (b - a) for t and u: ranges, and cells of the pieces (-1: none)."""
   a, b = pieces(track)
-  ranges = []
+  ranges, cells = [], []
   for angle in np.float64(yaw) + angles:
     matrix = np.stack([np.broadcast_to([np.cos(angle), np.sin(angle)], a.shape), a - b], -1)
     t, u = np.linalg.solve(matrix, (a - [np.float64(x), np.float64(y)])[..., None])[..., 0].T
-    ranges.append(min([most, *t[(t >= 0) & (u >= 0) & (u <= 1)]]))
-  return ranges
+    t = np.where((t >= 0) & (u >= 0) & (u <= 1), t, np.inf)
+    ranges.append(min(most, t.min()))
+    cells.append(t.argmin() % len(track.left) if t.min() < most else -1)
+  return ranges, cells
 
 
 def brute_contact(track, x, y, yaw):
@@ -174,12 +176,29 @@ def test_broken_files_are_refused_in_one_line(tmp_path, lines, want):
 def test_lidar_equals_brute_force_over_all_walls(course):
   at = poses(course, 150)
   got = np.asarray(jax.jit(jax.vmap(course.scan))(*at))
-  want = np.array([brute_scan(course.tracks[k], course.angles, x, y, yaw, course.max_range) for k, x, y, yaw in zip(*at)])
-  # Walls seen at a grazing angle: a place known to 1e-6 m (float32 at 10 m) moves the reading by 1e-6 m / sin(angle). Measured: 2.9e-4.
+  want = np.array([brute_scan(course.tracks[k], course.angles, x, y, yaw, course.max_range)[0] for k, x, y, yaw in zip(*at)])
+  # Walls seen at a grazing angle: a place known to 1e-6 m (float32 at 10 m) moves the reading by 1e-6 m / sin(angle). Measured: 1e-4 to 3e-4.
   np.testing.assert_allclose(got, want, atol=2e-3)
   assert np.median(np.abs(got - want)) < 1e-5
   assert course.window < min(len(t.centre) for t in course.tracks)  # it did not look at every wall
   assert (want == 10).any() and want.min() < 0.1 and 1.0 < want.mean() < 5.0
+
+
+def test_reach_holds_every_cell_that_is_seen_and_few_others(course):
+  """The windows are no wider than needed: on every track some ray ends within 4 cells of the end of its cell's window, either way."""
+  rng, spare = np.random.default_rng(4), []
+  for k, track in enumerate(course.tracks):
+    first, count = lib.reach(track, course.max_range)
+    num = len(track.centre)
+    least = np.full(2, num)
+    for i in rng.integers(num, size=60):
+      x, y = (track.centre[i] + track.centre[(i + 1) % num]) / 2 + rng.uniform(-0.7, 0.7) * (track.left[i] - track.centre[i])
+      _, cells = brute_scan(track, np.linspace(-np.pi, np.pi, 90), x, y, 0.0, course.max_range)
+      place = (np.array(cells)[np.array(cells) >= 0] - first[i]) % num
+      assert place.max() < count[i], (track.name, i)
+      least = np.minimum(least, [place.min(), count[i] - 1 - place.max()])
+    spare.append(least)
+  assert np.max(spare) <= 4, spare
 
 
 def test_lidar_on_a_ring_by_hand():
