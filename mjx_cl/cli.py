@@ -85,7 +85,7 @@ class Train:
   preset: str = "cpu"
   """Learner and schedule, see `mjx-cl list presets`."""
   demonstrator: str | None = None
-  """A policy's .npz, or `ppo`: train one first with brax (needs mjx-cl[brax]); default: none."""
+  """A policy's .npz, `reference`: the robot's own driver (car), or `ppo`: train one first with brax (needs mjx-cl[brax]); default: none."""
   agent: str | None = None
   """Start from this agent's weights, moments and counters; the replay is filled by acting."""
   set: tuple[str, ...] = ()
@@ -299,10 +299,10 @@ def do_train(args: Train) -> None:
   dreamer = replace(preset.dreamer, **rest)
   if args.seeds < 1:
     raise UserError(f"seeds must be above 0; got {args.seeds}")
-  from mjx_cl import agents, demonstrator, envs, run, store, train
+  from mjx_cl import agents, envs, run, store, train
   env = envs.make(args.env, args.physics)
   if args.demonstrator not in (None, "ppo"):  # whatever can be refused is refused before an earlier training is touched
-    demonstrator.load(args.demonstrator)
+    train.expert(env, args.demonstrator)
   if args.agent:
     agents.load(args.agent, args.env, len(env.spec.obs), len(env.spec.act))
   state = store.claim_folder(args.out, args.resume, args.overwrite, done_marker="agent/card.json")
@@ -421,7 +421,7 @@ def do_query(args: Query) -> None:
 def do_list(args: List) -> None:
   from mjx_cl import agents, detectors, envs, faults, memory
   first = lambda f: (f.__doc__ or "").strip().split("\n")[0]
-  tables = {"envs": {k: first(v) for k, v in envs.ENVS.items()}, "faults": {k: first(v) for k, v in faults.FAULTS.items()},
+  tables = {"envs": {k: first(v) for k, v in envs.ENVS.items()}, "faults": {k: faults.about(k) for k in faults.FAULTS},
             "detectors": {k: first(v) for k, v in detectors.DETECTORS.items()}, "presets": {k: p.about for k, p in PRESETS.items()},
             "agents": {k: "shipped" for k in agents.shipped()}, "arms": ARMS, "sizes": memory.table()}
   chosen = tables if args.what == "all" else {args.what: choose("list", args.what, tables)}

@@ -81,7 +81,7 @@ class TrainConfig:
     capacity: records kept per robot.
     repeat: control steps for which an action is held.
     lr_end: learning rate at the last update, reached linearly over the last `pure` updates (None: constant).
-    demonstrator: path of a demonstrator policy, or None.
+    demonstrator: path of a demonstrator policy, `reference` (the robot's own driver that knows its state), or None.
     demo_share: share of the robots that the demonstrator drives until the pure phase.
     demo_noise: deviation of the noise on the demonstrator's actions.
     clone: at most so many updates with cloning alone (the policy's own gradient off).

@@ -90,7 +90,7 @@ class Rollout:
     env, agent, fault: what is joined; `fault` may be a tuple.
     repeat: control steps per decision.
     deterministic: the policy's mean instead of a sample.
-    expert: a demonstrator, obs -> action, or None.
+    expert: a demonstrator, Stream -> action, or None.
     expert_noise: deviation of the noise on its actions.
   """
 
@@ -106,7 +106,7 @@ class Rollout:
     carry, action = self.agent.act(params, stream.agent, stream.obs, key_act, self.deterministic)
     demo, has_demo = jnp.zeros_like(action), jnp.bool_(False)
     if self.expert is not None:
-      demo, has_demo = self.expert(stream.obs), jnp.bool_(True)
+      demo, has_demo = self.expert(stream), jnp.bool_(True)
       noisy = demo + self.expert_noise * jax.random.normal(key_expert, demo.shape)
       action = jnp.where(drive, noisy, action)
       carry = carry._replace(action=action)

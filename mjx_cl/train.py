@@ -76,6 +76,16 @@ def seeds_mesh(seeds: int):
   return jax.sharding.Mesh(np.asarray(devices[:count]), ("seeds",)) if count > 1 else None
 
 
+def expert(env, name: str):
+  """A demonstrator, Stream -> action: `reference`, the environment's own driver that knows its state, or a policy's .npz."""
+  if name == "reference":
+    if not hasattr(env, "reference"):
+      raise UserError(f"robot {env.spec.name!r} has no reference driver; give a policy's .npz or `ppo`")
+    return lambda stream: env.reference(stream.env)
+  policy = demonstrator.load(name)
+  return lambda stream: policy(stream.obs)
+
+
 class Returns:
   """Returns of finished episodes, per stream, from chunks of rewards."""
 
@@ -105,7 +115,7 @@ class Trainer:
   def __init__(self, env, dreamer: DreamerConfig, config: TrainConfig, out, seed: int = 0, seeds: int = 1):
     self.env, self.dreamer, self.config, self.out = env, dreamer, config, pathlib.Path(out)
     self.seeds = seeds
-    self.expert = demonstrator.load(config.demonstrator) if config.demonstrator else None
+    self.expert = expert(env, config.demonstrator) if config.demonstrator else None
     self.expert_return = 0.0
     self.phase = "clone" if self.expert else "pure"
     self.phase_start = 0

@@ -109,7 +109,7 @@ def test_query(mjx, refused, tmp_path):
 
 RUN = {
     "environment": (["run", "wlker"], ["wlker", "walker"]),
-    "fault": (["run", "walker", "--fault", "geer"], ["geer", "gear, none"]),
+    "fault": (["run", "walker", "--fault", "geer"], ["geer", "gear, joint_damping"]),
     "target": (["run", "walker", "--target", "left_elbow"], ["left_elbow", "left_knee", "random"]),
     "target of no fault": (["run", "walker", "--fault", "none", "--target", "left_knee"], ["left_knee"]),
     "detector": (["run", "walker", "--detector", "cusum"], ["cusum", "rolling_sigma, rolling_sigma_plain"]),

@@ -86,7 +86,9 @@ def test_spec(env, walker):
   index, least = spec.posture
   assert spec.obs[index].name == "height" and 0.3 < least < 1.2  # between lying and standing [m]
   assert 0 < spec.acceptance < 1
-  assert set(env.model.mj) == {"actuator_gear"} and env.model.task == {}
+  for name, value in env.model.mj.items():
+    np.testing.assert_array_equal(value, np.asarray(walker.opt.gravity if name == "gravity" else getattr(walker, name), np.float32))
+  assert set(env.model.task) == {"reward_weights", "command_range"} and env.model.force.shape == (9,)
   np.testing.assert_array_equal(env.model.mj["actuator_gear"], walker.actuator_gear)
 
 

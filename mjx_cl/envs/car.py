@@ -238,6 +238,10 @@ class Car:
     m = state.physics.motion
     return state.physics.track, m.x, m.y, m.yaw, m.vx
 
+  def reference(self, state: EnvState) -> jax.Array:
+    """Action (2,) of the reference driver, which knows where the car is."""
+    return pure_pursuit(self, state)
+
   def _observe(self, model, motion, track, key):
     ranges = self.course.scan(track, motion.x, motion.y, motion.yaw)
     return observe(self.course, ranges, motion.vx, motion.yaw_rate, motion.steer, model.task["noise"], key)

@@ -21,7 +21,8 @@ from mjx_cl.errors import choose
 from mjx_cl.types import EnvState, Model, Step
 
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
-RADIUS, TRACK = 0.05, 0.25       # of a wheel, between left and right wheels [m]
+RADIUS = 0.0492                  # of a wheel under load [m]: 0.05 less half of what tyre and floor give way
+TRACK = 0.25                     # between left and right wheels [m]
 WHEEL_INERTIA = 0.00015          # of a wheel about its axle [kg m2]
 STEER_DAMPING = 0.5              # of the steering hinges [N m s/rad]; with a servo torque of as much per rad/s they turn at the rate asked for
 INERTIAL_MASS = car.MASS + 4 * WHEEL_INERTIA / RADIUS ** 2  # what the motor accelerates, spinning wheels included: 3.98 [kg]
@@ -68,9 +69,8 @@ def load_model() -> mujoco.MjModel:
 def widen(model: Model, name: str, share, wheels: tuple[int, ...]) -> Model:
   """The model with gap item `name` moved by `share` of its gap: from a simulator's value to the real one for 1, and on beyond it.
 
-    task leaf, friction: x + share (real - simulator)
-    mass: body_mass (1 + share (real / simulator - 1)), every body
-    yaw_inertia: body_inertia of the chassis about the vertical + share (real - simulator), since the item is the whole car's
+    acceleration, grip, mass: x (real / simulator)^share             mass: of every body; grip: friction of the wheels
+    the others:               x + share (real - simulator)           yaw_inertia: all of it in the chassis
 
   Share 0 leaves every bit. A fault of the same item is this function of its severity; constants that follow from masses are the backend's business.
 
@@ -80,15 +80,16 @@ def widen(model: Model, name: str, share, wheels: tuple[int, ...]) -> Model:
   item = choose("gap item", name, GAP)
   where, leaf = item.leaf.split(".")
   table = getattr(model, where)
-  value, gap = table[leaf], share * (item.real - item.simulator)
-  if name == "mass":
-    value = value * (1.0 + gap / item.simulator)
+  value, more = table[leaf], share * (item.real - item.simulator)
+  less = jnp.exp(share * np.log(np.float32(max(item.real, 1e-6) / max(item.simulator, 1e-6))))
+  if name == "grip":
+    value = value.at[jnp.asarray(wheels), 0].multiply(less)
+  elif name in ("acceleration", "mass"):
+    value = value * less
   elif name == "yaw_inertia":
-    value = value.at[1, 2].add(gap)
-  elif name == "grip":
-    value = value.at[jnp.asarray(wheels), 0].add(gap)
+    value = value.at[1, 2].add(more)
   else:
-    value = value + gap
+    value = value + more
   return model._replace(**{where: table | {leaf: value}})
 
 
@@ -192,7 +193,7 @@ class CarReal:
     mujoco.mj_setConst(self.mj_model, data)
     mujoco.mj_step(self.mj_model, data, 400)  # 2 s: the springs settle
     self._rest = jnp.asarray(data.qpos, jnp.float32)
-    self.model = model
+    self.model, self.gap_items, self.reward_terms = model, GAP, tuple(car.REWARD_TERMS)
     self.physics = physics_lib.make(physics, self.mj_model, SUBSTEPS, law=motor_law(self.mj_model))
     spec = car.spec("car_real", self.course, acceptance=0.5)
     front, rear = self.wheels[:2], self.wheels[2:]
@@ -209,6 +210,10 @@ class CarReal:
     """Privileged: track, x, y [m], yaw [rad] and speed ahead [m/s]."""
     m = state.physics.motion
     return state.physics.track, m.x, m.y, m.yaw, m.vx
+
+  def reference(self, state: EnvState) -> jax.Array:
+    """Action (2,) of the reference driver, which knows where the car is."""
+    return car.pure_pursuit(self, state)
 
   def _observe(self, model, motion, track, key):
     key_lidar, key_own = jax.random.split(key)

@@ -6,6 +6,8 @@ severities, onsets, schedules and targets are arrays, so any mix over a batch of
 from __future__ import annotations
 
 import importlib.metadata
+import inspect
+import re
 
 from mjx_cl.errors import UserError, choose
 from mjx_cl.faults.actuator import ACTUATOR
@@ -36,6 +38,15 @@ _plugins()
 def family(name: str) -> str:
   """Name of the family of fault `name`."""
   return next((f for f, members in FAMILIES.items() if name in members), "none")
+
+
+def about(name: str) -> str:
+  """One line on fault `name` from its docstring: family, what happens, what severity means, what it owns."""
+  text = inspect.getdoc(FAULTS[name]) or ""
+  part = lambda word: next(iter(re.findall(rf"{word}:? (.*?)\.(?: [A-Z]|\n|$)", " ".join(text.split("\n\n")[-1].split()))), "")
+  lines = [f"{family(name)}: {text.split(chr(10))[0]}"]
+  lines += [f"severity: {part('Severity')}"] * bool(part("Severity")) + [f"target: {part('Target')}"] * bool(part("Target"))
+  return "; ".join(lines)
 
 
 def make(name: str, env) -> Fault:

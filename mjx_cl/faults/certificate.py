@@ -16,6 +16,7 @@ from mjx_cl.faults import schedule
 SEVERITIES = (0.0, 0.25, 0.5, 0.75, 1.0)
 AFTER = (1, 10, 100)  # control steps at which the size of the difference is reported
 ROUNDING = 1e-4       # largest relative difference of the same nominal robot in two programs: XLA folds constants, which shifts last bits
+WIDTH = 64            # lanes at a time: XLA cuts a wide batch into shares and their rests, which scalar code computes with other last bits
 SLACK = 0.9           # a difference counts as not smaller from this share of the one before on
 
 
@@ -129,16 +130,34 @@ def certify(env, faults: dict[str, faults_lib.Fault] | None = None, severities=S
     faults = {k: f for k, f in faults_lib.available(env).items() if k != "none"}
   chosen = lanes(faults, severities) if chosen is None else chosen
   nominal = Lane(next(iter(faults)), next(iter(faults.values())).targets[0], 0.0)
-  plan, target = plans(faults, chosen + [nominal], onset)
   run = program(env, tuple(faults.values()))
   model = faults_lib.owned_model(tuple(faults.values()), env.model)
-  rows, plain = jax.tree.map(np.asarray, run(model, jax.random.key(seed), plan, target, jnp.asarray(actions(env, steps, seed))))
-  return compare(env, faults, chosen, rows, plain, onset)
+  signal = jnp.asarray(actions(env, steps, seed))
+  out = []
+  for part in parts(chosen):
+    plan, target = plans(faults, part + [nominal] * (WIDTH - len(part)), onset)
+    rows, plain = jax.tree.map(np.asarray, run(model, jax.random.key(seed), plan, target, signal))
+    found = compare(env, faults, part, rows, plain, onset)
+    out += found[1:] if out else found
+  return out
+
+
+def parts(chosen: list[Lane]) -> list[list[Lane]]:
+  """Lanes in batches that leave room for the nominal robot; a fault's lanes stay together, as far as they fit."""
+  out: list[list[Lane]] = [[]]
+  for name in dict.fromkeys(lane.fault for lane in chosen):
+    mine = [lane for lane in chosen if lane.fault == name]
+    for i in range(0, len(mine), WIDTH - 1):
+      batch = mine[i:i + WIDTH - 1]
+      if len(out[-1]) + len(batch) > WIDTH - 1:
+        out.append([])
+      out[-1] += batch
+  return out
 
 
 def compare(env, faults, chosen, rows, plain, onset) -> list[Certificate]:
   """Rows of the lanes, the last of which is the nominal robot, against that one; it is held against the program without faults."""
-  obs, reward, terminated = (x[:-1] for x in rows)
+  obs, reward, terminated = (x[:len(chosen)] for x in rows)
   rounding = max(float(np.max(np.abs(rows[k][-1] - plain[k]) / (1.0 + np.abs(plain[k])))) for k in (0, 1))
   plain = tuple(x[-1] for x in rows)
   scale = np.asarray([v.scale for v in env.spec.obs])

@@ -5,33 +5,29 @@ import jax.numpy as jnp
 
 from mjx_cl.errors import UserError
 from mjx_cl.faults.base import Fault, fault
+from mjx_cl.types import Model
 
 
 def gap(env) -> Fault:
-  """One item of the gap between simulator and car, or all of them, appears or grows.
+  """One item of the gap between simulator and car, or all of them, appears or grows (env.widen).
 
     x' = x + severity (x_real - x_simulator)
 
   Severity: 1 adds the whole difference of the item [its unit, see envs.car_real.GAP]: where the item is switched off it is then there in full, where it
-  is on it is doubled. Target: an item, or all. Owns the task leaves of the items.
+  is on it is doubled. Target: an item, or all. Owns the leaves of the items. Source: named with each item.
   """
   items = getattr(env, "gap_items", None)
   if not items:
     raise UserError(f"fault 'gap' needs a robot with a reality gap (car_real), which {env.spec.name!r} is not")
-  leaves = tuple(sorted({f"task.{item.leaf}" for item in items}))
-  names = tuple(item.name for item in items) + ("all",)
+  leaves = tuple(sorted({item.leaf for item in items.values()}))
 
   def act(target, memory, severity, key, ports):
-    values = {}
-    for leaf in leaves:
-      value = ports.model.task[leaf[5:]]
-      for i, item in enumerate(items):
-        if f"task.{item.leaf}" == leaf:
-          change = severity * jnp.asarray(item.real - item.simulator, jnp.float32)
-          value = jnp.where((target == i) | (target == len(items)), value + change, value)
-      values[leaf] = value
-    return memory, values
-  return fault("gap", env, leaves, names, act, drawn=len(items))
+    model = Model(dict(ports.model.mj), dict(ports.model.task), ports.model.force)
+    for i, name in enumerate(items):
+      model = env.widen(model, name, jnp.where((target == i) | (target == len(items)), severity, 0.0))
+    value = lambda leaf: getattr(model, leaf.split(".")[0])[leaf.split(".")[1]]
+    return memory, {leaf: value(leaf) for leaf in leaves}
+  return fault("gap", env, leaves, tuple(items) + ("all",), act, drawn=len(items))
 
 
 TRANSFER = {"gap": gap}

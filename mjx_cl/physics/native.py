@@ -80,7 +80,7 @@ class Native:
     task = {} if self.law is None else dict(task or {})
     return jax.pure_callback(self._host_step, result, fields, state, ctrl, task, force, vmap_method="broadcast_all")
 
-  def _host_step(self, fields, state, ctrl, task, force):
+  def _host_step(self, fields, state, ctrl, task=None, force=None):
     begin = time.perf_counter()
     state = np.asarray(state)
     lead, width = state.shape[:-1], state.shape[-1]
@@ -97,7 +97,7 @@ class Native:
         views["ctrl"][...] = flat(ctrl)
         batch.step(nstep=self.substeps)
       else:
-        task, ctrl = {k: flat(v) for k, v in task.items()}, flat(ctrl)
+        task, ctrl = {k: flat(v) for k, v in (task or {}).items()}, flat(ctrl)
         qpos, qvel = views["qpos"], views["qvel"]
         for k in range(self.substeps):
           views["ctrl"][...] = self.law(np, task, ctrl, qpos, qvel)
