@@ -24,6 +24,7 @@ WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 RADIUS = 0.0492                  # of a wheel under load [m]: 0.05 less half of what tyre and floor give way
 TRACK = 0.25                     # between left and right wheels [m]
 WHEEL_INERTIA = 0.00015          # of a wheel about its axle [kg m2]
+SHAFT = 0.01                     # torque on a wheel per difference of its axle's speed from the mean of both [N m s/rad]
 STEER_DAMPING = 0.5              # of the steering hinges [N m s/rad]; with a servo torque of as much per rad/s they turn at the rate asked for
 INERTIAL_MASS = car.MASS + 4 * WHEEL_INERTIA / RADIUS ** 2  # what the motor accelerates, spinning wheels included: 3.98 [kg]
 SUBSTEPS = 10                    # physics steps of 0.005 s in a control step of 0.05 s
@@ -112,25 +113,28 @@ def middle(left, right) -> jax.Array:
 def motor_law(mj_model: mujoco.MjModel):
   """Motor law of the vehicle: ctrl (..., 2) = steering angle [rad], speed [m/s] -> torques of 2 steering and 4 wheel motors [N m].
 
-    steering, per wheel: rate = clip((goal - angle) / max(lag, 0.01 s), -3.2, 3.2),   torque = rate x damping of the hinge
+    steering, per wheel: rate = clip((goal - angle) / max(lag, 0.01 s), -limit_0, limit_0),   torque = rate x damping of the hinge
       goal = ackermann(clip(strength_0 angle_commanded + offset, +-0.4189))
-    motor: a = clip(k (min(speed, limit) - r mean wheel speed), +-a_max),   torque of each wheel = strength_1 m a r / 4
+    motor: a = clip(k (min(speed, limit_1) - r w), +-a_max)                  w = mean speed of the four wheels [rad/s]
+      torque of a wheel = strength_1 m a r / 4 + c (w - w_axle)              c = 0.01 N m s/rad
 
-  k = 4.755 1/s to speed up, 19.02 to brake, as in `car`. The wheels' mean is what a motor behind open differentials measures, so it cannot
-  spin all four away, but one on ice takes its share of the torque with it. `steer_lag_s` is the time constant of the steering angle.
+  k = 4.755 1/s to speed up, 19.02 to brake, and four driven wheels, as in `car`. One shaft turns both axles (the second term, as stiff as the
+  physics step allows); behind it left and right share the torque evenly, so that one wheel on ice takes its share with it. The motor measures
+  its own speed, not the car's. `steer_lag_s` is the time constant of the steering angle.
   """
   angles = [mj_model.joint(n).qposadr[0] for n in ("steering_left", "steering_right")]
   spins = [mj_model.joint(f"spin_{n}").dofadr[0] for n in WHEELS]
 
   def law(xp, task, ctrl, qpos, qvel):
     goal = xp.clip(task["strength"][..., 0] * ctrl[..., 0] + task["steer_offset"], -car.STEER_MAX, car.STEER_MAX)
-    lag = xp.maximum(task["steer_lag_s"], 0.01)[..., None]
-    rate = xp.clip((ackermann(xp, goal) - xp.stack([qpos[..., i] for i in angles], -1)) / lag, -car.STEER_RATE, car.STEER_RATE)
-    speed = RADIUS / 4 * (qvel[..., spins[0]] + qvel[..., spins[1]] + qvel[..., spins[2]] + qvel[..., spins[3]])
-    error = xp.minimum(ctrl[..., 1], task["speed_limit"]) - speed
+    lag, most = xp.maximum(task["steer_lag_s"], 0.01)[..., None], task["velocity_limit"][..., :1]
+    rate = xp.clip((ackermann(xp, goal) - xp.stack([qpos[..., i] for i in angles], -1)) / lag, -most, most)
+    front, rear = (qvel[..., spins[0]] + qvel[..., spins[1]]) / 2, (qvel[..., spins[2]] + qvel[..., spins[3]]) / 2
+    error = xp.minimum(ctrl[..., 1], task["velocity_limit"][..., 1]) - RADIUS * (front + rear) / 2
     accel = xp.clip(xp.where(error > 0, car.GAIN_UP, car.GAIN_DOWN) * error, -task["accel_max"], task["accel_max"])
     torque = INERTIAL_MASS * RADIUS / 4 * task["strength"][..., 1] * accel
-    return xp.concatenate([STEER_DAMPING * rate, xp.stack([torque] * 4, -1)], -1)
+    shaft = SHAFT * (rear - front) / 2
+    return xp.concatenate([STEER_DAMPING * rate, xp.stack([torque + shaft, torque + shaft, torque - shaft, torque - shaft], -1)], -1)
   return law
 
 
@@ -166,9 +170,9 @@ class CarReal:
   """The four-wheel car on the tracks of `car`, with the reality gap switched on by name.
 
   Touching a wall, or tipping over by 60 degrees, terminates; 1,200 control steps of 0.05 s truncate. Reset as in `car`, on settled springs.
-  `Model.task` as in `car` where the name is the same: strength (2,), speed_limit () [m/s], steer_lag_s () [s], noise () [m]; besides
-  accel_max () [m/s2], speed_lag_s () [s], delay () [control steps, 0 to 3, a broken one gives the command's mean over the step], steer_offset ()
-  [rad], speed_noise () [m/s], yaw_rate_noise () [rad/s].
+  `Model.task` as in `car` where the name is the same: strength (2,), velocity_limit (2,) [rad/s, m/s], steer_lag_s () [s], noise () [m],
+  reward_weights (2,); besides accel_max () [m/s2], speed_lag_s () [s], delay () [control steps, 0 to 3; a fraction gives the command's mean over the
+  step], steer_offset () [rad], speed_noise () [m/s], yaw_rate_noise () [rad/s].
 
   Args:
     physics: `auto`, `native` or `mjx`.
@@ -182,7 +186,8 @@ class CarReal:
     self.wheels = tuple(self.mj_model.geom(f"wheel_{n}").id for n in WHEELS)
     leaves = ("body_mass", "body_inertia", "body_ipos", "geom_friction", "dof_damping")
     mj = {name: jnp.asarray(getattr(self.mj_model, name), jnp.float32) for name in leaves}
-    task = dict(strength=[1.0, 1.0], speed_limit=car.SPEED_MAX) | {i.leaf[5:]: i.simulator for i in GAP.values() if i.leaf.startswith("task.")}
+    task = {name: car.nominal()[name] for name in ("strength", "velocity_limit", "reward_weights")}
+    task |= {i.leaf[5:]: i.simulator for i in GAP.values() if i.leaf.startswith("task.")}
     model = Model(mj | {"gravity": jnp.asarray(self.mj_model.opt.gravity, jnp.float32)},
                   {name: jnp.asarray(value, jnp.float32) for name, value in task.items()}, jnp.zeros(self.mj_model.nv))
     for name in gap:
@@ -251,6 +256,7 @@ class CarReal:
     along = car.progress(self.course, last.track, motion.x, motion.y, out["qvel"][0], out["qvel"][1])
     crashed = self.course.collides(last.track, motion.x, motion.y, motion.yaw) | ~(upright > 0.5)
     obs, step = self._observe(model, motion, last.track, key_noise), state.step + 1
+    earned = car.reward(along, crashed, model.task["reward_weights"])
     truncated = ~crashed & (step >= self.spec.episode_steps)
     arrived = CarRealState(backend, motion, last.track, sent[:-1], speed, key)
-    return EnvState(arrived, step), Step(obs, car.reward(along, crashed), crashed, truncated, obs)
+    return EnvState(arrived, step), Step(obs, earned, crashed, truncated, obs)

@@ -1,0 +1,94 @@
+"""Faults by name: the paper's, and realworldrl_suite's levels where they have a figure here. `PRESETS` is the one table; no JAX needed.
+
+A preset is a tuple of changes to one robot. Onsets are counted from the run's own onset, so a later one makes a sequence; equal ones act at once.
+"""
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from mjx_cl.errors import UserError
+
+
+@dataclass(frozen=True)
+class Change:
+  """One fault of a preset.
+
+  Attributes:
+    fault, target: names; target None: drawn from the stream's seed.
+    severity: in [0, 1].
+    after: control steps from the run's onset.
+    duration: control steps, None: never repaired.
+    schedule, period, share: see faults.schedule.
+  """
+  fault: str
+  target: str | None = None
+  severity: float = 0.5
+  after: int = 0
+  duration: int | None = None
+  schedule: str = "abrupt"
+  period: int = 1000
+  share: float = 0.5
+
+
+@dataclass(frozen=True)
+class Preset:
+  """Named changes of one robot, `*` for any.
+
+  Attributes:
+    robot: environment. changes: see Change. becomes: environment that the robot turns into at the onset, None: stays. source: of the figures.
+  """
+  robot: str
+  changes: tuple[Change, ...]
+  about: str
+  source: str
+  becomes: str | None = None
+
+
+THIRD = (1.0 - 1.0 / 3.0) / 0.95       # severity of velocity_limit that leaves a third
+SOCKS = (1.0 - 0.30 / 0.65) / 0.95     # severity of friction that leaves 0.30 of the car's 0.65 under the rear wheels
+LEVELS = {"easy": (1, 0.1, 0.01), "medium": (2, 0.3, 0.05), "hard": (3, 1.0, 0.1)}  # thirds of 9 steps of delay, deviation, probability
+
+PRESETS: dict[str, Preset] = {
+    "walker/gear-half": Preset("walker", (Change("gear", None, 0.5),), "one random joint's gear ratio halved", "the paper, walker"),
+    "quadruped/rh-velocity-third": Preset("quadruped", (Change("velocity_limit", "RH", THIRD),), "right hind leg's velocity limits cut to a third",
+                                          "the paper, ANYmal"),
+    "car/sim-to-real": Preset("car", (), "the simulated car becomes the stand-in for the real one at an episode's end", "the paper, race car", "car_real"),
+    "car/socks": Preset("car_real", (Change("friction", "rear", SOCKS),), "socks on the rear wheels: friction 0.30 in place of 0.65",
+                        "the paper, race car; friction 0.2 to 0.4 is a guess, no figure of a sock was found"),
+}
+for _level, (_thirds, _deviation, _probability) in LEVELS.items():
+  _rwrl = f"realworldrl_suite, level {_level}"
+  PRESETS |= {
+      f"any/observation-delay-{_level}": Preset("*", (Change("delay", "all", _thirds / 3),), f"observations {3 * _thirds} control steps late", _rwrl),
+      f"any/action-delay-{_level}": Preset("*", (Change("command_delay", "all", _thirds / 3),), f"commands {3 * _thirds} control steps late", _rwrl),
+      f"any/observation-noise-{_level}": Preset("*", (Change("noise", "all", _deviation),),
+                                                f"Gaussian noise of {_deviation:g} typical deviations (there: of raw units)", _rwrl),
+      f"any/action-noise-{_level}": Preset("*", (Change("command_noise", "all", _deviation),), f"Gaussian noise of {_deviation:g} on commands", _rwrl),
+      f"any/observation-dropout-{_level}": Preset("*", (Change("dropout", "all", 2 * _probability),), f"readings lost with probability {_probability:g}", _rwrl),
+      f"any/observation-stuck-{_level}": Preset("*", (Change("freeze", "all", _probability),), f"readings held with probability {_probability:g}", _rwrl),
+      f"any/all-{_level}": Preset("*", tuple(Change(f, "all", s) for f, s in (
+          ("delay", _thirds / 3), ("command_delay", _thirds / 3), ("noise", _deviation), ("command_noise", _deviation), ("dropout", 2 * _probability),
+          ("freeze", _probability))), "all of these at once, the suite's combined challenge without its dummy channels and changed lengths", _rwrl),
+  }
+for _level, _damping, _grip in (("easy", 0.05, 0.2), ("medium", 0.25, 0.5), ("hard", 1.0, 1.0)):
+  PRESETS |= {
+      f"walker/damping-{_level}": Preset("walker", (Change("joint_damping", "all", _damping),), f"joint damping 0.1 + {10 * _damping:g} N m s/rad",
+                                         "realworldrl_suite, walker: range 0.1 to 10, deviation 0.5"),
+      f"walker/friction-{_level}": Preset("walker", (Change("friction", "all", _grip),), f"contact friction {0.7 * (1 - 0.95 * _grip):.2f}",
+                                          "realworldrl_suite, walker: range 0.01 to 2"),
+  }
+# lengths of limbs are excluded: MuJoCo calls a change of geom_size at run time unsafe
+
+
+def find(name: str, env_name: str) -> Preset:
+  """The preset `name` for a robot; `any/...` fits every robot.
+
+  Raises:
+    UserError for an unknown name, or one of another robot.
+  """
+  if name not in PRESETS:
+    raise UserError(f"unknown preset {name!r}; choose from: {', '.join(n for n, p in PRESETS.items() if p.robot in (env_name, '*'))}")
+  preset = PRESETS[name]
+  if preset.robot not in (env_name, "*"):
+    raise UserError(f"preset {name!r} is of robot {preset.robot!r}, not of {env_name!r}")
+  return preset
