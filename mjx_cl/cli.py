@@ -35,15 +35,21 @@ class Run:
   out: str = "runs/latest"
   """Result folder."""
   fault: str = "gear"
-  """Fault, see `mjx-cl list faults`; `none` for the healthy robot."""
+  """Fault, see `mjx-cl list faults`, or preset, see `mjx-cl list fault-presets`; `none` for the healthy robot."""
   target: str = "random"
   """Joint or part that the fault hits, `random`: drawn from the stream's seed."""
-  severity: float = 0.5
-  """In [0, 1]; 0 is nominal, 0.5 is the paper's gear halved."""
+  severity: float | None = None
+  """In [0, 1]; 0 is nominal, 0.5 (the default) is the paper's gear halved; a preset brings its own."""
   onset: int = 5000
   """First control step that the fault acts in."""
   duration: int | None = None
   """Control steps until the fault is repaired; default: never."""
+  schedule: str = "abrupt"
+  """How the severity moves from the onset on: abrupt, ramp, intermittent, cyclic or random_walk."""
+  period: int = 1000
+  """Control steps of the ramp, of one cycle, or between two steps of the random walk."""
+  share: float = 0.5
+  """On-share of an intermittent fault, deviation of a random walk's steps."""
   steps: int = 25_000
   """Control steps in all, counted from 0."""
   seeds: int = 10
@@ -168,7 +174,7 @@ class Query:
 class List:
   """Names that other commands take."""
   what: Positional[str] = "all"
-  """envs, faults, detectors, presets, agents, arms, sizes or all."""
+  """envs, faults, fault-presets, schedules, detectors, presets, agents, arms, sizes or all."""
   json: bool = False
 
 
@@ -261,7 +267,7 @@ class RunDisplay:
 def do_run(args: Run) -> None:
   config = RunConfig(
       env=args.env, fault=args.fault, target=None if args.target == "random" else args.target, severity=args.severity, onset=args.onset,
-      duration=args.duration, steps=args.steps, seeds=args.seeds, first_seed=args.first_seed, detector=args.detector, settings=settings(args.set),
+      duration=args.duration, schedule=args.schedule, period=args.period, share=args.share, steps=args.steps, seeds=args.seeds, first_seed=args.first_seed, detector=args.detector, settings=settings(args.set),
       arms=args.arm, agent=args.agent, physics=args.physics, form=args.form, actions=args.actions, deterministic=args.deterministic, adapt=args.adapt)
   from mjx_cl import run
   with RunDisplay() as display:
@@ -419,11 +425,12 @@ def do_query(args: Query) -> None:
 
 
 def do_list(args: List) -> None:
-  from mjx_cl import agents, detectors, envs, faults, memory
+  from mjx_cl import agents, detectors, envs, fault_presets, faults, memory
   first = lambda f: (f.__doc__ or "").strip().split("\n")[0]
   tables = {"envs": {k: first(v) for k, v in envs.ENVS.items()}, "faults": {k: faults.about(k) for k in faults.FAULTS},
             "detectors": {k: first(v) for k, v in detectors.DETECTORS.items()}, "presets": {k: p.about for k, p in PRESETS.items()},
-            "agents": {k: "shipped" for k in agents.shipped()}, "arms": ARMS, "sizes": memory.table()}
+            "agents": {k: "shipped" for k in agents.shipped()}, "arms": ARMS, "fault-presets": {k: f"{p.about} ({p.source})" for k, p in fault_presets.PRESETS.items()}, "schedules": fault_presets.SCHEDULES,
+            "sizes": memory.table()}
   chosen = tables if args.what == "all" else {args.what: choose("list", args.what, tables)}
   if args.json:
     emit(chosen)

@@ -5,6 +5,7 @@ import dataclasses
 import math
 from dataclasses import dataclass, field
 
+from mjx_cl import fault_presets
 from mjx_cl.dreamer.sizes import SIZES
 from mjx_cl.errors import UserError, choose
 
@@ -185,6 +186,8 @@ class RunConfig:
 
   Attributes:
     env, fault, target, severity, onset, duration: which robot meets what, when [control steps]. target None: drawn from the stream's seed.
+      fault may name a preset (robot/name), which brings its own faults, targets and severities. severity None: 0.5, or the preset's.
+    schedule, period, share: how the severity moves once the fault is there, see faults.schedule [control steps, 1].
     steps: control steps in all, counted from 0.
     seeds, first_seed: streams per arm; their seeds are first_seed, first_seed + 1, ...
     detector, settings: name and keyword settings.
@@ -197,9 +200,12 @@ class RunConfig:
   env: str
   fault: str = "gear"
   target: str | None = None
-  severity: float = 0.5
+  severity: float | None = None
   onset: int = 5000
   duration: int | None = None
+  schedule: str = "abrupt"
+  period: int = 1000
+  share: float = 0.5
   steps: int = 25_000
   seeds: int = 10
   first_seed: int = 0
@@ -214,8 +220,20 @@ class RunConfig:
   adapt: AdaptConfig = AdaptConfig()
 
   def __post_init__(self):
-    fraction(self, "severity")
-    positive(self, "steps", "seeds")
+    if "/" in self.fault:
+      preset = fault_presets.find(self.fault, self.env)
+      if preset.becomes:
+        raise UserError(f"preset {self.fault!r} turns the robot into {preset.becomes!r}, which `run` does not do; choose a preset that stays with its robot")
+      if self.severity is not None or self.target is not None:
+        raise UserError(f"preset {self.fault!r} brings its own severity and target; leave --severity and --target out")
+    elif self.severity is None:
+      object.__setattr__(self, "severity", 0.5)
+    if self.severity is not None:
+      fraction(self, "severity")
+    fraction(self, "share")
+    if self.schedule not in fault_presets.SCHEDULES:
+      raise UserError(f"unknown schedule {self.schedule!r}; choose from: {', '.join(fault_presets.SCHEDULES)}")
+    positive(self, "steps", "seeds", "period")
     if self.first_seed < 0:
       raise UserError(f"first_seed must be at least 0; got {self.first_seed}")
     if not 0 <= self.onset <= self.steps:
@@ -228,6 +246,14 @@ class RunConfig:
       raise UserError(f"name each arm once; got {', '.join(self.arms) or 'none'}")
     if self.physics not in ("auto", "native", "mjx"):
       raise UserError(f"unknown physics {self.physics!r}; choose from: auto, native, mjx")
+
+
+def changes(config: RunConfig) -> tuple[fault_presets.Change, ...]:
+  """The faults of a run, with its duration and schedule where the preset leaves them open."""
+  if "/" in config.fault:
+    return tuple(dataclasses.replace(c, duration=config.duration if c.duration is None else c.duration)
+                 for c in fault_presets.find(config.fault, config.env).changes)
+  return (fault_presets.Change(config.fault, config.target, config.severity, 0, config.duration, config.schedule, config.period, config.share),)
 
 
 @dataclass(frozen=True)

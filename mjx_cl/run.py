@@ -16,7 +16,7 @@ import numpy as np
 from mjx_cl import agents, checkpoint, detectors, envs, faults, memory, scoring, store
 from mjx_cl.adapt import phase as phase_lib
 from mjx_cl.adapt.loop import Loop, LoopState
-from mjx_cl.config import RunConfig
+from mjx_cl.config import RunConfig, changes
 from mjx_cl.errors import FileError
 from mjx_cl.interrupt import Interruptible
 from mjx_cl.monitor import Monitor
@@ -59,11 +59,11 @@ class Runner:
     self.trained = agents.load(config.agent, config.env, len(spec.obs), len(spec.act), lr=config.adapt.lr,
                                last_starts=config.adapt.last_starts, batch=config.adapt.batch)
     agent, self.repeat = self.trained.agent, int(self.trained.card.get("repeat", 1))
-    self.fault = faults.make(config.fault, self.env)
-    target = faults.target_index(self.fault, config.target)
+    self.changes = changes(config)
+    self.faults, plan, target = faults.build(self.changes, self.env, config.onset)
     detector = detectors.make(config.detector, **config.settings)
     monitor = Monitor(agent, n=15, form=config.form, actions=config.actions)
-    self.rollout = Rollout(self.env, agent, self.fault, self.repeat, config.deterministic)
+    self.rollout = Rollout(self.env, agent, self.faults, self.repeat, config.deterministic)
     self.chunk_steps = CHUNK * self.repeat
     self.chunks = -(-config.steps // self.chunk_steps)
     capacity = (self.chunks + 1) * CHUNK + config.steps // spec.episode_steps + CHUNK
@@ -75,7 +75,7 @@ class Runner:
     self.acts = jnp.asarray([arm == "detector" for arm, _ in self.labels])
     keys = jnp.stack([jax.random.key(seed) for _, seed in self.labels])[:, None]
     self.keys = jax.vmap(lambda k: jax.random.fold_in(k, 7))(keys[:, 0])
-    begin = lambda k: start(self.env, agent, self.fault, k, config.severity, config.onset, config.duration or faults.schedule.FOREVER, target)
+    begin = lambda k: start(self.env, agent, self.faults, k, target=target, plan=plan)
     self.state = State(nest(begin, 0, 0)(keys), self.loop.init(self.trained.train, self.groups))
     self.done_chunks = 0
     self.seconds = {"physics": 0.0, "acting": 0.0, "digest": 0.0, "other": 0.0}
@@ -203,8 +203,8 @@ class Runner:
     from mjx_cl import plots
     steps = self.config.steps
     trace = {k: v[:steps] if v.shape[0] >= steps else v for k, v in self._trace().items()}
-    targets = np.asarray(self.state.streams.injection.target).reshape(self.groups, -1)[:, 0]
-    names = [f"{self.config.fault}:{self.fault.targets[int(t)]}" for t in targets]
+    targets = np.asarray(self.state.streams.injection.target)[:, 0]  # (groups, F)
+    names = ["+".join(f"{f.name}:{f.targets[t]}" for f, t in zip(self.faults, row)) for row in targets]
     table = self._trace_table(trace, names)
     events = self._events(trace, names)
     runs = self._runs(trace, events, names)
@@ -241,10 +241,13 @@ class Runner:
     for g, (arm, seed) in enumerate(self.labels):
       def add(step, kind, reason):
         events.append({"stream": g, "arm": arm, "seed": seed, "step": int(step), "kind": kind, "reason": reason, "fault": names[g]})
-      if c.fault != "none" and c.onset < c.steps:
-        add(c.onset, "onset", f"severity {c.severity:g}")
-        if c.duration and c.onset + c.duration < c.steps:
-          add(c.onset + c.duration, "repair", f"after {c.duration} steps")
+      for change in self.changes:
+        begin = c.onset + change.after
+        if change.fault != "none" and begin < c.steps:
+          several = f"{change.fault}, " if len(self.changes) > 1 else ""
+          add(begin, "onset", f"{several}severity {change.severity:g}" + ("" if change.schedule == "abrupt" else f", {change.schedule}"))
+          if change.duration and begin + change.duration < c.steps:
+            add(begin + change.duration, "repair", f"{several}after {change.duration} steps")
       decisions = trace["decision"][:, g]
       started = {int(trace["since"][i, g]) for i in np.flatnonzero(decisions == phase_lib.START)}
       for step in np.flatnonzero(trace["alarm"][:, g]):
@@ -297,7 +300,7 @@ class Runner:
 
   def _summary(self, runs, trace) -> dict:
     """summary.json: per arm the aggregates, each with its interval; arm `detector` also at the top level."""
-    out = {"env": self.config.env, "fault": self.config.fault, "severity": self.config.severity, "onset": self.config.onset, "steps": self.config.steps,
+    out = {"env": self.config.env, "fault": self.config.fault, "severity": max(c.severity for c in self.changes), "onset": self.config.onset, "steps": self.config.steps,
            "detector": self.config.detector}
     arms = {arm: summarise([r for r in runs if r["arm"] == arm], self.config, self.env.spec.control_s) for arm in self.config.arms}
     out["arms"] = arms

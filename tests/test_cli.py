@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from test_run import saved  # noqa: F401  a fixture
 
-from mjx_cl import agents, cli, detectors, envs, faults, run, store
+from mjx_cl import agents, cli, detectors, envs, fault_presets, faults, run, store
 from mjx_cl.config import ARMS, PRESETS
 from mjx_cl.dreamer.sizes import SIZES
 from mjx_cl.errors import FileError
@@ -72,7 +72,8 @@ def test_list(mjx):
   tables = json.loads(out)
   assert {k: set(v) for k, v in tables.items()} == {
       "envs": set(envs.ENVS), "faults": set(faults.FAULTS), "detectors": set(detectors.DETECTORS), "presets": set(PRESETS),
-      "agents": set(agents.shipped()), "arms": set(ARMS), "sizes": set(SIZES)}
+      "agents": set(agents.shipped()), "arms": set(ARMS), "sizes": set(SIZES),
+      "fault-presets": set(fault_presets.PRESETS), "schedules": set(fault_presets.SCHEDULES)}
   assert all(text for table in tables.values() for text in table.values())  # each with a word about it
   assert json.loads(mjx("list", "faults", "--json")[1]) == {"faults": tables["faults"]}
   text = mjx("list")[1]

@@ -1,4 +1,4 @@
-"""What can break (one function per fault), when (`schedule.py`), and named settings (`presets.py`). `FAULTS` is the one table.
+"""What can break (one function per fault), and when (`schedule.py`); named settings are in ../fault_presets.py. `FAULTS` is the one table.
 
 A robot may have several faults in one compiled program, at once or one after the other: wherever a Fault is taken, a tuple of them is too. Their
 severities, onsets, schedules and targets are arrays, so any mix over a batch of robots is one trace.
@@ -8,6 +8,8 @@ from __future__ import annotations
 import importlib.metadata
 import inspect
 import re
+
+import jax.numpy as jnp
 
 from mjx_cl.errors import UserError, choose
 from mjx_cl.faults.actuator import ACTUATOR
@@ -76,3 +78,18 @@ def target_index(fault: Fault, target: str | None) -> int:
   if target not in fault.targets:
     raise UserError(f"unknown target {target!r} of fault {fault.name!r}; choose from: random, {', '.join(fault.targets)}")
   return fault.targets.index(target)
+
+
+def build(changes, env, onset: int = 0):
+  """The changes of a run (fault_presets.Change) on one robot.
+
+  Returns:
+    (faults, plan, targets): tuple of F Faults, Plan with leading (F,), int32 (F,); what `rollout.start` takes.
+  """
+  made = tuple(make(c.fault, env) for c in changes)
+  targets = [target_index(f, c.target) for f, c in zip(made, changes)]
+  column = lambda get: [get(c) for c in changes]
+  kinds = [list(SCHEDULES).index(c.schedule) for c in changes]
+  when = plan(column(lambda c: c.severity), column(lambda c: onset + c.after), column(lambda c: c.duration or FOREVER), kinds,
+              column(lambda c: c.period), column(lambda c: c.share))
+  return made, when, jnp.asarray(targets, jnp.int32)

@@ -1,4 +1,4 @@
-"""When a fault acts: a factor in [0, 1] on its severity, as a pure function of the control step. `SCHEDULES` is the one table."""
+"""When a fault acts: a factor in [0, 1] on its severity, as a pure function of the control step. `SCHEDULES` (fault_presets.py) is the one table."""
 from __future__ import annotations
 
 from typing import NamedTuple
@@ -7,16 +7,9 @@ import jax
 import jax.numpy as jnp
 
 from mjx_cl.errors import UserError
+from mjx_cl.fault_presets import SCHEDULES
 
 FOREVER = 2**31 - 1  # a duration that no run outlasts
-
-SCHEDULES = {
-    "abrupt": "from the onset on in full",
-    "ramp": "grows linearly over `period` control steps from the onset on, then stays",
-    "intermittent": "on for `share` of every `period`, off for the rest",
-    "cyclic": "rises and falls as (1 - cos) / 2 with `period`",
-    "random_walk": "starts at 0; every `period` a normal step of deviation `share`, reflected at 0 and 1",
-}
 
 
 class Plan(NamedTuple):

@@ -9,6 +9,15 @@ from dataclasses import dataclass
 from mjx_cl.errors import UserError
 
 
+SCHEDULES = {
+    "abrupt": "from the onset on in full",
+    "ramp": "grows linearly over `period` control steps from the onset on, then stays",
+    "intermittent": "on for `share` of every `period`, off for the rest",
+    "cyclic": "rises and falls as (1 - cos) / 2 with `period`",
+    "random_walk": "starts at 0; every `period` a normal step of deviation `share`, reflected at 0 and 1",
+}
+
+
 @dataclass(frozen=True)
 class Change:
   """One fault of a preset.
