@@ -121,6 +121,23 @@ class Eval:
 
 
 @dataclass(frozen=True)
+class Certify:
+  """Proves for every fault that it acts, and measures what it costs; writes certificates.parquet and certificates.md into --out."""
+  env: Positional[tuple[str, ...]] = ()
+  """Robots, default: all, see `mjx-cl list envs`."""
+  out: str = "results"
+  """Result folder; rows of other robots in it are kept."""
+  fault: tuple[str, ...] = ()
+  """Only these faults."""
+  episodes: int = 20
+  """Episodes per fault and severity for the return lost without adaptation; 0: none."""
+  agent: str | None = None
+  """Trained agent: shipped name or folder; default: the shipped one, where there is one."""
+  physics: str = "auto"
+  json: bool = False
+
+
+@dataclass(frozen=True)
 class Plot:
   """Draws figure.png of a run anew."""
   folder: Positional[str]
@@ -185,7 +202,7 @@ class Doctor:
 
 
 Command = (Annotated[Run, tyro.conf.subcommand("run")] | Annotated[Train, tyro.conf.subcommand("train")] | Annotated[Eval, tyro.conf.subcommand("eval")]
-           | Annotated[Plot, tyro.conf.subcommand("plot")] | Annotated[Render, tyro.conf.subcommand("render")] | Annotated[Query, tyro.conf.subcommand("query")]
+           | Annotated[Certify, tyro.conf.subcommand("certify")] | Annotated[Plot, tyro.conf.subcommand("plot")] | Annotated[Render, tyro.conf.subcommand("render")] | Annotated[Query, tyro.conf.subcommand("query")]
            | Annotated[List, tyro.conf.subcommand("list")] | Annotated[Doctor, tyro.conf.subcommand("doctor")])
 
 
@@ -382,6 +399,28 @@ def do_eval(args: Eval) -> None:
           f"{args.env}: return {result['return_mean']:.1f} in one episode")
 
 
+def do_certify(args: Certify) -> None:
+  if args.episodes < 0:
+    raise UserError(f"episodes must be at least 0; got {args.episodes}")
+  from mjx_cl import certify, envs
+  names = args.env or tuple(envs.ENVS)
+  certify.check(names)
+  rows, faulty = [], []
+  for name in names:
+    mine = certify.certify(name, args.physics, args.episodes, args.agent, args.fault, say)
+    certify.write(args.out, mine)  # what is measured is kept, whatever happens to the next robot
+    rows += mine
+    faulty += certify.certificate.faulty([certify.certificate.Certificate(*(r[k] for k in certify.certificate.Certificate._fields)) for r in mine])
+  if args.json:
+    emit(certify.summary(rows))
+  else:
+    for line in certify.summary(rows):
+      print(f"{line['name']}: {line['value']}")
+    print(f"files in {args.out}")
+  for line in faulty:
+    say(f"mjx-cl: {line}")
+
+
 def do_plot(args: Plot) -> None:
   from mjx_cl import plots
   if not os.path.exists(os.path.join(args.folder, "trace.parquet")):
@@ -451,7 +490,7 @@ def do_doctor(args: Doctor) -> None:
       print(f"{name:16s} {value if not isinstance(value, dict) else ', '.join(f'{k} {v}' for k, v in value.items())}")
 
 
-DO = {Run: do_run, Train: do_train, Eval: do_eval, Plot: do_plot, Render: do_render, Query: do_query, List: do_list, Doctor: do_doctor}
+DO = {Run: do_run, Train: do_train, Eval: do_eval, Certify: do_certify, Plot: do_plot, Render: do_render, Query: do_query, List: do_list, Doctor: do_doctor}
 
 
 def parse(argv: list[str] | None):

@@ -113,22 +113,23 @@ def middle(left, right) -> jax.Array:
 def motor_law(mj_model: mujoco.MjModel):
   """Motor law of the vehicle: ctrl (..., 2) = steering angle [rad], speed [m/s] -> torques of 2 steering and 4 wheel motors [N m].
 
-    steering, per wheel: rate = clip((goal - angle) / max(lag, 0.01 s), -limit_0, limit_0),   torque = rate x damping of the hinge
+    steering, per wheel: rate = clip((goal - angle) (1 - exp(-dt / lag)) / dt, -limit_0, limit_0), torque = rate x damping of the hinge
       goal = ackermann(clip(strength_0 angle_commanded + offset, +-0.4189))
     motor: a = clip(k (min(speed, limit_1) - r w), +-a_max)                  w = mean speed of the four wheels [rad/s]
       torque of a wheel = strength_1 m a r / 4 + c (w - w_axle)              c = 0.01 N m s/rad
 
   k = 4.755 1/s to speed up, 19.02 to brake, and four driven wheels, as in `car`. One shaft turns both axles (the second term, as stiff as the
   physics step allows); behind it left and right share the torque evenly, so that one wheel on ice takes its share with it. The motor measures
-  its own speed, not the car's. `steer_lag_s` is the time constant of the steering angle.
+  its own speed, not the car's. `steer_lag_s` is the time constant of the steering angle, at least 0.01 s; dt = 0.005 s.
   """
   angles = [mj_model.joint(n).qposadr[0] for n in ("steering_left", "steering_right")]
+  dt = float(mj_model.opt.timestep)
   spins = [mj_model.joint(f"spin_{n}").dofadr[0] for n in WHEELS]
 
   def law(xp, task, ctrl, qpos, qvel):
     goal = xp.clip(task["strength"][..., 0] * ctrl[..., 0] + task["steer_offset"], -car.STEER_MAX, car.STEER_MAX)
-    lag, most = xp.maximum(task["steer_lag_s"], 0.01)[..., None], task["velocity_limit"][..., :1]
-    rate = xp.clip((ackermann(xp, goal) - xp.stack([qpos[..., i] for i in angles], -1)) / lag, -most, most)
+    gain, most = (1 - xp.exp(-dt / xp.maximum(task["steer_lag_s"], 0.01)[..., None])) / dt, task["velocity_limit"][..., :1]
+    rate = xp.clip((ackermann(xp, goal) - xp.stack([qpos[..., i] for i in angles], -1)) * gain, -most, most)
     front, rear = (qvel[..., spins[0]] + qvel[..., spins[1]]) / 2, (qvel[..., spins[2]] + qvel[..., spins[3]]) / 2
     error = xp.minimum(ctrl[..., 1], task["velocity_limit"][..., 1]) - RADIUS * (front + rear) / 2
     accel = xp.clip(xp.where(error > 0, car.GAIN_UP, car.GAIN_DOWN) * error, -task["accel_max"], task["accel_max"])

@@ -35,8 +35,9 @@ LEGS = ("LF", "RF", "LH", "RH")
 JOINTS = tuple(f"{leg}_{joint}" for leg in LEGS for joint in ("HAA", "HFE", "KFE"))
 DEFAULT = np.array([0, 0.4, -0.8] * 2 + [0, -0.4, 0.8] * 2, np.float32)  # stance [rad]
 ACTION_SCALE, ISAAC_SCALE = 1.0, 0.5         # [rad] of an action of 1, here and in Isaac Lab
-STIFFNESS, DAMPING = 80.0, 2.0               # [N m/rad], [N m s/rad]
+STIFFNESS, DAMPING = 80.0, 5.0               # [N m/rad], [N m s/rad]
 SATURATION, EFFORT, VELOCITY = 120.0, 80.0, 7.5  # torque at standstill that the voltage would allow, limit of torque [N m]; no torque beyond [rad/s]
+ARMATURE = 0.1                               # inertia of a motor, seen at the joint; as in quadruped.xml [kg m2]
 CONTROL_S, PHYSICS_S, SUBSTEPS = 0.02, 0.005, 4
 EPISODE_STEPS, RESAMPLE_STEPS = 1000, 500    # 20 s; a new command every 10 s
 STANDING = 0.02                              # share of commands to stand
@@ -90,6 +91,7 @@ class QuadrupedState(NamedTuple):
   Attributes:
     backend: state of the physics backend, opaque.
     qpos, qvel: float32 (19,), (18,), at the end of the control step.
+    torque: float32 (12,), of the last physics step [N m].
     action: float32 (12,), the last one.
     draw: Command in force.
     command: float32 (3,), v_x, v_y [m/s], yaw rate [rad/s], as observed.
@@ -101,6 +103,7 @@ class QuadrupedState(NamedTuple):
   backend: Any
   qpos: jax.Array
   qvel: jax.Array
+  torque: jax.Array
   action: jax.Array
   draw: Command
   command: jax.Array
@@ -124,9 +127,10 @@ def motor_law(xp, task, ctrl, qpos, qvel):
   """
   q, speed, limit = qpos[..., 7:], qvel[..., 6:], task["velocity_limit"]
   wanted = STIFFNESS * (ctrl - q) - DAMPING * speed
-  ratio = xp.clip(speed / limit, -(1.0 + EFFORT / SATURATION), 1.0 + EFFORT / SATURATION)
-  high = xp.minimum(EFFORT, SATURATION * (1.0 - ratio))
-  low = xp.maximum(-EFFORT, SATURATION * (-1.0 - ratio))
+  below, above = limit - speed, limit + speed  # [rad/s] to go until the limit, either way
+  slope, stop = SATURATION / limit, ARMATURE / PHYSICS_S
+  high = xp.clip(xp.maximum(slope * below, xp.minimum(stop * below, 0.0)), -EFFORT, EFFORT)
+  low = -xp.clip(xp.maximum(slope * above, xp.minimum(stop * above, 0.0)), -EFFORT, EFFORT)
   return task["strength"] * xp.clip(wanted, low, high)
 
 
@@ -173,7 +177,7 @@ def base_motion(qpos: jax.Array, qvel: jax.Array, gravity: jax.Array) -> tuple[j
   MuJoCo's free joint has the linear velocity in the world's frame and the angular velocity in the body's.
   """
   turn = rotation(qpos[3:7])
-  return jnp.sum(turn * qvel[:3, None], 0), qvel[3:6], jnp.sum(turn * (gravity / jnp.linalg.norm(gravity))[:, None], 0)
+  return jnp.sum(turn * qvel[:3, None], 0), qvel[3:6], jnp.sum(turn * (gravity / jnp.maximum(jnp.linalg.norm(gravity), 1e-6))[:, None], 0)
 
 
 # ---- command -------------------------------------------------------------------------------------------------------------------------
@@ -207,7 +211,7 @@ def observe(qpos: jax.Array, qvel: jax.Array, gravity: jax.Array, command: jax.A
   return jnp.concatenate([linear, angular, down, command, qpos[7:] - DEFAULT, qvel[6:], action])
 
 
-def reward_terms(before: QuadrupedState, action, qpos, qvel, gravity, acceleration, torque, soft_range) -> tuple[jax.Array, jax.Array, jax.Array]:
+def reward_terms(before: QuadrupedState, action, qpos, qvel, gravity, acceleration, torque, soft_range):
   """Unweighted terms of the reward for arriving at (qpos, qvel).
 
     track_velocity    exp(-|v_xy - command|^2 / 0.25)          vertical_velocity   v_z^2                  all velocities in the base's frame
@@ -281,7 +285,7 @@ class Quadruped:
     self.stance, self.reward_terms = DEFAULT, tuple(name for name, _ in REWARDS)
     self._soft_range = jnp.asarray([middle - half, middle + half], jnp.float32)
     nominal = lambda name: jnp.asarray(getattr(self.mj_model, name), jnp.float32)
-    fields = ("body_mass", "body_inertia", "body_ipos", "geom_friction", "dof_damping", "dof_frictionloss", "jnt_range")
+    fields = ("body_mass", "body_inertia", "body_ipos", "geom_friction", "dof_armature", "dof_damping", "dof_frictionloss", "jnt_range")
     self.model = Model(
         mj={name: nominal(name) for name in fields} | {"gravity": self._gravity},
         task={"strength": jnp.ones(12), "velocity_limit": jnp.full(12, VELOCITY),
@@ -303,7 +307,7 @@ class Quadruped:
     qvel = jnp.concatenate([speed[:3], turning, jnp.zeros(12)])
     draw, action, gravity = draw_command(key_command), jnp.zeros(12), model.mj.get("gravity", self._gravity)
     command = command_of(model.task, draw, qpos)
-    state = QuadrupedState(self.physics.init(qpos, qvel), qpos, qvel, action, draw, command, jnp.zeros(4), jnp.float32(0), jnp.bool_(False),
+    state = QuadrupedState(self.physics.init(qpos, qvel), qpos, qvel, jnp.zeros(12), action, draw, command, jnp.zeros(4), jnp.float32(0), jnp.bool_(False),
                            jax.random.key_data(key))
     return EnvState(state, jnp.int32(0)), self._sense(key_noise, observe(qpos, qvel, gravity, command, action))
 
@@ -317,14 +321,14 @@ class Quadruped:
     acceleration = (qvel - out["qvel_before"])[6:] / PHYSICS_S
     terms, air, error = reward_terms(before, action, qpos, qvel, gravity, acceleration, out["ctrl"], self._soft_range)
     reward = jnp.sum(task["reward_weights"] * terms) / REWARD_SCALE
-    fallen = trunk_height(qpos) <= TOUCH
+    fallen = ~(trunk_height(qpos) > TOUCH)  # true as well for a state that is no number
 
     step = state.step + 1
     key_command, key_noise = jax.random.split(jax.random.fold_in(jax.random.wrap_key_data(before.key), step))
     renew = step % RESAMPLE_STEPS == 0
     draw = jax.tree.map(lambda new, old: jnp.where(renew, new, old), draw_command(key_command), before.draw)
     command = command_of(task, draw, qpos)
-    after = QuadrupedState(inner, qpos, qvel, action, draw, command, air, error, fallen, before.key)
+    after = QuadrupedState(inner, qpos, qvel, out["ctrl"], action, draw, command, air, error, fallen, before.key)
     obs = self._sense(key_noise, observe(qpos, qvel, gravity, command, action))
     return EnvState(after, step), Step(obs, reward, fallen, step >= self.spec.episode_steps, obs)
 

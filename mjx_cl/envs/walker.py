@@ -102,7 +102,7 @@ class Walker:
         bodies=tuple((b, (self.mj_model.body(b).id,)) for b in BODIES))
     self.reward_terms = tuple(REWARD_TERMS)
     self.model = Model(
-        mj=physics_lib.leaves(self.mj_model, "actuator_gear", "geom_friction", "body_mass", "body_inertia", "body_ipos", "dof_damping",
+        mj=physics_lib.leaves(self.mj_model, "actuator_gear", "geom_friction", "body_mass", "body_inertia", "body_ipos", "dof_armature", "dof_damping",
                               "dof_frictionloss", "jnt_range", "gravity"),
         task={"reward_weights": jnp.asarray(list(REWARD_TERMS.values()), jnp.float32), "command_range": jnp.asarray([WALK_SPEED], jnp.float32)},
         force=jnp.zeros(self.mj_model.nv))

@@ -13,7 +13,7 @@ from mjx_cl.errors import UserError
 from mjx_cl.faults.base import Fault, actuator_targets, fault, require
 
 MOST_DELAY = 9       # control steps at severity 1: the hard level of realworldrl_suite
-LOCK_DAMPING = 1e4   # [N m s/rad] at severity 1: a joint under 100 N m creeps at 0.01 rad/s
+LOCK = (10.0, 1000.0)  # [kg m^2], [N m s/rad] at severity 1
 
 
 def dofs(env, name: str) -> np.ndarray:
@@ -56,7 +56,8 @@ def torque_loss(env) -> Fault:
     value = getattr(ports.model, kind)[name]
     hit = mask[target].reshape((-1,) + (1,) * (value.ndim - 1))
     return memory, {leaf: jnp.where(hit, value * (1.0 - severity), value)}
-  return fault("torque_loss", env, (leaf,), names, act, drawn=single)
+  reason = "" if leaf.startswith("mj.") else "the position loop runs at every physics step, so a joint held less firmly may end a control step anywhere"
+  return fault("torque_loss", env, (leaf,), names, act, drawn=single, not_monotone=reason)
 
 
 def velocity_limit(env) -> Fault:
@@ -76,21 +77,23 @@ def velocity_limit(env) -> Fault:
 
 
 def joint_lock(env) -> Fault:
-  """A joint seizes: it is damped until it hardly moves.
+  """A joint seizes: it grows heavy and stiff until it hardly moves.
 
-    damping_j' = damping_j + 1e4 severity^4 [N m s/rad]
+    armature_j' = armature_j + 10 severity^2 [kg m^2],   damping_j' = damping_j + 1,000 severity^2 [N m s/rad]
 
-  Severity: 0.25, 0.5, 0.75 add 39, 625, 3,164; 1 holds the joint (0.01 rad/s under 100 N m). Target: a joint, a leg or all. Owns
-  `mj.dof_damping`, (nv,); the integrators treat it implicitly, so it stays stable. Source: locked and crippled joints, facts 4.2.
+  Severity: 1 holds the joint: it stops within 10 ms and creeps at 0.1 rad/s under 100 N m; 0.5 is a quarter of that. Target: a joint, a leg or all. Owns
+  `mj.dof_armature`, `mj.dof_damping`, (nv,). Damping alone would do in the air, but MuJoCo's contact solver does not know of implicit damping:
+  beyond hD = M (h the physics step) a leg on the ground gains speed from it; with the armature hD / M stays at 0.5. Source: locked and crippled
+  joints, facts 4.2.
   """
   names, mask, single = actuator_targets(env)
   at = dofs(env, "joint_lock")
 
   def act(target, memory, severity, key, ports):
-    value = ports.model.mj["dof_damping"]
-    extra = jnp.where(mask[target], LOCK_DAMPING * severity**4, 0.0)
-    return memory, {"mj.dof_damping": value.at[at].add(extra)}
-  return fault("joint_lock", env, ("mj.dof_damping",), names, act, drawn=single)
+    extra = jnp.where(mask[target], severity * severity, 0.0)
+    armature, damping = ports.model.mj["dof_armature"], ports.model.mj["dof_damping"]
+    return memory, {"mj.dof_armature": armature.at[at].add(LOCK[0] * extra), "mj.dof_damping": damping.at[at].add(LOCK[1] * extra)}
+  return fault("joint_lock", env, ("mj.dof_armature", "mj.dof_damping"), names, act, drawn=single)
 
 
 def _command(name, env, change, memory=(), not_monotone=""):

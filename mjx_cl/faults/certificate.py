@@ -10,18 +10,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_cl import faults as faults_lib
+from mjx_cl import fault_presets, faults as faults_lib
 from mjx_cl.faults import schedule
 
 SEVERITIES = (0.0, 0.25, 0.5, 0.75, 1.0)
 AFTER = (1, 10, 100)  # control steps at which the size of the difference is reported
 ROUNDING = 1e-4       # largest relative difference of the same nominal robot in two programs: XLA folds constants, which shifts last bits
+REWARD_ROUNDING = 2e-6  # relative; a sum's last bits depend on the place of a lane in its batch, since XLA adds whole vectors and rests otherwise
 WIDTH = 64            # lanes at a time: XLA cuts a wide batch into shares and their rests, which scalar code computes with other last bits
 SLACK = 0.9           # a difference counts as not smaller from this share of the one before on
 
 
 class Lane(NamedTuple):
-  """One robot of the proof: fault, target, severity."""
+  """One robot of the proof: fault, target, severity; or a preset, with `fault` its name and the target `preset`."""
   fault: str
   target: str
   severity: float
@@ -33,7 +34,7 @@ class Certificate(NamedTuple):
   Attributes:
     robot, fault, family, target, severity: what was set; the row of fault `none` holds the nominal robot in this program against a program
       without any fault, diff_1 the largest relative difference.
-    identical: bit-identical to the nominal robot in all steps (must hold at severity 0).
+    identical: observations bit-identical to the nominal robot's in all steps, rewards to rounding (must hold at severity 0).
     early: something differs before the onset (must not be).
     first_step: first control step, counted from the onset, whose outcome differs; None: none does.
     diff_1, diff_10, diff_100: root mean square over channels of (x - x_nominal) / scale, so many steps after that first one (1 = itself);
@@ -65,12 +66,22 @@ def lanes(faults: dict[str, faults_lib.Fault], severities=SEVERITIES, targets: i
   return out
 
 
-def actions(env, steps: int, seed: int) -> np.ndarray:
-  """A vigorous, smooth command signal, float32 (steps, A) in [-1, 1]: sines of drawn frequency and phase."""
+def preset_lanes(env, faults: dict[str, faults_lib.Fault]) -> list[Lane]:
+  """One lane for every preset that this robot can have."""
+  out = []
+  for name, preset in fault_presets.PRESETS.items():
+    if preset.robot in (env.spec.name, "*") and preset.changes and all(c.fault in faults for c in preset.changes):
+      out.append(Lane(name, "preset", max(c.severity for c in preset.changes)))
+  return out
+
+
+def actions(env, steps: int, seed: int, size: float = 1.0) -> np.ndarray:
+  """A smooth command signal, float32 (steps, A) in [-1, 1]: two sines of drawn frequency and phase, 0.9 and 0.4 times `size`."""
   rng = np.random.default_rng(seed)
   t = np.arange(steps)[:, None] * env.spec.control_s
   hertz, phase = rng.uniform(0.5, 2.5, (2, 1, len(env.spec.act))), rng.uniform(0, 2 * np.pi, (2, 1, len(env.spec.act)))
-  return np.clip(0.9 * np.sin(2 * np.pi * hertz[0] * t + phase[0]) + 0.4 * np.sin(2 * np.pi * hertz[1] * t + phase[1]), -1, 1).astype(np.float32)
+  signal = 0.9 * np.sin(2 * np.pi * hertz[0] * t + phase[0]) + 0.4 * np.sin(2 * np.pi * hertz[1] * t + phase[1])
+  return np.clip(size * signal, -1, 1).astype(np.float32)
 
 
 def live(env, faults: tuple, model, key: jax.Array, injection, signal: jax.Array):
@@ -106,12 +117,15 @@ def program(env, faults: tuple):
 
 
 def plans(faults: dict[str, faults_lib.Fault], chosen: list[Lane], onset: int):
-  """Plan (lanes, F) and targets (lanes, F): each lane has its one fault, the others rest at severity 0."""
+  """Plan (lanes, F) and targets (lanes, F): each lane has its own fault or faults, the others rest at severity 0."""
   names = list(faults)
   severity, target = np.zeros((len(chosen), len(names)), np.float32), np.zeros((len(chosen), len(names)), np.int32)
   for i, lane in enumerate(chosen):
-    f = names.index(lane.fault)
-    severity[i, f], target[i, f] = lane.severity, faults[lane.fault].targets.index(lane.target)
+    changes = (fault_presets.Change(lane.fault, lane.target, lane.severity),) if "/" not in lane.fault else fault_presets.PRESETS[lane.fault].changes
+    for change in changes:
+      f = names.index(change.fault)
+      severity[i, f] = change.severity
+      target[i, f] = 0 if change.target is None else faults[change.fault].targets.index(change.target)
   full = lambda value, dtype: jnp.full(severity.shape, value, dtype)
   plan = schedule.Plan(jnp.asarray(severity), full(onset, jnp.int32), full(faults_lib.FOREVER, jnp.int32), full(0, jnp.int32), full(1000, jnp.int32),
                        full(0.5, jnp.float32))
@@ -119,27 +133,41 @@ def plans(faults: dict[str, faults_lib.Fault], chosen: list[Lane], onset: int):
 
 
 def certify(env, faults: dict[str, faults_lib.Fault] | None = None, severities=SEVERITIES, chosen: list[Lane] | None = None, onset: int = 40,
-            steps: int = 400, seed: int = 0) -> list[Certificate]:
-  """Certificates of `faults` (all that the robot can have) on `env`, under one signal.
+            steps: int = 240, seed: int = 0, sizes=(1.0, 0.4)) -> list[Certificate]:
+  """Certificates of `faults` (all that the robot can have) on `env`.
 
   Args:
-    chosen: lanes, in place of those that `severities` give.
+    chosen: lanes, in place of those that `severities` give, and the presets.
     onset, steps: control steps; a fault must act within steps - onset - 100.
+    seed: of the start and the signal; one more for each further size.
+    sizes: of the signals. Identity and onset must hold under each; to act, and to grow with severity, a fault needs one: a vigorous one
+      reaches limits of speed and range, a gentle one leaves a legged robot on its feet.
   """
   if faults is None:
     faults = {k: f for k, f in faults_lib.available(env).items() if k != "none"}
-  chosen = lanes(faults, severities) if chosen is None else chosen
+  chosen = lanes(faults, severities) + preset_lanes(env, faults) if chosen is None else chosen
   nominal = Lane(next(iter(faults)), next(iter(faults.values())).targets[0], 0.0)
   run = program(env, tuple(faults.values()))
   model = faults_lib.owned_model(tuple(faults.values()), env.model)
-  signal = jnp.asarray(actions(env, steps, seed))
-  out = []
-  for part in parts(chosen):
-    plan, target = plans(faults, part + [nominal] * (WIDTH - len(part)), onset)
-    rows, plain = jax.tree.map(np.asarray, run(model, jax.random.key(seed), plan, target, signal))
-    found = compare(env, faults, part, rows, plain, onset)
-    out += found[1:] if out else found
-  return out
+  under = []
+  for k, size in enumerate(sizes):
+    signal, out = jnp.asarray(actions(env, steps, seed + k, size)), []
+    for part in parts(chosen):
+      plan, target = plans(faults, part + [nominal] * (WIDTH - len(part)), onset)
+      rows, plain = jax.tree.map(np.asarray, run(model, jax.random.key(seed + k), plan, target, signal))
+      found = compare(env, faults, part, rows, plain, onset)
+      out += found[1:] if out else found
+    under.append(out)
+  return [best(rows) for rows in zip(*under)]
+
+
+def best(rows: tuple[Certificate, ...]) -> Certificate:
+  """One certificate of the same lane under several signals."""
+  acting = [r for r in rows if not r.identical] or [rows[0]]
+  chosen = next((r for r in acting if r.monotone), acting[0])
+  identical = all(r.identical for r in rows) if rows[0].severity == 0 else chosen.identical
+  return chosen._replace(identical=identical, early=any(r.early for r in rows), diff_1=max((r.diff_1 for r in rows), default=None)
+                         if rows[0].fault == "none" else chosen.diff_1)
 
 
 def parts(chosen: list[Lane]) -> list[list[Lane]]:
@@ -162,19 +190,21 @@ def compare(env, faults, chosen, rows, plain, onset) -> list[Certificate]:
   plain = tuple(x[-1] for x in rows)
   scale = np.asarray([v.scale for v in env.spec.obs])
   bits = lambda x: np.ascontiguousarray(x, np.float32).view(np.uint32)
-  differs = (bits(obs) != bits(plain[0])[None]).any(-1) | (bits(reward) != bits(plain[1])[None]) | (terminated != plain[2][None])  # (lanes, T)
+  paid = np.abs(reward - plain[1][None]) > REWARD_ROUNDING * (1.0 + np.abs(plain[1][None]))
+  differs = (bits(obs) != bits(plain[0])[None]).any(-1) | paid | (terminated != plain[2][None])  # (lanes, T)
   size = np.sqrt(np.mean(((obs - plain[0][None]) / scale) ** 2, -1))
   size = np.where(size > 0, size, np.abs(reward - plain[1][None]))
   # an outcome of step t is read at t + 1: a sensor that fails at the onset already shows in the outcome of the step before
   out = [Certificate(env.spec.name, "none", "none", "all", 0.0, rounding < ROUNDING, False, None, rounding, None, None, None, "")]
   for i, lane in enumerate(chosen):
-    begin = onset - 1 if faults[lane.fault].senses else onset
+    mine = (lane.fault,) if "/" not in lane.fault else tuple(c.fault for c in fault_presets.PRESETS[lane.fault].changes)
+    begin = onset - 1 if any(faults[name].senses for name in mine) else onset
     at = np.flatnonzero(differs[i])
     first = int(at[0]) if at.size else None
     values = [float(size[i, first + k - 1]) if first is not None and first + k - 1 < size.shape[1] else None for k in AFTER]
-    out.append(Certificate(
-        env.spec.name, lane.fault, faults_lib.family(lane.fault), lane.target, lane.severity, not at.size, first is not None and first < begin,
-        None if first is None else first - begin, *values, monotone(chosen, differs, size, i), faults[lane.fault].not_monotone))
+    kind, reason = ("preset", "") if "/" in lane.fault else (faults_lib.family(lane.fault), faults[lane.fault].not_monotone)
+    out.append(Certificate(env.spec.name, lane.fault, kind, lane.target, lane.severity, not at.size, first is not None and first < begin,
+                           None if first is None else first - begin, *values, monotone(chosen, differs, size, i), reason))
   return out
 
 

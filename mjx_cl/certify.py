@@ -1,0 +1,182 @@
+"""`mjx-cl certify`: every robot x fault x severity and preset, what it changes (faults.certificate) and what it costs an agent that does not adapt."""
+from __future__ import annotations
+
+import pathlib
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_cl import agents, envs, faults as faults_lib, store
+from mjx_cl.errors import UserError
+from mjx_cl.faults import certificate
+from mjx_cl.monitor import Monitor
+from mjx_cl.rollout import Rollout, nest, start
+from mjx_cl.scoring import bootstrap
+
+CHUNK = 50     # decisions
+WARM = 30      # decisions at an episode's start whose residuals are not compared
+AT_ONCE = 120  # robots side by side
+
+
+class Cost:
+  """Lives whole episodes of the shipped agent under faults, all in one program per robot.
+
+  Args:
+    env, trained: robot and its agent. faults: name -> Fault, the program's.
+    episodes: per lane; episode e starts from seed e, for every lane alike.
+  """
+
+  def __init__(self, env, trained, faults: dict, episodes: int):
+    self.env, self.agent, self.faults, self.episodes = env, trained.agent, faults, episodes
+    self.params = jax.tree.map(lambda x: x[None], trained.train.params)
+    self.repeat = int(trained.card.get("repeat", 1))
+    self.rollout = Rollout(env, self.agent, tuple(faults.values()), self.repeat)
+    self.monitor = Monitor(self.agent)
+    self.watch = jax.jit(self.monitor.update)
+    self.begin = jax.jit(jax.vmap(lambda key, plan, target: start(env, self.agent, tuple(faults.values()), key, target=target, plan=plan)))
+
+  def live(self, chosen: list[certificate.Lane]) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Returns of every lane (lanes, episodes), and of each lane the valid (ln OPR, ln RPR), (samples, 2)."""
+    lanes = len(chosen)
+    plan, target = certificate.plans(self.faults, chosen, onset=0)
+    spread = lambda x: jnp.repeat(x, self.episodes, 0)
+    keys = jnp.tile(jax.vmap(jax.random.key)(jnp.arange(self.episodes)), lanes)
+    streams = jax.tree.map(lambda x: x[None], self.begin(keys, jax.tree.map(spread, plan), spread(target)))
+    history = self.monitor.init(1, lanes * self.episodes)
+    total, alive = np.zeros(lanes * self.episodes), np.ones(lanes * self.episodes, bool)
+    residuals, kept = [], []
+    for chunk in range(-(-self.env.spec.episode_steps // self.repeat // CHUNK)):
+      streams, rows = self.rollout.chunk(self.params, streams, CHUNK)
+      history, residual = self.watch(self.params, history, rows, jax.random.split(jax.random.key(chunk), 1))
+      reward, done = np.asarray(rows.reward)[:, 0], np.asarray(rows.terminated | rows.truncated)[:, 0]
+      residuals.append(np.stack([np.asarray(residual.opr)[:, 0], np.asarray(residual.rpr)[:, 0]], -1))
+      for k in range(CHUNK):
+        total += reward[k] * alive
+        kept.append(alive.copy() & (chunk * CHUNK + k >= WARM))
+        alive &= ~done[k]
+      if not alive.any():
+        break
+    values, kept = np.concatenate(residuals), np.stack(kept)
+    good = kept & np.isfinite(values).all(-1)
+    logs = np.log(np.maximum(values, 1e-9))
+    mine = lambda i: slice(i * self.episodes, (i + 1) * self.episodes)
+    return total.reshape(lanes, self.episodes), [logs[:, mine(i)][good[:, mine(i)]] for i in range(lanes)]
+
+
+def divergence(faulted: np.ndarray, nominal: np.ndarray) -> float | None:
+  """Kullback-Leibler divergence of two normal fits to (ln OPR, ln RPR), nats per step.
+
+    KL = (tr(S0^-1 S1) + (m0 - m1)' S0^-1 (m0 - m1) - 2 + ln(det S0 / det S1)) / 2          1 faulted, 0 nominal
+
+  What a detector can gain per step if samples were independent; they are not, so it is an upper figure for one that reads these two.
+  """
+  if len(faulted) < 20 or len(nominal) < 20:
+    return None
+  m1, m0 = faulted.mean(0), nominal.mean(0)
+  s1, s0 = np.cov(faulted.T) + 1e-9 * np.eye(2), np.cov(nominal.T) + 1e-9 * np.eye(2)
+  inverse = np.linalg.inv(s0)
+  return float((np.trace(inverse @ s1) + (m0 - m1) @ inverse @ (m0 - m1) - 2 + np.log(np.linalg.det(s0) / np.linalg.det(s1))) / 2)
+
+
+def certify(name: str, physics: str = "auto", episodes: int = 20, agent: str | None = None, only: tuple[str, ...] = (),
+            progress=lambda text: None) -> list[dict]:
+  """Certificates of one robot as rows of results/certificates.parquet.
+
+  Args:
+    episodes: per lane for the cost; 0, or a robot without a shipped agent: no cost is measured (null).
+    only: names of faults, () for all.
+  """
+  env = envs.make(name, physics)
+  faults = {k: f for k, f in faults_lib.available(env).items() if k != "none"}
+  for fault in only:
+    faults_lib.make(fault, env)
+  faults = {k: f for k, f in faults.items() if not only or k in only}
+  progress(f"{name}: {len(faults)} faults, acting under the same commands")
+  rows = [c._asdict() | {"physics": env.physics.name, "agent": None, "episodes": 0, "return_nominal": None, "return_mean": None, "return_lost": None,
+                         "return_lost_low": None, "return_lost_high": None, "kl_nats": None} for c in certificate.certify(env, faults)]
+  if not episodes or (agent is None and name not in agents.shipped()):
+    return rows
+  trained = agents.load(agent, name, len(env.spec.obs), len(env.spec.act))
+  cost = Cost(env, trained, faults, episodes)
+  first = next(iter(faults))
+  chosen = [certificate.Lane(first, faults[first].targets[0], 0.0)]  # the nominal robot
+  chosen += [lane for lane in certificate.lanes(faults, targets=0) if lane.severity > 0] + certificate.preset_lanes(env, faults)
+  at_once, found = max(2, AT_ONCE // episodes), {}
+  nominal = None
+  for i in range(0, len(chosen), at_once):
+    part = chosen[i:i + at_once]
+    padded = part + [chosen[0]] * (at_once - len(part))
+    returns, logs = cost.live(padded)
+    nominal = (returns[0], logs[0]) if nominal is None else nominal
+    for lane, own, log in zip(part, returns, logs):
+      lost = nominal[0] - own
+      low, high = bootstrap.interval(lost, lambda x, axis: np.mean(x, axis)) or (None, None)
+      found[lane] = {"agent": agent or name, "episodes": episodes, "return_nominal": float(nominal[0].mean()), "return_mean": float(own.mean()),
+                     "return_lost": float(lost.mean()), "return_lost_low": low, "return_lost_high": high, "kl_nats": divergence(log, nominal[1])}
+    progress(f"{name}: cost of {min(i + at_once, len(chosen))}/{len(chosen)} settings")
+  for row in rows:
+    row |= found.get(certificate.Lane(row["fault"], row["target"], row["severity"]), {})
+  return rows
+
+
+def write(folder, rows: list[dict]) -> None:
+  """Writes certificates.parquet and certificates.md; rows of other robots that are there already are kept."""
+  import pyarrow.parquet
+  folder = pathlib.Path(folder)
+  path = folder / "certificates.parquet"
+  folder.mkdir(parents=True, exist_ok=True)
+  robots = {r["robot"] for r in rows}
+  if path.exists():
+    rows = [r for r in pyarrow.parquet.read_table(path).to_pylist() if r["robot"] not in robots] + rows
+  store.write_table(path, {k: [r[k] for r in rows] for k in rows[0]})
+  tmp = folder / "certificates.md.tmp"
+  tmp.write_text(table(rows))
+  tmp.replace(folder / "certificates.md")
+
+
+def table(rows: list[dict]) -> str:
+  """The certificates for a reader: one line per robot, fault and target, its greatest severity."""
+  number = lambda x, form: "" if x is None else format(x, form)
+  out = ["# Certificates: every fault acts", "",
+         "Made by `mjx-cl certify`; all severities are in certificates.parquet. Each line is a fault at severity 1 (a preset: its own). `first` is the first control",
+         "step from the onset whose outcome differs under the same commands, `after 1, 10, 100` the difference so many steps on (root mean square over the",
+         "channels, in typical deviations). `return lost`: mean over episodes of the shipped agent, which does not adapt, with its 95 % bootstrap interval over",
+         "episodes. `KL`: normal fits to ln OPR, ln RPR against the nominal robot's, nats per step.", ""]
+  for robot in dict.fromkeys(r["robot"] for r in rows):
+    mine = [r for r in rows if r["robot"] == robot and r["fault"] != "none" and r["severity"] > 0]
+    top = {}
+    for r in mine:
+      key = (r["fault"], r["target"])
+      if key not in top or r["severity"] > top[key]["severity"]:
+        top[key] = r
+    agent = next((r for r in mine if r["episodes"]), None)
+    out += [f"## {robot}", "", "No agent is shipped for it, so no return is given." if agent is None else
+            f"Nominal return {agent['return_nominal']:.0f} over {agent['episodes']} episodes of agent `{agent['agent']}`.", "",
+            "| family | fault | target | severity | first | after 1 | 10 | 100 | return lost | KL |", "|---|---|---|---|---|---|---|---|---|---|"]
+    for r in top.values():
+      lost = "" if r["return_lost"] is None else f"{r['return_lost']:.0f} [{number(r['return_lost_low'], '.0f')}, {number(r['return_lost_high'], '.0f')}]"
+      out.append(f"| {r['family']} | {r['fault']} | {r['target']} | {r['severity']:.3g} | {number(r['first_step'], 'd')} | {number(r['diff_1'], '.2g')} | "
+                 f"{number(r['diff_10'], '.2g')} | {number(r['diff_100'], '.2g')} | {lost} | {number(r['kl_nats'], '.2g')} |")
+    out.append("")
+  return "\n".join(out)
+
+
+def summary(rows: list[dict]) -> list[dict]:
+  """What `--json` prints: {name, value, unit, goal, holds} per robot."""
+  out = []
+  fields = certificate.Certificate._fields
+  for robot in dict.fromkeys(r["robot"] for r in rows):
+    mine = [certificate.Certificate(*(r[k] for k in fields)) for r in rows if r["robot"] == robot]
+    wrong = certificate.faulty(mine)
+    names = {c.fault for c in mine if c.fault != "none" and "/" not in c.fault}
+    out += [{"name": f"{robot}: faults certified", "value": len(names), "unit": "faults", "goal": None, "holds": None},
+            {"name": f"{robot}: faults that fail", "value": len(wrong), "unit": "lanes", "goal": "== 0", "holds": not wrong}]
+  return out
+
+
+def check(names: tuple[str, ...]) -> None:
+  """Raises UserError for an unknown robot."""
+  for name in names:
+    if name not in envs.ENVS:
+      raise UserError(f"unknown environment {name!r}; choose from: {', '.join(sorted(envs.ENVS))}")
