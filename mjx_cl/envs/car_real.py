@@ -201,7 +201,7 @@ class CarReal:
     self._rest = jnp.asarray(data.qpos, jnp.float32)
     self.model, self.gap_items, self.reward_terms = model, GAP, tuple(car.REWARD_TERMS)
     self.physics = physics_lib.make(physics, self.mj_model, SUBSTEPS, law=motor_law(self.mj_model))
-    spec = car.spec("car_real", self.course, acceptance=0.5)
+    spec = car.spec("car_real", self.course, acceptance=0.5)  # no crash; the reference driver earns 0.95 without the gap, 0.64 with
     front, rear = self.wheels[:2], self.wheels[2:]
     bodies = ("chassis",) + WHEELS
     self.spec = spec._replace(
