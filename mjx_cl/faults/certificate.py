@@ -132,7 +132,7 @@ def plans(faults: dict[str, faults_lib.Fault], chosen: list[Lane], onset: int):
   return plan, jnp.asarray(target)
 
 
-def certify(env, faults: dict[str, faults_lib.Fault] | None = None, severities=SEVERITIES, chosen: list[Lane] | None = None, onset: int = 40,
+def certify(env, faults: dict[str, faults_lib.Fault] | None = None, severities=SEVERITIES, chosen: list[Lane] | None = None, onset: int = 25,
             steps: int = 240, seed: int = 0, sizes=(1.0, 0.4)) -> list[Certificate]:
   """Certificates of `faults` (all that the robot can have) on `env`.
 
