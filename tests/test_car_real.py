@@ -192,7 +192,8 @@ def test_one_slippery_wheel_turns_a_braking_car_to_the_other_side(env, ride):
 def test_strength_and_limits(env, ride):
   def task(**changed):
     return env.model._replace(task=env.model.task | {k: jnp.asarray(v, jnp.float32) for k, v in changed.items()})
-  models = [env.model, task(strength=[0.5, 1.0]), env.model, task(strength=[1.0, 0.5]), task(velocity_limit=[3.2, 1.5]), task(velocity_limit=[0.5, 5.0])]
+  models = [env.model, task(strength=[0.5, 1.0]), env.model, task(strength=[1.0, 0.5]), task(velocity_limit=[3.2, 1.5]),
+            task(velocity_limit=[0.5, 5.0])]
   motion, _ = ride(models, [steady(0.2, 3), steady(0.2, 3), steady(0, 5), steady(0, 5), steady(0, 3), steady(0.2, 3)])
   np.testing.assert_allclose(motion.steer[:2, -1], [0.2, 0.1], atol=2e-3)
   gain = motion.vx[2:4, 3] - motion.vx[2:4, 1]                               # [m/s] in 0.1 s, once the tyres have taken hold
@@ -236,7 +237,8 @@ def test_widen_owns_one_leaf_and_share_zero_leaves_every_bit(env, same):
     assert same(zero, whole(env.model))
     for other in (one, two):
       assert {k for k in zero if not same(zero[k], other[k])} == {item.leaf}
-    assert all((np.asarray(v) >= 0).all() for k, v in two.items() if k not in ("mj.gravity", "mj.body_ipos", "task.reward_weights"))  # twice the gap is still a car
+    signed = ("mj.gravity", "mj.body_ipos", "task.reward_weights")
+    assert all((np.asarray(v) >= 0).all() for k, v in two.items() if k not in signed)  # twice the gap is still a car
 
 
 @pytest.fixture(scope="module")

@@ -1,8 +1,9 @@
 """Car_real: the car as a four-wheel MuJoCo vehicle, a stand-in for the laboratory's car to which the simulator's policy is moved.
 
 Observation, action, reward and tracks are those of `car`. What differs is of two kinds. The vehicle itself: suspension, wheels with a spin of
-their own, load that moves between four wheels, Coulomb friction at each of them. And the reality gap: the items of `GAP`, each named, with its
-source, and switchable; together they are one identified 1:10 car ("NUC2", ForzaETH's race stack) as far as figures of it were at hand.
+their own, load that moves between four wheels, Coulomb friction at each of them (assets/car.xml); this is never switched off. And the reality gap:
+the items of `GAP`, each named, with its source, and switchable; together they are one identified 1:10 car ("NUC2", ForzaETH's race stack) as far
+as figures of it were at hand.
 """
 from __future__ import annotations
 
@@ -82,13 +83,11 @@ def widen(model: Model, name: str, share, wheels: tuple[int, ...]) -> Model:
   where, leaf = item.leaf.split(".")
   table = getattr(model, where)
   value, more = table[leaf], share * (item.real - item.simulator)
-  less = jnp.exp(share * np.log(np.float32(max(item.real, 1e-6) / max(item.simulator, 1e-6))))
-  if name == "grip":
-    value = value.at[jnp.asarray(wheels), 0].multiply(less)
-  elif name in ("acceleration", "mass"):
-    value = value * less
+  if name in ("acceleration", "grip", "mass"):
+    less = jnp.exp(share * np.float32(np.log(item.real / item.simulator)))  # 1 exactly for share 0
+    value = value.at[jnp.asarray(wheels), 0].multiply(less) if name == "grip" else value * less
   elif name == "yaw_inertia":
-    value = value.at[1, 2].add(more)
+    value = value.at[1, 2].add(more)  # body 1 is the chassis
   else:
     value = value + more
   return model._replace(**{where: table | {leaf: value}})
