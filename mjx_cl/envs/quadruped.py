@@ -288,12 +288,11 @@ class Quadruped:
     self._gravity = jnp.asarray(self.mj_model.opt.gravity, jnp.float32)
     self.stance, self.reward_terms = DEFAULT, tuple(name for name, _ in REWARDS)
     self._soft_range = jnp.asarray([middle - half, middle + half], jnp.float32)
-    nominal = lambda name: jnp.asarray(getattr(self.mj_model, name), jnp.float32)
-    fields = ("body_mass", "body_inertia", "body_ipos", "geom_friction", "dof_armature", "dof_damping", "dof_frictionloss", "jnt_range")
     self.model = Model(
-        mj={name: nominal(name) for name in fields} | {"gravity": self._gravity},
-        task={"strength": jnp.ones(12), "velocity_limit": jnp.full(12, VELOCITY),
-              "command_range": jnp.asarray([[-1.0] * 3, [1.0] * 3]),  # least and greatest v_x, v_y [m/s], yaw rate [rad/s]
+        mj=physics_lib.leaves(self.mj_model, "body_mass", "body_inertia", "body_ipos", "geom_friction", "dof_armature", "dof_damping",
+                              "dof_frictionloss", "jnt_range", "gravity"),
+        task={"strength": jnp.ones(12), "velocity_limit": jnp.full(12, VELOCITY, jnp.float32),
+              "command_range": jnp.asarray([[-1.0] * 3, [1.0] * 3], jnp.float32),  # least and greatest v_x, v_y [m/s], yaw rate [rad/s]
               "reward_weights": jnp.asarray([weight for _, weight in REWARDS], jnp.float32)},
         force=jnp.zeros(self.mj_model.nv))
 
@@ -311,8 +310,8 @@ class Quadruped:
     qvel = jnp.concatenate([speed[:3], turning, jnp.zeros(12)])
     draw, action, gravity = draw_command(key_command), jnp.zeros(12), model.mj.get("gravity", self._gravity)
     command = command_of(model.task, draw, qpos)
-    state = QuadrupedState(self.physics.init(qpos, qvel), qpos, qvel, jnp.zeros(12), action, draw, command, jnp.zeros(4), jnp.float32(0), jnp.bool_(False),
-                           jax.random.key_data(key))
+    state = QuadrupedState(self.physics.init(qpos, qvel), qpos, qvel, jnp.zeros(12), action, draw, command, jnp.zeros(4), jnp.float32(0),
+                           jnp.bool_(False), jax.random.key_data(key))
     return EnvState(state, jnp.int32(0)), self._sense(key_noise, observe(qpos, qvel, gravity, command, action))
 
   def step(self, model: Model, state: EnvState, action: jax.Array) -> tuple[EnvState, Step]:
