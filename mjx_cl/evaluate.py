@@ -1,4 +1,4 @@
-"""Return of an agent on the healthy robot."""
+"""Return of an agent on the healthy robot, and the task's own figures."""
 from __future__ import annotations
 
 import jax
@@ -14,20 +14,51 @@ def evaluate(env, agent, params, episodes: int, seed: int = 0, repeat: int = 1, 
   """Runs `episodes` episodes side by side, seeds seed, seed + 1, ...
 
   Returns:
-    episodes, return_mean, return_iqm, return_ci (95 % bootstrap of the IQM over episodes of this one agent), returns, terminations.
+    episodes, return_mean, return_iqm, return_ci (95 % bootstrap of the IQM over episodes of this one agent), returns, terminations, and where the
+    environment measures them (env.measure), means over the steps of all episodes with their bootstrap interval over episodes:
+    quadruped: velocity_error_m_s, fall_rate; car: mean_speed_m_s, collision_rate, and reference_speed_m_s, the reference driver's mean speed from the
+    same starts on the same tracks.
   """
   fault = faults.make("none", env)
   rollout = Rollout(env, agent, fault, repeat, deterministic)
+  total, steps, sums, ended = live(env, rollout, agent, params, episodes, seed)
+  out = {"episodes": episodes, "return_mean": float(total.mean()), "return_iqm": float(bootstrap.iqm(total)), "return_ci": bootstrap.interval(total),
+         "terminations": int(ended.sum()), "returns": [round(float(x), 2) for x in total]}
+  mean = lambda x, axis: np.mean(x, axis)
+  for name, value in sums.items():
+    each = value / np.maximum(steps, 1)
+    out |= {name: float(value.sum() / max(1, steps.sum())), name + "_ci": bootstrap.interval(each, mean)}
+  rate = getattr(env, "termination_rate", None)
+  if rate:
+    out |= {rate: float(ended.mean()), rate + "_ci": bootstrap.wilson(int(ended.sum()), episodes)}
+  if hasattr(env, "reference"):
+    driver = Rollout(env, agent, fault, repeat, expert=lambda stream: env.reference(stream.env))
+    reference, steps, sums, ended = live(env, driver, agent, params, episodes, seed, drive=True)
+    out |= {"reference_return": float(reference.mean()), "reference_speed_m_s": float(sums["mean_speed_m_s"].sum() / steps.sum()),
+            "reference_collisions": int(ended.sum())}
+  return out
+
+
+def live(env, rollout, agent, params, episodes: int, seed: int, drive: bool = False):
+  """One episode each: (return, measured steps, {figure: sum over the steps}, terminated), arrays (episodes,).
+
+  A figure is read after a step, from the state; the step that ends an episode, after which a new one has begun, is left out.
+  """
   keys = jnp.stack([jax.random.key(seed + i) for i in range(episodes)])[None]
-  streams = nest(lambda k: start(env, agent, fault, k), 0, 0)(keys)
+  streams = nest(lambda k: start(env, agent, rollout.fault, k), 0, 0)(keys)
   params = jax.tree.map(lambda x: x[None], params)
-  total, alive, ended = np.zeros(episodes), np.ones(episodes, bool), 0
+  measure = jax.jit(nest(env.measure, 0, 0)) if hasattr(env, "measure") else None
+  total, steps, alive, ended = np.zeros(episodes), np.zeros(episodes), np.ones(episodes, bool), np.zeros(episodes, bool)
+  sums: dict[str, np.ndarray] = {}
   while alive.any():
-    streams, rows = rollout.chunk(params, streams, 50)
+    streams, rows = rollout.chunk(params, streams, 50 if measure is None else 1, jnp.full((1, episodes), drive))
     reward, terminated, done = (np.asarray(x)[:, 0] for x in (rows.reward, rows.terminated, rows.terminated | rows.truncated))
     for r, t, d in zip(reward, terminated, done):
       total += r * alive
-      ended += int((t & alive).sum())
-      alive &= ~d
-  return {"episodes": episodes, "return_mean": float(total.mean()), "return_iqm": float(bootstrap.iqm(total)), "return_ci": bootstrap.interval(total),
-          "terminations": ended, "returns": [round(float(x), 2) for x in total]}
+      ended |= t & alive
+      alive = alive & ~d
+    if measure is not None:
+      steps += alive
+      for name, value in measure(streams.env).items():
+        sums[name] = sums.get(name, 0.0) + np.asarray(value)[0] * alive
+  return total, steps, sums, ended

@@ -1,4 +1,6 @@
 """The two physics backends: bits, independence of what was stepped before, and parity between them."""
+import copy
+
 import jax
 import mujoco
 import numpy as np
@@ -227,3 +229,104 @@ def test_both_backends_read_the_fields_they_are_given(walker, pair, fields, crow
   effect = np.abs(outs["native"]).max(-1)
   assert np.median(effect) > 0.5  # [rad/s]; measured: 5.4
   assert np.median(np.abs(outs["native"] - outs["mjx"]).max(-1)) < 1e-4  # measured: 1.0e-5
+
+
+# ---- what faults need: fields, derived constants, forces, motor laws -----------------------------------------------------------------
+
+def by_hand(model, fields, qpos, qvel, ctrl, steps, force=None, law=None, task=None):
+  """Plain mujoco with `fields` written into a copy of the model and mj_setConst: (qpos, qvel), float32."""
+  model = copy.deepcopy(model)
+  for name, value in fields.items():
+    (model.opt.gravity if name == "gravity" else getattr(model, name))[...] = value
+  data = mujoco.MjData(model)
+  mujoco.mj_setConst(model, data)
+  mujoco.mj_resetData(model, data)
+  data.qpos[:], data.qvel[:] = qpos, qvel
+  if force is not None:
+    data.qfrc_applied[:] = force
+  for _ in range(steps):
+    data.ctrl[:] = ctrl if law is None else law(np, task, ctrl, data.qpos, data.qvel)
+    mujoco.mj_step(model, data)
+  return data.qpos.astype(np.float32), data.qvel.astype(np.float32)
+
+
+def changed_fields(model, num, seed=0):
+  """Masses, damping, friction, ranges and gravity of each robot; the first robot's are nominal. name -> (num, ...) float32."""
+  rng = np.random.default_rng(seed)
+  out = {}
+  for name in ("body_mass", "body_inertia", "body_ipos", "dof_damping", "dof_frictionloss", "geom_friction", "jnt_range", "gravity"):
+    nominal = np.asarray(model.opt.gravity if name == "gravity" else getattr(model, name))
+    grown = nominal * rng.uniform(0.8, 1.6, (num,) + nominal.shape) + (rng.uniform(0, 3, (num,) + nominal.shape) if name == "dof_frictionloss" else 0)
+    out[name] = np.where(np.arange(num).reshape((-1,) + (1,) * nominal.ndim) == 0, nominal, grown).astype(np.float32)
+  return out
+
+
+def test_native_with_changed_fields_equals_mujoco_bit_for_bit(walker):
+  """Derived constants of masses included, and whatever masses the batch held before; robot 0's nominal values are float64 ones that float32 rounds."""
+  num = 6
+  native = physics.make("native", walker, substeps=4)
+  step = jax.jit(jax.vmap(native.step))
+  qpos, qvel = starts(num)
+  ctrl = np.random.default_rng(3).uniform(-1, 1, (num, 6)).astype(np.float32)
+  force = np.random.default_rng(4).normal(0, 20, (num, 9)).astype(np.float32)
+  state = jax.vmap(native.init)(qpos, qvel)
+  for seed in (0, 1, 0):  # back to the first masses
+    fields = changed_fields(walker, num, seed)
+    _, out = step(fields, state, ctrl, None, force)
+    for i in range(num):
+      mine = {k: (np.asarray(walker.opt.gravity if k == "gravity" else getattr(walker, k)) if i == 0 else v[i]) for k, v in fields.items()}
+      want = by_hand(walker, mine, qpos[i], qvel[i], ctrl[i], 4, force[i])
+      np.testing.assert_array_equal(out["qpos"][i], want[0])
+      np.testing.assert_array_equal(out["qvel"][i], want[1])
+
+
+def test_nominal_fields_change_nothing(walker):
+  native = physics.make("native", walker, substeps=4)
+  qpos, qvel = starts(5)
+  state, ctrl = jax.vmap(native.init)(qpos, qvel), np.full((5, 6), 0.3, np.float32)
+  names = [n for n in changed_fields(walker, 1)]
+  nominal = {k: jax.numpy.tile(v, (5,) + (1,) * v.ndim) for k, v in physics.leaves(walker, *names).items()}
+  rows, _ = jax.jit(jax.vmap(native.step))(nominal, state, ctrl)
+  plain, _ = jax.jit(jax.vmap(native.step))({}, state, ctrl)
+  np.testing.assert_array_equal(rows, plain)
+
+
+def spring(xp, task, ctrl, qpos, qvel):
+  """A motor law with state and a parameter: PD towards ctrl, clipped."""
+  return xp.clip(task["gain"] * (ctrl - qpos[..., 3:]) - 0.1 * qvel[..., 3:], -1.0, 1.0)
+
+
+def test_motor_law_is_evaluated_at_every_physics_step(walker):
+  num = 4
+  native = physics.make("native", walker, substeps=5, law=spring)
+  qpos, qvel = starts(num)
+  ctrl = np.random.default_rng(0).uniform(-0.5, 0.5, (num, 6)).astype(np.float32)
+  task = {"gain": np.linspace(0.5, 4, num * 6).reshape(num, 6).astype(np.float32)}
+  _, out = jax.jit(jax.vmap(native.step))({}, jax.vmap(native.init)(qpos, qvel), ctrl, task)
+  for i in range(num):
+    want = by_hand(walker, {}, qpos[i], qvel[i], ctrl[i], 5, law=spring, task={"gain": task["gain"][i]})
+    np.testing.assert_array_equal(out["qpos"][i], want[0])
+    before = by_hand(walker, {}, qpos[i], qvel[i], ctrl[i], 4, law=spring, task={"gain": task["gain"][i]})
+    np.testing.assert_array_equal(out["qvel_before"][i], before[1])
+    np.testing.assert_allclose(out["ctrl"][i], spring(np, {"gain": task["gain"][i]}, ctrl[i], *before), atol=1e-6)  # from float32 states
+
+
+def test_mjx_derives_the_constants_that_mujoco_does(walker):
+  """Tolerance: float32 sums and a 9 x 9 inverse; the largest seen is 4e-6."""
+  mjx = physics.make("mjx", walker, substeps=1)
+  derive = jax.jit(lambda fields: mjx.derived(mjx._model.replace(**fields)))
+  fields = {k: v for k, v in changed_fields(walker, 4).items() if k in ("body_mass", "body_inertia", "body_ipos")}
+  for i in range(4):
+    mine = {k: v[i] for k, v in fields.items()}
+    model = copy.deepcopy(walker)
+    for name, value in mine.items():
+      getattr(model, name)[...] = value
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    for name, got in derive(mine).items():
+      want = getattr(model, name)
+      np.testing.assert_allclose(got, want, rtol=5e-5, atol=1e-6 * np.abs(want).max(), err_msg=name)
+
+
+def test_mjx_refuses_a_field_without_effect(walker):
+  with pytest.raises(UserError, match="dof_frictionloss.*choose physics native"):
+    physics.make("mjx", walker, substeps=1).model({"dof_frictionloss": np.ones(9, np.float32)})

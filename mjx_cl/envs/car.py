@@ -238,6 +238,14 @@ class Car:
     m = state.physics.motion
     return state.physics.track, m.x, m.y, m.yaw, m.vx
 
+  termination_rate = "collision_rate"  # what the share of terminated episodes is called
+
+  def measure(self, state: EnvState) -> dict[str, jax.Array]:
+    """mean_speed_m_s: speed along the track, float32 ()."""
+    m = state.physics.motion
+    sin, cos = jnp.sin(m.yaw), jnp.cos(m.yaw)
+    return {"mean_speed_m_s": progress(self.course, state.physics.track, m.x, m.y, cos * m.vx - sin * m.vy, sin * m.vx + cos * m.vy)}
+
   def reference(self, state: EnvState) -> jax.Array:
     """Action (2,) of the reference driver, which knows where the car is."""
     return pure_pursuit(self, state)

@@ -216,6 +216,14 @@ class CarReal:
     m = state.physics.motion
     return state.physics.track, m.x, m.y, m.yaw, m.vx
 
+  termination_rate = "collision_rate"
+
+  def measure(self, state: EnvState) -> dict[str, jax.Array]:
+    """mean_speed_m_s: speed along the track, float32 ()."""
+    m = state.physics.motion
+    sin, cos = jnp.sin(m.yaw), jnp.cos(m.yaw)
+    return {"mean_speed_m_s": car.progress(self.course, state.physics.track, m.x, m.y, cos * m.vx - sin * m.vy, sin * m.vx + cos * m.vy)}
+
   def reference(self, state: EnvState) -> jax.Array:
     """Action (2,) of the reference driver, which knows where the car is."""
     return car.pure_pursuit(self, state)

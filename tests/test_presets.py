@@ -1,0 +1,77 @@
+"""Named faults: they exist on their robots, say the figures that they claim, and reach `run` as their faults, targets and clocks."""
+import jax
+import numpy as np
+import pytest
+
+from mjx_cl import config, envs, fault_presets, faults
+from mjx_cl.config import RunConfig
+from mjx_cl.errors import UserError
+from mjx_cl.fault_presets import PRESETS, Change
+
+
+@pytest.fixture(scope="module")
+def robots():
+  return {name: envs.make(name, "native") for name in ("walker", "quadruped", "car_real")}
+
+
+@pytest.mark.parametrize("name", sorted(PRESETS))
+def test_every_preset_can_be_built_on_its_robot(name, robots):
+  preset = PRESETS[name]
+  assert preset.about and preset.source and (preset.robot == "*" or preset.robot in envs.ENVS)
+  assert (preset.becomes in envs.ENVS) != bool(preset.changes)
+  for env in robots.values():
+    if preset.robot in ("*", env.spec.name) and preset.changes:
+      made, plan, targets = faults.build(preset.changes, env, onset=7)
+      assert [f.name for f in made] == [c.fault for c in preset.changes]
+      np.testing.assert_allclose(plan.severity, [c.severity for c in preset.changes], rtol=1e-6)
+      assert (np.asarray(plan.onset) == [7 + c.after for c in preset.changes]).all() and (np.asarray(plan.severity) <= 1).all()
+      assert [(-1 if c.target is None else f.targets.index(c.target)) for f, c in zip(made, preset.changes)] == np.asarray(targets).tolist()
+
+
+def after(env, name, leaf):
+  """Value of a leaf under the preset, in force."""
+  made, plan, targets = faults.build(PRESETS[name].changes, env)
+  injection = faults.begin(made, jax.random.key(0), plan, targets)
+  ports = faults.drive(made, injection, 5, jax.random.key(0), faults.Ports(env.model, ctrl=np.zeros(len(env.spec.act), np.float32)))[1]
+  kind, key = leaf.split(".")
+  return np.asarray(getattr(ports.model, kind)[key])
+
+
+def test_the_papers_presets_have_the_papers_figures(robots):
+  limit = after(robots["quadruped"], "quadruped/rh-velocity-third", "task.velocity_limit")
+  rh = [i for i, j in enumerate(robots["quadruped"].spec.targets) if j.startswith("RH_")]
+  np.testing.assert_allclose(limit, np.where(np.isin(np.arange(12), rh), 2.5, 7.5), rtol=1e-6)
+  gear = after(robots["walker"], "walker/gear-half", "mj.actuator_gear")[:, 0]
+  assert sorted(gear / [100, 50, 20, 100, 50, 20]) == [0.5, 1, 1, 1, 1, 1]
+  env = robots["car_real"]
+  grip = after(env, "car/socks", "mj.geom_friction")[:, 0]
+  rear, front = (list(dict(env.spec.feet)[k]) for k in ("rear", "front"))
+  np.testing.assert_allclose(grip[rear], 0.30, rtol=1e-5)  # float32
+  np.testing.assert_allclose(grip[front], 0.65, rtol=1e-5)
+
+
+def test_delays_of_the_levels_are_3_6_9_steps():
+  for level, steps in (("easy", 3), ("medium", 6), ("hard", 9)):
+    for name in ("observation-delay", "action-delay"):
+      (change,) = PRESETS[f"any/{name}-{level}"].changes
+      assert np.ceil(np.float32(9) * np.float32(change.severity)) == steps
+
+
+def test_run_takes_a_preset_and_refuses_what_contradicts_it():
+  c = RunConfig("walker", fault="any/all-easy", duration=50)
+  assert [x.fault for x in config.changes(c)] == ["delay", "command_delay", "noise", "command_noise", "dropout", "freeze"]
+  assert all(x.duration == 50 for x in config.changes(c))
+  assert config.changes(RunConfig("walker"))[0] == Change("gear", None, 0.5)
+  assert config.changes(RunConfig("walker", severity=0.25, schedule="ramp", period=9))[0] == Change("gear", None, 0.25, schedule="ramp", period=9)
+  for kw, words in (({"fault": "any/all-easy", "severity": 0.3}, "brings its own severity"), ({"fault": "walker/nothing"}, "walker/gear-half"),
+                    ({"fault": "car/socks"}, "of robot 'car_real'"), ({"schedule": "now"}, "abrupt, ramp"), ({"period": 0}, "period"), ({"share": 1.5}, "share")):
+    with pytest.raises(UserError, match=words):
+      RunConfig("walker", **kw)
+  with pytest.raises(UserError, match="turns the robot into 'car_real'"):
+    RunConfig("car", fault="car/sim-to-real")
+
+
+def test_names_are_found_for_the_robot_that_asks():
+  with pytest.raises(UserError, match="choose from: .*car/sim-to-real") as e:
+    fault_presets.find("car/fly", "car")
+  assert "walker/" not in str(e.value)
