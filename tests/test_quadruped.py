@@ -402,8 +402,8 @@ def test_ends(native):
   np.testing.assert_array_equal(np.flatnonzero(out.terminated), [1, 2, 4])
   np.testing.assert_array_equal(np.flatnonzero(out.truncated), [6])
   figures = jax.vmap(native.env.measure)(after)
-  np.testing.assert_array_equal(figures["fall"], np.asarray(out.terminated, np.float32))
-  assert set(figures) == {"velocity_error_m_s", "fall"} and figures["velocity_error_m_s"].shape == (NUM,)
+  np.testing.assert_array_equal(after.physics.fallen, out.terminated)
+  assert set(figures) == {"velocity_error_m_s"} and figures["velocity_error_m_s"].shape == (NUM,)
 
 
 def test_a_state_that_is_no_number_ends(pair):

@@ -335,12 +335,14 @@ class Quadruped:
     obs = self._sense(key_noise, observe(qpos, qvel, gravity, command, action))
     return EnvState(after, step), Step(obs, reward, fallen, step >= self.spec.episode_steps, obs)
 
+  termination_rate = "fall_rate"  # what the share of terminated episodes is called
+
   def measure(self, state: EnvState) -> dict[str, jax.Array]:
     """The task's own figures on arriving at `state`, from the true state, float32 () each.
 
-    velocity_error_m_s: |v_xy - commanded v_xy|; its mean over steps is `eval`'s figure. fall: 1 where the base has touched the ground.
+    velocity_error_m_s: |v_xy - commanded v_xy|; its mean over steps is `eval`'s figure.
     """
-    return {"velocity_error_m_s": state.physics.velocity_error, "fall": state.physics.fallen.astype(jnp.float32)}
+    return {"velocity_error_m_s": state.physics.velocity_error}
 
   def _sense(self, key: jax.Array, obs: jax.Array) -> jax.Array:
     return obs + NOISE * jax.random.uniform(key, obs.shape, minval=-1.0, maxval=1.0)
