@@ -95,7 +95,8 @@ def certify(name: str, physics: str = "auto", episodes: int = 20, agent: str | N
   progress(f"{name}: {len(faults)} faults, acting under the same commands")
   rows = [c._asdict() | {"physics": env.physics.name, "agent": None, "episodes": 0, "return_nominal": None, "return_mean": None, "return_lost": None,
                          "return_lost_low": None, "return_lost_high": None, "kl_nats": None} for c in certificate.certify(env, faults)]
-  if not episodes or (agent is None and name not in agents.shipped()):
+  have = {name, getattr(env, "agents_of", None)} & set(agents.shipped())
+  if not episodes or (agent is None and not have):
     return rows
   trained = agents.load(agent, name, len(env.spec.obs), len(env.spec.act))
   cost = Cost(env, trained, faults, episodes)
@@ -112,7 +113,7 @@ def certify(name: str, physics: str = "auto", episodes: int = 20, agent: str | N
     for lane, own, log in zip(part, returns, logs):
       lost = nominal[0] - own
       low, high = bootstrap.interval(lost, lambda x, axis: np.mean(x, axis)) or (None, None)
-      found[lane] = {"agent": agent or name, "episodes": episodes, "return_nominal": float(nominal[0].mean()), "return_mean": float(own.mean()),
+      found[lane] = {"agent": pathlib.Path(trained.path).name, "episodes": episodes, "return_nominal": float(nominal[0].mean()), "return_mean": float(own.mean()),
                      "return_lost": float(lost.mean()), "return_lost_low": low, "return_lost_high": high, "kl_nats": divergence(log, nominal[1])}
     progress(f"{name}: cost of {min(i + at_once, len(chosen))}/{len(chosen)} settings")
   for row in rows:

@@ -390,13 +390,17 @@ def do_eval(args: Eval) -> None:
   env = envs.make(args.env, args.physics)
   trained = agents.load(args.agent, args.env, len(env.spec.obs), len(env.spec.act))
   result = evaluate.evaluate(env, trained.agent, trained.train.params, args.episodes, args.seed, int(trained.card.get("repeat", 1)), args.deterministic)
-  result = {"env": args.env, "agent": args.agent or args.env, **result}
+  result = {"env": args.env, "agent": os.path.basename(os.path.normpath(trained.path)), **result}
   if args.json:
     emit(result)
   else:
     print(f"{args.env}: return {result['return_mean']:.1f} (IQM {result['return_iqm']:.1f}, 95 % interval {result['return_ci'][0]:.1f} to "
           f"{result['return_ci'][1]:.1f}) over {args.episodes} episodes, {result['terminations']} terminations" if result["return_ci"] else
           f"{args.env}: return {result['return_mean']:.1f} in one episode")
+    base = ("env", "agent", "episodes", "return_mean", "return_iqm", "terminations")
+    figures = {k: v for k, v in result.items() if isinstance(v, (int, float)) and k not in base}
+    if figures:
+      print("  " + ", ".join(f"{k} {v:.3g}" for k, v in figures.items()))
 
 
 def do_certify(args: Certify) -> None:
@@ -436,7 +440,7 @@ def do_render(args: Render) -> None:
   acting = {"seed": args.seed, "deterministic": args.deterministic, "severity": args.severity, "onset": args.onset, "duration": args.duration}
   if args.agent in ("none", "random"):
     acting["agent"] = adapters.Puppet(len(env.spec.act), float(args.agent == "random"))
-  elif args.agent is None and args.env not in agents.shipped():
+  elif args.agent is None and not {args.env, getattr(envs.ENVS[args.env], "agents_of", None)} & set(agents.shipped()):
     raise UserError(f"no agent is shipped for {args.env}; give a folder, or --agent none (stands still), --agent random")
   else:
     trained = agents.load(args.agent, args.env, len(env.spec.obs), len(env.spec.act))

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import ml_dtypes
 import numpy as np
 
+from mjx_cl import envs
 from mjx_cl.config import DreamerConfig
 from mjx_cl.dreamer.agent import Agent, TrainState
 from mjx_cl.errors import FileError, UserError
@@ -63,13 +64,14 @@ def load(path: str | None, env_name: str, obs_size: int, act_size: int, **depart
   """Loads an agent by shipped name or folder.
 
   Args:
-    path: folder or shipped name; None: the shipped agent named as the environment.
+    path: folder or shipped name; None: the shipped agent named as the environment, or as the one whose agents it takes (`agents_of`).
     env_name: robot that it must fit.
     departures: fields of its DreamerConfig to go on with otherwise, e.g. lr; None: its own.
   Raises:
     UserError for an agent of another robot or an unknown name; FileError for a broken or foreign file.
   """
-  name = path or env_name
+  related = getattr(envs.ENVS.get(env_name), "agents_of", None)  # a robot with the same observation, action and reward
+  name = path or (related if related and env_name not in shipped() else env_name)
   folder = pathlib.Path(name)
   if not (folder / "card.json").exists():
     folder = HERE / name
@@ -80,7 +82,7 @@ def load(path: str | None, env_name: str, obs_size: int, act_size: int, **depart
     config = DreamerConfig(**card["dreamer"])
   except (OSError, ValueError, KeyError, TypeError) as e:
     raise FileError(f"{folder / 'card.json'} is not an agent's card: {e}") from None
-  if card.get("env") != env_name:
+  if card.get("env") not in (env_name, related):
     raise UserError(f"agent {name!r} was trained on {card.get('env')!r}, not on {env_name!r}")
   config = dataclasses.replace(config, warmup=0)  # whatever goes on from here does so at full learning rate
   config = dataclasses.replace(config, **{k: v for k, v in departures.items() if v is not None})

@@ -216,6 +216,7 @@ class CarReal:
     m = state.physics.motion
     return state.physics.track, m.x, m.y, m.yaw, m.vx
 
+  agents_of = "car"  # same observation, action and reward: what was learnt there may drive here
   termination_rate = "collision_rate"
 
   def measure(self, state: EnvState) -> dict[str, jax.Array]:
