@@ -74,7 +74,7 @@ def broken(env):
       "idle": ctrl("idle", lambda t, m, s, key, ports: (m, {"ctrl": ports.ctrl * 1.0})),
       "backwards": ctrl("backwards", lambda t, m, s, key, ports: (m, {"ctrl": ports.ctrl * s})),
       # the author bypasses `fault`: the change is there before the onset and at severity 0
-      "early": faults.Fault("early", ("ctrl",), ("all",), 1, lambda key, target=-1: faults.State(jnp.int32(0), ()),
+      "early": faults.Fault("early", ("ctrl",), ("all",), 1, lambda key, target=-1: faults.State(jnp.int32(0), (), ()),
                             lambda state, s, key, ports: (state, ports._replace(ctrl=ports.ctrl * 0.5)), False),
       "sound": ctrl("sound", lambda t, m, s, key, ports: (m, {"ctrl": ports.ctrl * (1 - s)})),
   }

@@ -17,11 +17,11 @@ LOCK = (10.0, 1000.0)  # [kg m^2], [N m s/rad] at severity 1
 
 
 def dofs(env, name: str) -> np.ndarray:
-  """Index of the degree of freedom that each actuator drives, int (A,)."""
+  """Which degree of freedom each actuator drives, float32 (A, nv) of 0 and 1: `mask @ dofs` is a mask of degrees of freedom."""
   model = getattr(env, "mj_model", None)
   if model is None or len(env.spec.targets) != model.nu:
     raise UserError(f"fault {name!r} needs a robot with one motor per joint, which {env.spec.name!r} is not")
-  return model.jnt_dofadr[model.actuator_trnid[:, 0]]
+  return np.eye(model.nv, dtype=np.float32)[model.jnt_dofadr[model.actuator_trnid[:, 0]]]
 
 
 def gear(env) -> Fault:
@@ -34,10 +34,10 @@ def gear(env) -> Fault:
   """
   names, mask, single = actuator_targets(env)
 
-  def act(target, memory, severity, key, ports):
+  def act(hit, memory, severity, key, ports):
     value = ports.model.mj["actuator_gear"]
-    return memory, {"mj.actuator_gear": jnp.where(mask[target][:, None], value * (1.0 - severity), value)}
-  return fault("gear", env, ("mj.actuator_gear",), names, act, drawn=single)
+    return memory, {"mj.actuator_gear": jnp.where(hit[:, None], value * (1.0 - severity), value)}
+  return fault("gear", env, ("mj.actuator_gear",), names, act, drawn=single, rows=mask)
 
 
 def torque_loss(env) -> Fault:
@@ -51,13 +51,12 @@ def torque_loss(env) -> Fault:
   names, mask, single = actuator_targets(env)
   leaf = "task.strength" if "strength" in env.model.task else "mj.actuator_gear"
 
-  def act(target, memory, severity, key, ports):
+  def act(hit, memory, severity, key, ports):
     kind, name = leaf.split(".")
     value = getattr(ports.model, kind)[name]
-    hit = mask[target].reshape((-1,) + (1,) * (value.ndim - 1))
-    return memory, {leaf: jnp.where(hit, value * (1.0 - severity), value)}
+    return memory, {leaf: jnp.where(hit.reshape((-1,) + (1,) * (value.ndim - 1)), value * (1.0 - severity), value)}
   reason = "" if leaf.startswith("mj.") else "the position loop runs at every physics step, so a joint held less firmly may end a control step anywhere"
-  return fault("torque_loss", env, (leaf,), names, act, drawn=single, not_monotone=reason)
+  return fault("torque_loss", env, (leaf,), names, act, drawn=single, not_monotone=reason, rows=mask)
 
 
 def velocity_limit(env) -> Fault:
@@ -70,10 +69,10 @@ def velocity_limit(env) -> Fault:
   """
   names, mask, single = actuator_targets(env)
 
-  def act(target, memory, severity, key, ports):
+  def act(hit, memory, severity, key, ports):
     value = ports.model.task["velocity_limit"]
-    return memory, {"task.velocity_limit": jnp.where(mask[target], value * (1.0 - 0.95 * severity), value)}
-  return fault("velocity_limit", env, ("task.velocity_limit",), names, act, drawn=single)
+    return memory, {"task.velocity_limit": jnp.where(hit, value * (1.0 - 0.95 * severity), value)}
+  return fault("velocity_limit", env, ("task.velocity_limit",), names, act, drawn=single, rows=mask)
 
 
 def joint_lock(env) -> Fault:
@@ -87,24 +86,23 @@ def joint_lock(env) -> Fault:
   joints, facts 4.2.
   """
   names, mask, single = actuator_targets(env)
-  at = dofs(env, "joint_lock")
+  hits = mask.astype(jnp.float32) @ dofs(env, "joint_lock")
 
-  def act(target, memory, severity, key, ports):
-    extra = jnp.where(mask[target], severity * severity, 0.0)
+  def act(hit, memory, severity, key, ports):
+    extra = severity * severity * hit
     armature, damping = ports.model.mj["dof_armature"], ports.model.mj["dof_damping"]
-    return memory, {"mj.dof_armature": armature.at[at].add(LOCK[0] * extra), "mj.dof_damping": damping.at[at].add(LOCK[1] * extra)}
-  return fault("joint_lock", env, ("mj.dof_armature", "mj.dof_damping"), names, act, drawn=single)
+    return memory, {"mj.dof_armature": armature + LOCK[0] * extra, "mj.dof_damping": damping + LOCK[1] * extra}
+  return fault("joint_lock", env, ("mj.dof_armature", "mj.dof_damping"), names, act, drawn=single, rows=hits)
 
 
 def _command(name, env, change, memory=(), not_monotone=""):
   """A fault of the command alone; change(hit (A,), memory, severity, key, ports) -> (memory', ctrl')."""
   names, mask, single = actuator_targets(env)
 
-  def act(target, memory, severity, key, ports):
-    hit = mask[target]
+  def act(hit, memory, severity, key, ports):
     memory, value = change(hit, memory, severity, key, ports)
     return memory, {"ctrl": jnp.where(hit, value, ports.ctrl)}
-  return fault(name, env, ("ctrl",), names, act, memory, single, not_monotone)
+  return fault(name, env, ("ctrl",), names, act, memory, single, not_monotone, mask)
 
 
 def stuck(env) -> Fault:

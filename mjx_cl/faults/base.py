@@ -33,8 +33,15 @@ class Ports(NamedTuple):
 
 
 class State(NamedTuple):
-  """fstate of a fault: target int32 (), index into its `targets`; memory, a pytree (delay lines, held values), () where there is none."""
+  """fstate of a fault.
+
+  Attributes:
+    target: int32 (), index into its `targets`.
+    row: what the target stands for (a mask, a direction), looked up once; the target itself where there is no table.
+    memory: a pytree (delay lines, held values), () where there is none.
+  """
   target: jax.Array
+  row: Any
   memory: Any
 
 
@@ -91,17 +98,18 @@ def write(ports: Ports, name: str, value: jax.Array) -> Ports:
   return ports._replace(model=ports.model._replace(force=value)) if kind == "force" else ports._replace(**{kind: value})
 
 
-def fault(name: str, env, owns: tuple[str, ...], targets, act, memory=(), drawn: int | None = None, not_monotone: str = "") -> Fault:
+def fault(name: str, env, owns: tuple[str, ...], targets, act, memory=(), drawn: int | None = None, not_monotone: str = "", rows=None) -> Fault:
   """Builds a Fault of `env`.
 
   Args:
     name: registry name.
     owns: names of its leaves; "obs" is owned alone.
     targets: names, the ones that may be drawn first.
-    act: (target, memory, severity, key, ports) -> (memory', {owned leaf: new value}); for severity > 0 the values take effect.
+    act: (row, memory, severity, key, ports) -> (memory', {owned leaf: new value}); for severity > 0 the values take effect.
     memory: initial memory, a pytree of arrays; renewed where ports.first says so by `act` itself.
     drawn: a target that is not named is drawn from the first so many; None: from all.
     not_monotone: why a greater severity need not make a greater difference at first.
+    rows: array of what each target stands for, leading (targets,); `act` gets the row of its target. None: it gets the target's index.
   Raises:
     UserError where `env` lacks one of the leaves.
   """
@@ -118,16 +126,16 @@ def fault(name: str, env, owns: tuple[str, ...], targets, act, memory=(), drawn:
   def init(key, target=-1):
     target = jnp.asarray(target)
     index = jnp.where(target < 0, jax.random.randint(key, (), 0, count), target).astype(jnp.int32)
-    return State(index, jax.tree.map(jnp.asarray, memory))
+    return State(index, index if rows is None else jnp.asarray(rows)[index], jax.tree.map(jnp.asarray, memory))
 
   def apply(state, severity, key, ports: Ports):
-    kept, values = act(state.target, state.memory, severity, key, ports)
+    kept, values = act(state.row, state.memory, severity, key, ports)
     if set(values) != set(owns):
       raise ValueError(f"fault {name!r} owns {', '.join(owns)} but gave {', '.join(sorted(values))}")
     for leaf, value in values.items():
       old = read(ports, leaf)
       ports = write(ports, leaf, jnp.where(severity > 0, value.astype(old.dtype), old))
-    return State(state.target, kept), ports
+    return state._replace(memory=kept), ports
 
   return Fault(name, tuple(owns), targets, count, init, apply, senses, not_monotone)
 
@@ -197,7 +205,7 @@ def _apply(faults, injection, t, key, ports, severity, senses):
 def none(env) -> Fault:
   """No fault at all: the nominal robot."""
   del env
-  return Fault("none", (), ("all",), 1, lambda key, target=-1: State(jnp.int32(0), ()), lambda state, severity, key, ports: (state, ports), False)
+  return Fault("none", (), ("all",), 1, lambda key, target=-1: State(jnp.int32(0), (), ()), lambda state, severity, key, ports: (state, ports), False)
 
 
 # ---- targets -------------------------------------------------------------------------------------------------------------------------

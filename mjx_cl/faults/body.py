@@ -54,11 +54,11 @@ def com(env) -> Fault:
   model, trunk = env.mj_model, int(env.spec.bodies[0][1][0])
   gyration = float(np.sqrt(model.body_inertia[trunk].sum() / 2 / model.body_mass[trunk]))
   names, directions = heading_targets(env, ("forward", "backward", "left", "right", "up", "down"))
+  of_trunk = (jnp.arange(model.nbody) == trunk)[:, None]
 
-  def act(target, memory, severity, key, ports):
-    value = ports.model.mj["body_ipos"]
-    return memory, {"mj.body_ipos": value.at[trunk].add(0.5 * severity * gyration * directions[target])}
-  return fault("com", env, ("mj.body_ipos",), names, act)
+  def act(direction, memory, severity, key, ports):
+    return memory, {"mj.body_ipos": ports.model.mj["body_ipos"] + jnp.where(of_trunk, 0.5 * severity * gyration * direction, 0.0)}
+  return fault("com", env, ("mj.body_ipos",), names, act, rows=directions)
 
 
 def limb_mass(env) -> Fault:
@@ -70,10 +70,10 @@ def limb_mass(env) -> Fault:
   names, mask = _bodies(env, "limb_mass")
   names, mask = names[1:], mask[1:]
 
-  def act(target, memory, severity, key, ports):
-    grown = jnp.where(mask[target], 1.0 + 2.0 * severity, 1.0)
+  def act(hit, memory, severity, key, ports):
+    grown = jnp.where(hit, 1.0 + 2.0 * severity, 1.0)
     return memory, {"mj.body_mass": ports.model.mj["body_mass"] * grown, "mj.body_inertia": ports.model.mj["body_inertia"] * grown[:, None]}
-  return fault("limb_mass", env, ("mj.body_mass", "mj.body_inertia"), names, act)
+  return fault("limb_mass", env, ("mj.body_mass", "mj.body_inertia"), names, act, rows=mask)
 
 
 def joint_damping(env) -> Fault:
@@ -83,11 +83,11 @@ def joint_damping(env) -> Fault:
   Source: facts 4.5.
   """
   names, mask, single = actuator_targets(env)
-  at = dofs(env, "joint_damping")
+  hits = mask.astype(jnp.float32) @ dofs(env, "joint_damping")
 
-  def act(target, memory, severity, key, ports):
-    return memory, {"mj.dof_damping": ports.model.mj["dof_damping"].at[at].add(jnp.where(mask[target], 10.0 * severity, 0.0))}
-  return fault("joint_damping", env, ("mj.dof_damping",), names, act, drawn=single)
+  def act(hit, memory, severity, key, ports):
+    return memory, {"mj.dof_damping": ports.model.mj["dof_damping"] + 10.0 * severity * hit}
+  return fault("joint_damping", env, ("mj.dof_damping",), names, act, drawn=single, rows=hits)
 
 
 def joint_friction(env) -> Fault:
@@ -97,18 +97,18 @@ def joint_friction(env) -> Fault:
   friction constraint for a model that has none and refuses it there; C MuJoCo (physics native) does.
   """
   names, mask, single = actuator_targets(env)
-  at = dofs(env, "joint_friction")
+  which = dofs(env, "joint_friction")
   model = env.mj_model
-  torque = jnp.asarray(np.abs(model.actuator_gear[:, 0] * model.actuator_ctrlrange[:, 1]), jnp.float32)
-  if not (np.asarray(torque) > 0).all():
+  torque = np.abs(model.actuator_gear[:, 0] * model.actuator_ctrlrange[:, 1]).astype(np.float32)
+  if not (torque > 0).all():
     raise UserError(f"fault 'joint_friction' needs motors with a greatest torque (ctrlrange), which robot {env.spec.name!r} does not state")
   if env.physics.name == "mjx" and not (model.dof_frictionloss > 0).any():
     raise UserError("fault 'joint_friction': MJX builds no friction constraint for a model whose joints have none, so it would do nothing; "
                     "choose physics native")
 
-  def act(target, memory, severity, key, ports):
-    return memory, {"mj.dof_frictionloss": ports.model.mj["dof_frictionloss"].at[at].add(jnp.where(mask[target], 0.25 * severity * torque, 0.0))}
-  return fault("joint_friction", env, ("mj.dof_frictionloss",), names, act, drawn=single)
+  def act(greatest, memory, severity, key, ports):
+    return memory, {"mj.dof_frictionloss": ports.model.mj["dof_frictionloss"] + 0.25 * severity * greatest}
+  return fault("joint_friction", env, ("mj.dof_frictionloss",), names, act, drawn=single, rows=(mask * torque) @ which)
 
 
 def range_loss(env) -> Fault:
@@ -126,14 +126,14 @@ def range_loss(env) -> Fault:
                     + ", ".join(env.spec.targets[i] for i in np.flatnonzero(~model.jnt_limited[joints].astype(bool))))
   stance = getattr(env, "stance", None)  # joint angles of standing, in actuator order
   stance = model.qpos0[model.jnt_qposadr[joints]] if stance is None else np.asarray(stance)
-  middle = jnp.asarray(np.clip(stance, *model.jnt_range[joints].T), jnp.float32)[:, None]
+  middle = np.zeros((model.njnt, 1), np.float32)
+  middle[joints, 0] = np.clip(stance, *model.jnt_range[joints].T)
+  hits = jnp.zeros((len(names), model.njnt), bool).at[:, joints].set(mask)
 
-  def act(target, memory, severity, key, ports):
+  def act(hit, memory, severity, key, ports):
     value = ports.model.mj["jnt_range"]
-    mine = value[joints]
-    shrunk = mine + 0.95 * severity * (middle - mine)
-    return memory, {"mj.jnt_range": value.at[joints].set(jnp.where(mask[target][:, None], shrunk, mine))}
-  return fault("range_loss", env, ("mj.jnt_range",), names, act, drawn=single)
+    return memory, {"mj.jnt_range": jnp.where(hit[:, None], value + 0.95 * severity * (middle - value), value)}
+  return fault("range_loss", env, ("mj.jnt_range",), names, act, drawn=single, rows=hits)
 
 
 DIRECTIONS = {"forward": (1, 0, 0), "backward": (-1, 0, 0), "left": (0, 1, 0), "right": (0, -1, 0), "up": (0, 0, 1), "down": (0, 0, -1)}

@@ -35,12 +35,11 @@ def friction(env) -> Fault:
     check_priority(env, everything)
   mask = jnp.asarray([[i in hit for i in range(size)] for _, hit in feet])
 
-  def act(target, memory, severity, key, ports):
+  def act(hit, memory, severity, key, ports):
     kind, name = leaf.split(".")
     value = getattr(ports.model, kind)[name]
-    hit = mask[target].reshape((-1,) + (1,) * (value.ndim - 1))
-    return memory, {leaf: jnp.where(hit, value * (1.0 - 0.95 * severity), value)}
-  return fault("friction", env, (leaf,), names, act)
+    return memory, {leaf: jnp.where(hit.reshape((-1,) + (1,) * (value.ndim - 1)), value * (1.0 - 0.95 * severity), value)}
+  return fault("friction", env, (leaf,), names, act, rows=mask)
 
 
 def check_priority(env, geoms) -> None:
@@ -65,13 +64,13 @@ def slope(env) -> Fault:
   names, directions = heading_targets(env, ("forward", "backward", "left", "right"))
   leaf = "task.gravity" if "gravity" in env.model.task else "mj.gravity"
 
-  def act(target, memory, severity, key, ports):
+  def act(direction, memory, severity, key, ports):
     kind, name = leaf.split(".")
     value = getattr(ports.model, kind)[name]
     angle = jnp.deg2rad(20.0) * severity
-    tilted = jnp.linalg.norm(value) * (jnp.sin(angle) * directions[target] - jnp.cos(angle) * jnp.asarray([0.0, 0.0, 1.0]))
+    tilted = jnp.linalg.norm(value) * (jnp.sin(angle) * direction - jnp.cos(angle) * jnp.asarray([0.0, 0.0, 1.0]))
     return memory, {leaf: tilted}
-  return fault("slope", env, (leaf,), names, act)
+  return fault("slope", env, (leaf,), names, act, rows=directions)
 
 
 def whole_mass(env) -> float:
@@ -85,11 +84,11 @@ def wind(env) -> Fault:
   Severity: 1 is 30 % of the weight. Target: the direction of the wind in the world: forward (+x), backward, left, right. Owns `force` (nv,).
   """
   names, directions = heading_targets(env, ("forward", "backward", "left", "right"))
-  newton, onto = 0.3 * 9.81 * whole_mass(env), jnp.asarray(force_map(env))
+  blows = 0.3 * 9.81 * whole_mass(env) * directions @ force_map(env)
 
-  def act(target, memory, severity, key, ports):
-    return memory, {"force": ports.model.force + severity * newton * directions[target] @ onto}
-  return fault("wind", env, ("force",), names, act)
+  def act(blow, memory, severity, key, ports):
+    return memory, {"force": ports.model.force + severity * blow}
+  return fault("wind", env, ("force",), names, act, rows=blows)
 
 
 def push(env) -> Fault:
@@ -101,13 +100,14 @@ def push(env) -> Fault:
   direction of the latest blow. Source: pushes, facts 1.6 and 4.2.
   """
   _, directions = heading_targets(env, ("forward", "backward", "left", "right"))
-  newton, onto = 1.5 * whole_mass(env) / (PUSH_FOR * env.spec.control_s), jnp.asarray(force_map(env))
+  blows = 1.5 * whole_mass(env) / (PUSH_FOR * env.spec.control_s) * directions @ force_map(env)  # (directions, nv)
 
   def act(target, memory, severity, key, ports):
     phase = jnp.mod(ports.since, PUSH_EVERY)
     which = jnp.where(phase == 0, jax.random.randint(key, (), 0, directions.shape[0]), memory)
-    blow = jnp.where(phase < PUSH_FOR, severity * newton, 0.0)
-    return which, {"force": ports.model.force + blow * directions[which] @ onto}
+    strength = jnp.where(phase < PUSH_FOR, severity, 0.0)
+    chosen = (jnp.arange(blows.shape[0]) == which)[:, None]
+    return which, {"force": ports.model.force + strength * jnp.sum(jnp.where(chosen, blows, 0.0), 0)}
   return fault("push", env, ("force",), ("trunk",), act, jnp.int32(0))
 
 

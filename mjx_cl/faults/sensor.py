@@ -20,10 +20,10 @@ def _sensor(name, env, change, memory=(), not_monotone=""):
   names, mask, single = channel_targets(env)
   scale = jnp.asarray([v.scale for v in env.spec.obs], jnp.float32)
 
-  def act(target, memory, severity, key, ports):
+  def act(hit, memory, severity, key, ports):
     memory, value = change(memory, severity, key, ports, scale)
-    return memory, {"obs": jnp.where(mask[target], value, ports.obs)}
-  return fault(name, env, ("obs",), names, act, memory, single, not_monotone)
+    return memory, {"obs": jnp.where(hit, value, ports.obs)}
+  return fault(name, env, ("obs",), names, act, memory, single, not_monotone, mask)
 
 
 def bias(env) -> Fault:
@@ -105,13 +105,12 @@ def lidar_loss(env) -> Fault:
   if not beams:
     raise UserError(f"fault 'lidar_loss' needs a lidar, which robot {env.spec.name!r} does not have")
   size = len(env.spec.obs)
-  mask = jnp.asarray([[i in hit for i in range(size)] for _, hit in beams])
-  rank = jnp.asarray([[hit.index(i) / len(hit) if i in hit else 2.0 for i in range(size)] for _, hit in beams])  # place in the sector
+  rank = jnp.asarray([[hit.index(i) / len(hit) if i in hit else 2.0 for i in range(size)] for _, hit in beams])  # place in the sector, 2 outside it
   high = jnp.asarray([v.high if v.high < 1e9 else 0.0 for v in env.spec.obs], jnp.float32)
 
-  def act(target, memory, severity, key, ports):
-    return memory, {"obs": jnp.where(mask[target] & (rank[target] < severity), high, ports.obs)}
-  return fault("lidar_loss", env, ("obs",), [name for name, _ in beams], act)
+  def act(place, memory, severity, key, ports):
+    return memory, {"obs": jnp.where(place < severity, high, ports.obs)}
+  return fault("lidar_loss", env, ("obs",), [name for name, _ in beams], act, rows=rank)
 
 
 SENSOR = {"bias": bias, "drift": drift, "scale": scale, "noise": noise, "dropout": dropout, "freeze": freeze, "delay": delay, "lidar_loss": lidar_loss}

@@ -6,6 +6,7 @@ result depends on what the batch object held before: XLA may repeat or reorder c
 """
 from __future__ import annotations
 
+import functools
 import threading
 import time
 
@@ -74,11 +75,36 @@ class Native:
     return row.at[at:at + nq].set(float64_bits(qpos)).at[at + nq:at + nq + nv].set(float64_bits(qvel))
 
   def step(self, fields: dict[str, jax.Array], state: jax.Array, ctrl: jax.Array, task=None, force=None):
-    """`substeps` x mj_step of one robot; a vmap of it steps all robots in one call on all threads."""
-    shapes = {o: jax.ShapeDtypeStruct(s, jnp.float32) for o, s in self._shapes.items()}
-    result = (jax.ShapeDtypeStruct(self._template.shape, jnp.uint32), shapes)
-    task = {} if self.law is None else dict(task or {})
-    return jax.pure_callback(self._host_step, result, fields, state, ctrl, task, force, vmap_method="broadcast_all")
+    """`substeps` x mj_step of one robot; a vmap of it steps all robots in one call on all threads.
+
+    Everything crosses to the host and back as one array of bits each way: an operand of a callback costs some 20 us, however small.
+    """
+    given = {"ctrl": ctrl} | ({} if force is None else {"force": force}) | {f"field {k}": v for k, v in fields.items()}
+    given |= {f"task {k}": v for k, v in (task or {}).items()} if self.law is not None else {}
+    given = {k: jnp.asarray(v, jnp.float32) for k, v in given.items()}
+    layout = tuple((k, v.shape) for k, v in given.items())
+    bits = lambda x: jax.lax.bitcast_convert_type(x, jnp.uint32).reshape(-1)
+    width = state.shape[0] + sum(int(np.prod(s)) for s in self._shapes.values())
+    out = jax.pure_callback(functools.partial(self._packed_step, layout), jax.ShapeDtypeStruct((width,), jnp.uint32),
+                            jnp.concatenate([state] + [bits(v) for v in given.values()]), vmap_method="broadcast_all")
+    values, at = {}, state.shape[0]
+    for name, shape in self._shapes.items():
+      size = int(np.prod(shape))
+      values[name] = jax.lax.bitcast_convert_type(out[at:at + size], jnp.float32).reshape(shape)
+      at += size
+    return out[:state.shape[0]], values
+
+  def _packed_step(self, layout, packed):
+    """`_host_step` on one array of bits, (..., state + everything in `layout`) -> (..., state + outputs)."""
+    packed = np.asarray(packed)
+    lead, at, given = packed.shape[:-1], self._template.shape[0], {}
+    for name, shape in layout:
+      size = int(np.prod(shape))
+      given[name] = packed[..., at:at + size].view(np.float32).reshape(lead + shape)
+      at += size
+    part = lambda kind: {k[len(kind) + 1:]: v for k, v in given.items() if k.startswith(kind + " ")}
+    rows, out = self._host_step(part("field"), packed[..., :self._template.shape[0]], given["ctrl"], part("task"), given.get("force"))
+    return np.concatenate([rows] + [out[o].reshape(lead + (-1,)).view(np.uint32) for o in self._shapes], -1)
 
   def _host_step(self, fields, state, ctrl, task=None, force=None):
     begin = time.perf_counter()
@@ -114,8 +140,11 @@ class Native:
     """Model fields of every robot, in double precision where they are the nominal ones; constants derived of a changed mass are renewed."""
     stale = np.zeros(num, bool)
     for name, value in fields.items():
-      view, own = views["field " + name], views["nominal " + name]
+      view, own, held = views["field " + name], views["nominal " + name], views["held " + name]
       value = np.asarray(value).reshape(view.shape)
+      if np.array_equal(value, held):  # what a field holds is a function of the last value written alone, so it is there already
+        continue
+      held[...] = value
       value = np.where(value == own.astype(np.float32), own, value)  # float32 cannot hold every nominal value: severity 0 is the model itself
       if name in DERIVING:
         stale |= (view != value).reshape(num, -1).any(1)
@@ -131,6 +160,7 @@ class Native:
       if force:
         views["force"] = batch.bind("qfrc_applied")
       views |= {"field " + f: batch.expand(f) for f in fields}
+      views |= {"held " + f: np.full(views["field " + f].shape, np.nan, np.float32) for f in fields}  # equal to nothing yet
       views |= {"nominal " + f: np.array(views["field " + f][0]) for f in fields}
       views |= {"out " + o: batch.bind(o) for o in self.outputs}
       self._batches[key] = (batch, views)
