@@ -440,7 +440,7 @@ def do_render(args: Render) -> None:
   acting = {"seed": args.seed, "deterministic": args.deterministic, "severity": args.severity, "onset": args.onset, "duration": args.duration}
   if args.agent in ("none", "random"):
     acting["agent"] = adapters.Puppet(len(env.spec.act), float(args.agent == "random"))
-  elif args.agent is None and not {args.env, getattr(envs.ENVS[args.env], "agents_of", None)} & set(agents.shipped()):
+  elif args.agent is None and not {args.env, getattr(envs.ENVS.get(args.env), "agents_of", None)} & set(agents.shipped()):
     raise UserError(f"no agent is shipped for {args.env}; give a folder, or --agent none (stands still), --agent random")
   else:
     trained = agents.load(args.agent, args.env, len(env.spec.obs), len(env.spec.act))

@@ -123,7 +123,7 @@ def repeated(tiny, tiny_params):
   env = envs.make("walker", "native")
   env.spec = env.spec._replace(episode_steps=5)
   fault = faults.make("gear", env)
-  roll = Rollout(env, tiny, fault, repeat=2, expert=lambda obs: jnp.tanh(obs[:6] + obs[15:21]))
+  roll = Rollout(env, tiny, fault, repeat=2, expert=lambda stream: jnp.tanh(stream.obs[:6] + stream.obs[15:21]))
   begin, params = streams_of(env, tiny, fault, 1, 2), at(tiny_params, slice(0, 1))
   end, rows = roll.chunk(params, begin, length=8, drive=jnp.array([[True, False]]))
   return env, params, begin, end, jax.tree.map(np.asarray, rows)

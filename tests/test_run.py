@@ -384,17 +384,27 @@ def test_load_overrides_how_it_goes_on(saved):
   assert (config.lr, config.last_starts, config.warmup) == (1e-5, 4, 0)
 
 
-def test_the_shipped_agents_load():
-  assert agents.shipped() == ["walker"]
-  trained = agents.load(None, "walker", 24, 6)
-  assert trained.card["env"] == "walker" and {"command", "dreamer", "repeat"} <= set(trained.card) and int(trained.train.updates) > 0
+@pytest.mark.parametrize("name, obs, act", [("walker", 24, 6), ("car", 67, 2)])
+def test_the_shipped_agents_load(name, obs, act):
+  assert name in agents.shipped()
+  trained = agents.load(None, name, obs, act)
+  assert trained.card["env"] == name and {"command", "dreamer", "repeat"} <= set(trained.card) and int(trained.train.updates) > 0
   assert all(np.isfinite(x).all() for x in jax.tree.leaves(trained.train))
+
+
+def test_a_related_robot_takes_the_agent():
+  """car_real has observation, action and reward of car; the walker has not."""
+  assert agents.load(None, "car_real", 67, 2).card["env"] == agents.load("car", "car_real", 67, 2).card["env"] == "car"
+  with pytest.raises(UserError, match="trained on 'car', not on 'walker'"):
+    agents.load("car", "walker", 24, 6)
+  with pytest.raises(UserError, match="trained on 'walker', not on 'car_real'"):
+    agents.load("walker", "car_real", 67, 2)
 
 
 def test_load_refuses_what_does_not_fit(saved, tmp_path):
   with pytest.raises(FileError, match="does not fit"):
     agents.load(str(saved), "walker", 25, 6)
-  with pytest.raises(UserError, match="shipped: walker"):
+  with pytest.raises(UserError, match="shipped: car, walker"):
     agents.load(str(tmp_path / "none"), "walker", 24, 6)
 
 

@@ -4,6 +4,7 @@ import pathlib
 import shutil
 import subprocess
 import sys
+import types
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +12,7 @@ import numpy as np
 import pyarrow.parquet
 import pytest
 
-from mjx_cl import checkpoint, demonstrator, replay as replay_lib, train
+from mjx_cl import checkpoint, demonstrator, envs, replay as replay_lib, train
 from mjx_cl.config import PRESETS, TrainConfig, replace
 from mjx_cl.errors import FileError, UserError
 
@@ -188,7 +189,16 @@ def test_expert_drives_its_share_and_is_labelled_everywhere(short_walker, tmp_pa
   for e in range(ENVS):
     followed = np.allclose(data.action[e][at[e]], data.demo[e][at[e]], atol=1e-5)  # the expert's own action, without noise
     assert followed == (e < 2), e
-  np.testing.assert_allclose(data.demo[at], trainer.expert(data.obs[at]), atol=1e-5)  # float32 in another order
+  np.testing.assert_allclose(data.demo[at], demonstrator.load(expert_path)(data.obs[at]), atol=1e-5)  # float32 in another order
+
+
+def test_the_reference_driver_is_a_demonstrator(short_walker):
+  env = envs.make("car")
+  state, obs = env.init(env.model, jax.random.key(0))
+  stream = types.SimpleNamespace(env=state, obs=obs)
+  np.testing.assert_array_equal(train.expert(env, "reference")(stream), env.reference(state))
+  with pytest.raises(UserError, match="'walker' has no reference driver"):
+    train.expert(short_walker, "reference")
 
 
 def test_cloning_ends_when_the_agent_is_good_enough(short_walker, tmp_path, expert_path):
