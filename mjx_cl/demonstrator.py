@@ -71,16 +71,42 @@ def _to_policy(params) -> Policy:
   return Policy(normalizer.mean, normalizer.std, tuple((layers[n]["kernel"], layers[n]["bias"]) for n in names))
 
 
+class Shaped:
+  """A robot with an easier reward for its demonstrator alone, who only has to show the way: terms weighted otherwise, and a constant added.
+
+  Where penalties outweigh what a beginner earns, each step costs, and PPO learns to end its episode by falling.
+
+  Args:
+    env: robot with `reward_terms`. weights: term -> factor on its weight. bonus: added to every step's reward.
+  """
+
+  def __init__(self, env, weights: dict[str, float], bonus: float):
+    self.env, self.bonus = env, bonus
+    factors = jnp.asarray([weights.get(name, 1.0) for name in env.reward_terms], jnp.float32)
+    self.model = env.model._replace(task=env.model.task | {"reward_weights": env.model.task["reward_weights"] * factors})
+
+  def __getattr__(self, name):
+    return getattr(self.env, name)
+
+  def step(self, model, state, action):
+    state, out = self.env.step(model, state, action)
+    return state, out._replace(reward=out.reward + self.bonus)
+
+
+PPO = {"discounting": 0.995, "entropy_cost": 1e-2, "reward_scaling": 10.0}
+
+
 def train(env, out: str | os.PathLike, steps: int, seed: int = 0, evals: int = 12, progress=lambda row: None) -> list[dict]:
   """Trains PPO and keeps one policy per evaluation as OUT/policy_NN.npz, with OUT/curve.json.
 
-  Settings: 256 environments, unroll 30, 16 minibatches of 256 x 30, 6 epochs, lr 1e-3, entropy 1e-2, discount 0.995, reward x 10,
-  observations normalised, policy and value 3 x 128.
+  Settings: 256 environments, unroll 30, 16 minibatches of 256 x 30, 6 epochs, lr 1e-3, observations normalised, policy and value 3 x 128, and `PPO`
+  unless the robot has its own in `env.demonstration` (`ppo`, and `weights` and `bonus` of Shaped).
 
   Returns:
-    Rows {step, return, seconds}, return = mean over 128 episodes of the stochastic policy.
+    Rows {step, return, seconds}, return = mean over 128 episodes of the stochastic policy, of the shaped reward where there is one.
   """
-  adapter = brax_env(env)
+  own = getattr(env, "demonstration", {})
+  adapter = brax_env(Shaped(env, own["weights"], own["bonus"]) if "bonus" in own else env)
   from brax.training.agents.ppo import networks, train as ppo
   out = pathlib.Path(out)
   out.mkdir(parents=True, exist_ok=True)
@@ -99,9 +125,10 @@ def train(env, out: str | os.PathLike, steps: int, seed: int = 0, evals: int = 1
 
   ppo.train(
       environment=adapter, num_timesteps=steps, episode_length=env.spec.episode_steps, num_envs=256, unroll_length=30, num_minibatches=16,
-      batch_size=256, num_updates_per_batch=6, learning_rate=1e-3, entropy_cost=1e-2, discounting=0.995, reward_scaling=10.0,
-      normalize_observations=True, seed=seed, num_evals=evals, progress_fn=on_progress, policy_params_fn=on_params,
-      network_factory=functools.partial(networks.make_ppo_networks, policy_hidden_layer_sizes=(128,) * 3, value_hidden_layer_sizes=(128,) * 3))
+      batch_size=256, num_updates_per_batch=6, learning_rate=1e-3, normalize_observations=True, seed=seed, num_evals=evals,
+      progress_fn=on_progress, policy_params_fn=on_params,
+      network_factory=functools.partial(networks.make_ppo_networks, policy_hidden_layer_sizes=(128,) * 3, value_hidden_layer_sizes=(128,) * 3),
+      **PPO | own.get("ppo", {}))
   return rows
 
 

@@ -310,7 +310,7 @@ def build(env, dreamer: DreamerConfig, config: TrainConfig, out, seed: int, seed
   if demonstrator_name == "ppo":
     path = out / "demonstrator" / "policy.npz"
     if not path.exists():
-      demonstrator.train(env, out / "demonstrator", DEMONSTRATOR_STEPS, seed, progress=lambda row: print(
+      demonstrator.train(env, out / "demonstrator", getattr(env, "demonstration", {}).get("steps", DEMONSTRATOR_STEPS), seed, progress=lambda row: print(
           f"demonstrator: {row['step']:,} steps, return {row['return']:.0f}", file=sys.stderr, flush=True))
       os.replace(sorted((out / "demonstrator").glob("policy_*.npz"))[-1], path)
     config = dataclasses.replace(config, demonstrator=str(path))

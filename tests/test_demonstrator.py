@@ -50,3 +50,17 @@ def test_adapter_steps_like_the_environment():
   np.testing.assert_array_equal(after.obs, step.final_obs)
   np.testing.assert_array_equal(after.reward, step.reward)
   assert float(after.done) == 0.0
+
+
+def test_shaped_reward_is_the_demonstrators_alone():
+  env = envs.make("quadruped", "native")
+  own = env.demonstration
+  shaped = demonstrator.Shaped(env, own["weights"], own["bonus"])
+  state, _ = env.init(env.model, jax.random.key(0))
+  action = jnp.linspace(-1, 1, 12)
+  terms = dict(zip(env.reward_terms, np.asarray(shaped.model.task["reward_weights"] / jnp.where(env.model.task["reward_weights"] == 0, 1, env.model.task["reward_weights"]))))
+  assert {k: round(float(v), 3) for k, v in terms.items() if v not in (0, 1)} == own["weights"]
+  (_, plain), (_, other) = env.step(shaped.model, state, action), shaped.step(shaped.model, state, action)
+  np.testing.assert_allclose(other.reward, plain.reward + own["bonus"], rtol=1e-6)
+  np.testing.assert_array_equal(other.final_obs, plain.final_obs)
+  assert shaped.spec is env.spec and demonstrator.brax_env(shaped).observation_size == 48

@@ -335,6 +335,9 @@ class Quadruped:
     obs = self._sense(key_noise, observe(qpos, qvel, gravity, command, action))
     return EnvState(after, step), Step(obs, reward, fallen, step >= self.spec.episode_steps, obs)
 
+  # how PPO learns to show the way (demonstrator.py): at first every step costs, and it would learn to fall
+  demonstration = {"steps": 30_000_000, "weights": {"joint_acceleration": 0.2, "torque": 0.5}, "bonus": 1.2,
+                   "ppo": {"discounting": 0.99, "entropy_cost": 5e-3, "reward_scaling": 1.0}}
   termination_rate = "fall_rate"  # what the share of terminated episodes is called
 
   def measure(self, state: EnvState) -> dict[str, jax.Array]:
