@@ -58,8 +58,10 @@ def join(env, agent=None, fault: str = "none", target: str | None = None, severi
     raise UserError(f"severity must lie in [0, 1]; got {severity}")
   if onset < 0:
     raise UserError(f"onset must be at least 0; got {onset}")
-  if duration is not None and duration < 1:
-    raise UserError(f"duration must be above 0; got {duration}")
+  if duration is not None and not 1 <= duration < faults.FOREVER:
+    raise UserError(f"duration must lie in 1..{faults.FOREVER - 1:,}; got {duration}")
+  if onset >= faults.FOREVER:
+    raise UserError(f"onset must be below {faults.FOREVER:,}; got {onset}")
   the_fault = faults.make(fault, env)
   agent = agent or Puppet(len(env.spec.act))
   index = faults.target_index(the_fault, target)
@@ -96,7 +98,12 @@ def brax_env(env, fault: str | None = None, target: str | None = None, severity:
         inner, out = env.step(rollout.model, state.pipeline_state, action)
         info = state.info
       else:
-        stream = state.info["stream"]._replace(env=state.pipeline_state, first=state.pipeline_state.step == 0)
+        first = state.pipeline_state.step == 0
+        stream = state.info["stream"]._replace(env=state.pipeline_state, first=first)
+        now = jax.random.fold_in(jax.random.fold_in(stream.key, stream.t), 5)
+        renewed, _ = faults.sense(rollout.fault, stream.injection, stream.t, now, rollout.model, state.obs, True)
+        injection = jax.tree.map(lambda new, old: jnp.where(first, new, old), renewed, stream.injection)  # brax's autoreset renews no memory
+        stream = stream._replace(injection=injection)
         stream, out, severity = rollout._control(stream, action)
         inner, info = stream.env, state.info | {"stream": stream._replace(env=()), "severity": worst(severity)}
       return state.replace(pipeline_state=inner, obs=out.final_obs, reward=out.reward, done=out.terminated.astype(jnp.float32), info=info)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_cl import agents, envs, faults as faults_lib, store
-from mjx_cl.errors import UserError
+from mjx_cl.errors import FileError, UserError
 from mjx_cl.faults import certificate
 from mjx_cl.monitor import Monitor
 from mjx_cl.rollout import Rollout, nest, start
@@ -17,6 +17,8 @@ from mjx_cl.scoring import bootstrap
 CHUNK = 50     # decisions
 WARM = 30      # decisions at an episode's start whose residuals are not compared
 AT_ONCE = 120  # robots side by side
+COLUMNS = certificate.Certificate._fields + ("physics", "agent", "episodes", "return_nominal", "return_mean", "return_lost", "return_lost_low",
+                                             "return_lost_high", "kl_nats")
 
 
 class Cost:
@@ -90,19 +92,20 @@ def certify(name: str, physics: str = "auto", episodes: int = 20, agent: str | N
   env = envs.make(name, physics)
   faults = {k: f for k, f in faults_lib.available(env).items() if k != "none"}
   for fault in only:
-    faults_lib.make(fault, env)
+    if not faults_lib.make(fault, env).owns:
+      raise UserError(f"fault {fault!r} changes nothing by design; choose from: {', '.join(faults)}")
   faults = {k: f for k, f in faults.items() if not only or k in only}
+  have = {name, getattr(env, "agents_of", None)} & set(agents.shipped())
+  trained = agents.load(agent, name, len(env.spec.obs), len(env.spec.act)) if episodes and (agent or have) else None
   progress(f"{name}: {len(faults)} faults, acting under the same commands")
   rows = [c._asdict() | {"physics": env.physics.name, "agent": None, "episodes": 0, "return_nominal": None, "return_mean": None, "return_lost": None,
                          "return_lost_low": None, "return_lost_high": None, "kl_nats": None} for c in certificate.certify(env, faults)]
-  have = {name, getattr(env, "agents_of", None)} & set(agents.shipped())
-  if not episodes or (agent is None and not have):
+  if trained is None:
     return rows
-  trained = agents.load(agent, name, len(env.spec.obs), len(env.spec.act))
   cost = Cost(env, trained, faults, episodes)
   first = next(iter(faults))
   chosen = [certificate.Lane(first, faults[first].targets[0], 0.0)]  # the nominal robot
-  chosen += [lane for lane in certificate.lanes(faults, targets=0) if lane.severity > 0] + certificate.preset_lanes(env, faults)
+  chosen += [lane for lane in certificate.lanes(faults, targets=False) if lane.severity > 0] + certificate.preset_lanes(env, faults)
   at_once, found = max(2, AT_ONCE // episodes), {}
   nominal = None
   for i in range(0, len(chosen), at_once):
@@ -121,16 +124,41 @@ def certify(name: str, physics: str = "auto", episodes: int = 20, agent: str | N
   return rows
 
 
-def write(folder, rows: list[dict]) -> None:
-  """Writes certificates.parquet and certificates.md; rows of other robots that are there already are kept."""
+def old_rows(folder) -> list[dict]:
+  """Rows of certificates.parquet in `folder`, [] where there is none; FileError for one that is no such table or a folder that cannot be written."""
+  import pyarrow
   import pyarrow.parquet
   folder = pathlib.Path(folder)
   path = folder / "certificates.parquet"
-  folder.mkdir(parents=True, exist_ok=True)
-  robots = {r["robot"] for r in rows}
-  if path.exists():
-    rows = [r for r in pyarrow.parquet.read_table(path).to_pylist() if r["robot"] not in robots] + rows
-  store.write_table(path, {k: [r[k] for r in rows] for k in rows[0]})
+  try:
+    folder.mkdir(parents=True, exist_ok=True)
+    probe = folder / "certificates.tmp"
+    probe.touch()
+    probe.unlink()
+    rows = pyarrow.parquet.read_table(path).to_pylist() if path.exists() else []
+  except OSError as e:
+    raise FileError(f"cannot write in {folder}: {e.strerror or e}") from None
+  except pyarrow.ArrowException as e:
+    raise FileError(f"{path} is no table of certificates: {str(e).splitlines()[0]}; give another --out") from None
+  if rows and set(rows[0]) != set(COLUMNS):
+    raise FileError(f"{path} has the columns of another version; give another --out, or move it away")
+  return rows
+
+
+def guard(folder, names: tuple[str, ...], episodes: int) -> None:
+  """Refuses what would lose measured costs, before anything is measured."""
+  costly = {r["robot"] for r in old_rows(folder) if r["episodes"]} & set(names)
+  if not episodes and costly:
+    raise UserError(f"{folder} holds measured costs of {', '.join(sorted(costly))}; give --episodes above 0, or another --out")
+
+
+def write(folder, rows: list[dict]) -> None:
+  """Writes certificates.parquet and certificates.md; rows of other robots, faults and backends that are there already are kept."""
+  folder = pathlib.Path(folder)
+  which = lambda r: (r["robot"], r["fault"], r["physics"])
+  new = {which(r) for r in rows}
+  rows = [r for r in old_rows(folder) if which(r) not in new] + rows
+  store.write_table(folder / "certificates.parquet", {k: [r[k] for r in rows] for k in COLUMNS})
   tmp = folder / "certificates.md.tmp"
   tmp.write_text(table(rows))
   tmp.replace(folder / "certificates.md")

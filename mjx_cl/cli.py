@@ -409,6 +409,7 @@ def do_certify(args: Certify) -> None:
   from mjx_cl import certify, envs
   names = args.env or tuple(envs.ENVS)
   certify.check(names)
+  certify.guard(args.out, names, args.episodes)
   rows, faulty = [], []
   for name in names:
     mine = certify.certify(name, args.physics, args.episodes, args.agent, args.fault, say)

@@ -226,6 +226,8 @@ class RunConfig:
         raise UserError(f"preset {self.fault!r} turns the robot into {preset.becomes!r}, which `run` does not do; choose a preset that stays with its robot")
       if self.severity is not None or self.target is not None:
         raise UserError(f"preset {self.fault!r} brings its own severity and target; leave --severity and --target out")
+      if (self.schedule, self.period, self.share) != ("abrupt", 1000, 0.5):
+        raise UserError(f"preset {self.fault!r} brings its own schedule; leave --schedule, --period and --share out")
     elif self.severity is None:
       object.__setattr__(self, "severity", 0.5)
     if self.severity is not None:
@@ -234,6 +236,9 @@ class RunConfig:
     if self.schedule not in fault_presets.SCHEDULES:
       raise UserError(f"unknown schedule {self.schedule!r}; choose from: {', '.join(fault_presets.SCHEDULES)}")
     positive(self, "steps", "seeds", "period")
+    for name in ("steps", "period", "duration"):
+      if (getattr(self, name) or 0) >= 2**31 - 1:
+        raise UserError(f"{name} must be below 2,147,483,647 control steps; got {getattr(self, name)}")
     if self.first_seed < 0:
       raise UserError(f"first_seed must be at least 0; got {self.first_seed}")
     if not 0 <= self.onset <= self.steps:
@@ -249,7 +254,7 @@ class RunConfig:
 
 
 def changes(config: RunConfig) -> tuple[fault_presets.Change, ...]:
-  """The faults of a run, with its duration and schedule where the preset leaves them open."""
+  """The faults of a run, with its duration where the preset leaves it open."""
   if "/" in config.fault:
     return tuple(dataclasses.replace(c, duration=config.duration if c.duration is None else c.duration)
                  for c in fault_presets.find(config.fault, config.env).changes)

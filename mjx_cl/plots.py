@@ -76,7 +76,8 @@ def figure(folder, width: int = 500) -> pathlib.Path:
     axis.plot(starts, [high * 0.985] * len(starts), "v", color="k", ms=5, clip_on=False, in_layout=False, label="alarm, finetuning starts")
     axis.plot(stops, [high * 0.985] * len(stops), "^", mfc="w", mec="k", ms=5, clip_on=False, in_layout=False, label="finetuning ends")
   axes[0].legend(loc="lower right", fontsize=8, framealpha=0.9)
-  axes[0].set_title(f"{config['env']}: {config['fault']} {config['severity']:g} at step {config['onset']:,}; {panels[main]['opr'].shape[0]} streams, mean and "
+  severity = "" if config["severity"] is None else f" {config['severity']:g}"  # a preset has one for each of its faults
+  axes[0].set_title(f"{config['env']}: {config['fault']}{severity} at step {config['onset']:,}; {panels[main]['opr'].shape[0]} streams, mean and "
                     f"standard deviation\narm {main} in colour" + (", arm none in grey" if "none" in panels and main != "none" else "")
                     + f"; curves are trailing means of {width} steps", fontsize=10)
   axes[1].set_xlabel(f"control step ({control_s:g} s)")

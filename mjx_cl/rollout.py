@@ -72,9 +72,12 @@ def start(env, agent, fault, key: jax.Array, severity=0.0, onset=0, duration=fau
     fault: Fault or tuple of F. severity, onset, duration, target: () or (F,). plan: in place of severity, onset and duration.
   """
   key_env, key_fault, key = jax.random.split(key, 3)
-  env_state, obs = env.init(env.model, key_env)
   injection = faults_lib.begin(fault, key_fault, faults_lib.plan(severity, onset, duration) if plan is None else plan, target)
-  injection, obs = faults_lib.sense(fault, injection, jnp.int32(0), jax.random.fold_in(key, 0), env.model, obs, True)
+  now, model = jax.random.fold_in(key, 0), faults_lib.owned_model(faults_lib.as_tuple(fault), env.model)
+  ports = faults_lib.Ports(model, ctrl=jnp.zeros(len(env.spec.act)), first=True)
+  _, ports, _ = faults_lib.drive(fault, injection, jnp.int32(0), jax.random.fold_in(now, 1), ports)  # onset 0: the first episode is of the faulty robot
+  env_state, obs = env.init(ports.model, key_env)
+  injection, obs = faults_lib.sense(fault, injection, jnp.int32(0), jax.random.fold_in(now, 5), model, obs, True)
   return Stream(env_state, agent.carry(), obs, jnp.float32(0), jnp.bool_(True), key, jnp.int32(0), jnp.int32(0), injection)
 
 

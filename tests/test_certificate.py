@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mjx_cl import certify, envs, fault_presets, faults
-from mjx_cl.errors import UserError
+from mjx_cl.errors import FileError, UserError
 from mjx_cl.faults import certificate
 from mjx_cl.faults.certificate import Lane
 
@@ -49,6 +49,14 @@ def test_what_a_robot_cannot_have_says_why(robot):
       faults.make(name, robot)
 
 
+def test_every_channel_has_a_typical_deviation_of_its_own_kind(robot):
+  """Sensor faults are measured in these: a default of 1 for all would make one of them a catastrophe and the other nothing."""
+  scales = [v.scale for v in robot.spec.obs]
+  assert min(scales) > 0 and len(set(scales)) > 2
+  for v in robot.spec.obs:
+    assert v.high > 1e9 or v.scale < 0.5 * (v.high - v.low), v.name
+
+
 def test_targets_name_their_parts(robot):
   """A group is the union of what its name says, and every target of a fault changes something of its own."""
   for name, f in faults.available(robot).items():
@@ -76,12 +84,13 @@ def broken(env):
       # the author bypasses `fault`: the change is there before the onset and at severity 0
       "early": faults.Fault("early", ("ctrl",), ("all",), 1, lambda key, target=-1: faults.State(jnp.int32(0), (), ()),
                             lambda state, s, key, ports: (state, ports._replace(ctrl=ports.ctrl * 0.5)), False),
+      "nan": faults.fault("nan", env, ("obs",), ("all",), lambda t, m, s, key, ports: (m, {"obs": ports.obs * jnp.nan})),
       "sound": ctrl("sound", lambda t, m, s, key, ports: (m, {"ctrl": ports.ctrl * (1 - s)})),
   }
 
 
 @pytest.mark.parametrize("name, words", [("idle", ["changes nothing"]), ("backwards", ["falls with severity"]),
-                                         ("early", ["not the nominal robot bit for bit"]), ("sound", [])])
+                                         ("early", ["not the nominal robot bit for bit"]), ("nan", ["no numbers"]), ("sound", [])])
 def test_a_defective_fault_is_found(short, name, words):
   """`early` makes the nominal robot of its own program another one too, which the comparison with the program without faults shows."""
   found = certificate.faulty(certificate.certify(short, {name: broken(short)[name]}, onset=20, steps=140, sizes=(1.0,), severities=(0.0, 0.5, 1.0)))
@@ -137,6 +146,7 @@ def test_files_keep_the_rows_of_other_robots(tmp_path, short):
   have = {"noise": faults.make("noise", short)}
   extra = {"physics": "jax", "agent": None, "episodes": 0, "return_nominal": None, "return_mean": None, "return_lost": None, "return_lost_low": None,
            "return_lost_high": None, "kl_nats": None}
+  assert set(extra) | set(certificate.Certificate._fields) == set(certify.COLUMNS)
   rows = [c._asdict() | extra for c in certificate.certify(short, have, onset=20, steps=140, sizes=(1.0,), severities=(0.0, 1.0))]
   certify.write(tmp_path, [r | {"robot": "other"} for r in rows])
   certify.write(tmp_path, rows)
@@ -144,10 +154,27 @@ def test_files_keep_the_rows_of_other_robots(tmp_path, short):
   import pyarrow.parquet
   kept = pyarrow.parquet.read_table(tmp_path / "certificates.parquet").to_pylist()
   assert [r["robot"] for r in kept].count("car") == len(rows) == [r["robot"] for r in kept].count("other")
+  with pytest.raises(UserError, match="measured costs of other"):
+    certify.write(tmp_path, [r | {"robot": "other", "episodes": 3, "return_nominal": 9.0} for r in rows])
+    certify.guard(tmp_path, ("other",), 0)
+  certify.guard(tmp_path, ("other",), 2)
   text = (tmp_path / "certificates.md").read_text()
   assert "## car" in text and "## other" in text and "| sensor | noise | lidar | 1 |" in text
   assert all(row["holds"] for row in certify.summary(rows) if row["goal"])
   json.dumps(certify.summary(rows))
+
+
+def test_what_is_in_the_way_is_said_before_anything_is_measured(tmp_path):
+  (tmp_path / "file").write_text("x")
+  with pytest.raises(FileError, match="cannot write in"):
+    certify.guard(tmp_path / "file", ("walker",), 20)
+  (tmp_path / "certificates.parquet").write_text("no table")
+  with pytest.raises(FileError, match="is no table of certificates"):
+    certify.guard(tmp_path, ("walker",), 20)
+  with pytest.raises(UserError, match="no agent 'nobody'"):
+    certify.certify("car", episodes=1, agent="nobody")
+  with pytest.raises(UserError, match="'none' changes nothing"):
+    certify.certify("car", only=("none",))
 
 
 def test_unknown_robot_names_the_choices():

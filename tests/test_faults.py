@@ -115,7 +115,7 @@ def test_severity_follows_the_clock_across_resets(runs):
   t = np.arange(LENGTH)
   for i in range(5):
     active = (t >= ONSET[i]) & (t < ONSET[i] + DURATION[i])
-    np.testing.assert_array_equal(runs.lane(i).severity, np.where(active, SEVERITY[i], np.float32(0)))
+    np.testing.assert_array_equal(runs.lane(i).severity, np.where(active & bool(runs.fault.owns), SEVERITY[i], np.float32(0)))  # `none` has no severity
   np.testing.assert_array_equal(runs.lane(3).episode, t // 12)  # there were resets while the fault was active
   np.testing.assert_array_equal(runs.end.t, LENGTH)
   np.testing.assert_array_equal(runs.end.injection.plan.onset[0, :, 0], ONSET)
@@ -126,7 +126,7 @@ def test_one_trace_for_all_seeds_severities_onsets_and_targets(runs):
   severity, onset = np.array([0.1, 0.9, 0.0, 1.0, 0.6], np.float32), np.array([9, 0, 2, 30, 1])
   targets = (np.arange(5) + 1) % len(runs.fault.targets)
   (_, rows), _ = runs.run(11, severity, onset, DURATION[::-1], targets)  # a second trace raises
-  np.testing.assert_array_equal(rows.severity[-1, 0], severity * [1, 0, 0, 1, 1])  # the second and third are repaired by then
+  np.testing.assert_array_equal(rows.severity[-1, 0], severity * [1, 0, 0, 1, 1] * bool(runs.fault.owns))  # the second and third are repaired by then
 
 
 def test_each_stream_of_a_batch_has_its_own_target(runs, same):
@@ -204,6 +204,17 @@ def test_every_documented_fault_states_severity_target_and_leaves():
   for name, build in FAULTS.items():
     if name != "none":
       assert "Severity:" in build.__doc__ and "Owns" in build.__doc__, name
+
+
+def test_stuck_holds_the_last_command_before_the_onset(short_walker):
+  stuck = faults.make("stuck", short_walker)
+  injection = faults.begin(stuck, jax.random.key(0), faults.plan(1.0, 3), faults.target_index(stuck, "right_knee"))
+  sent = []
+  for t in range(6):
+    ports = ports_of(short_walker, obs=False, first=t == 0)._replace(ctrl=jnp.full(6, t / 10))
+    injection, ports, _ = faults.drive(stuck, injection, jnp.int32(t), jax.random.key(t), ports)
+    sent.append((round(float(ports.ctrl[1]), 2), round(float(ports.ctrl[0]), 2)))
+  assert sent == [(0.0, 0.0), (0.1, 0.1), (0.2, 0.2), (0.2, 0.3), (0.2, 0.4), (0.2, 0.5)]
 
 
 # ---- several faults ------------------------------------------------------------------------------------------------------------------

@@ -224,6 +224,28 @@ def test_runs_are_sums_of_the_trace(whole):
 
 # ---- figure --------------------------------------------------------------------------------------------------------------------------
 
+def test_a_preset_of_several_faults_ends_in_all_files(saved, tmp_path):
+  """Six faults at once, repaired after 30 steps; each is an event, and the figure does without a single severity."""
+  config = RunConfig("walker", fault="any/all-easy", onset=40, duration=30, steps=128, seeds=1, arms=("none",), agent=str(saved), physics="native")
+  summary = run.execute(config, tmp_path / "out")
+  assert summary["fault"] == "any/all-easy" and summary["severity"] == pytest.approx(1 / 3)
+  e = table(tmp_path / "out", "events")
+  names = ["delay", "command_delay", "noise", "command_noise", "dropout", "freeze"]
+  onsets = [(s, r.split(",")[0]) for s, k, r in zip(e["step"], e["kind"], e["reason"]) if k == "onset"]
+  assert onsets == [(40, n) for n in names]
+  assert [(s, r) for s, k, r in zip(e["step"], e["kind"], e["reason"]) if k == "repair"] == [(70, f"{n}, after 30 steps") for n in names]
+  severity = np.asarray(table(tmp_path / "out", "trace")["severity"])
+  np.testing.assert_allclose(severity, np.where((np.arange(128) >= 40) & (np.arange(128) < 70), np.float32(1 / 3), 0), rtol=1e-6)
+  assert set(e["fault"]) == {"+".join(f"{n}:all" for n in names)} and (tmp_path / "out" / "figure.png").stat().st_size > 5000
+
+
+def test_a_healthy_run_has_no_severity(saved, tmp_path):
+  config = RunConfig("walker", fault="none", onset=40, steps=128, seeds=1, arms=("none",), agent=str(saved), physics="native")
+  run.execute(config, tmp_path / "out")
+  trace = table(tmp_path / "out", "trace")
+  assert not any(trace["fault_active"]) and not any(trace["severity"]) and not table(tmp_path / "out", "events")["kind"].count("onset")
+
+
 def test_smooth_is_a_trailing_mean_that_leaves_nan_out():
   rng = np.random.default_rng(0)
   x = np.where(rng.random((2, 40)) < 0.3, np.nan, rng.normal(size=(2, 40)))

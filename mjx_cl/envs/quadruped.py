@@ -55,12 +55,12 @@ SOFT_LIMIT = 0.95                            # share of a joint's range that is 
 REWARDS = (("track_velocity", 1.0), ("track_yaw_rate", 0.5), ("vertical_velocity", -2.0), ("roll_pitch_rate", -0.05), ("torque", -2.5e-5),
            ("joint_acceleration", -2.5e-7), ("action_rate", -0.01), ("air_time", 0.5), ("knee_contacts", -1.0), ("tilt", -5.0), ("joint_limits", 0.0))
 
-# observation: group, channels, unit, half width of the uniform noise
+# observation: group, channels, unit, half width of the uniform noise, typical deviation of a channel (64 robots of a PPO policy that tracks to 0.45 m/s)
 OBSERVATION = (
-    ("base_lin_vel", ("x", "y", "z"), "m/s", 0.1), ("base_ang_vel", ("x", "y", "z"), "rad/s", 0.2), ("projected_gravity", ("x", "y", "z"), "1", 0.05),
-    ("command", ("vx", "vy", "wz"), "m/s", 0.0), ("joint_pos", JOINTS, "rad", 0.01), ("joint_vel", JOINTS, "rad/s", 1.5),
-    ("last_action", JOINTS, "1", 0.0))
-NOISE = np.concatenate([np.full(len(names), noise) for _, names, _, noise in OBSERVATION]).astype(np.float32)
+    ("base_lin_vel", ("x", "y", "z"), "m/s", 0.1, 0.3), ("base_ang_vel", ("x", "y", "z"), "rad/s", 0.2, 0.35), ("projected_gravity", ("x", "y", "z"), "1", 0.05, 0.05),
+    ("command", ("vx", "vy", "wz"), "m/s", 0.0, 0.5), ("joint_pos", JOINTS, "rad", 0.01, 0.2), ("joint_vel", JOINTS, "rad/s", 1.5, 2.0),
+    ("last_action", JOINTS, "1", 0.0, 0.35))
+NOISE = np.concatenate([np.full(len(names), noise) for _, names, _, noise, _ in OBSERVATION]).astype(np.float32)
 
 # lengths in base-parallel frames [m]; sides (4, 2): +1 front / -1 hind, +1 left / -1 right
 SIDES = np.array([(1, 1), (1, -1), (-1, 1), (-1, -1)], np.float32)
@@ -254,10 +254,10 @@ def reward_terms(before: QuadrupedState, action, qpos, qvel, gravity, accelerati
 def make_spec(mj_model: mujoco.MjModel) -> Spec:
   """Names, units and groups, read from the tables above and the MuJoCo model."""
   obs, groups = [], []
-  for group, names, unit, noise in OBSERVATION:
+  for group, names, unit, noise, scale in OBSERVATION:
     groups.append((group, tuple(range(len(obs), len(obs) + len(names)))))
     bound = {"projected_gravity": 1 + noise, "last_action": 1.0}.get(group, float("inf"))
-    obs += [Var(f"{group}_{name}", "rad/s" if name == "wz" else unit, -bound, bound) for name in names]
+    obs += [Var(f"{group}_{name}", "rad/s" if name == "wz" else unit, -bound, bound, scale) for name in names]
   legs = tuple((leg, tuple(range(3 * k, 3 * k + 3))) for k, leg in enumerate(LEGS))
   return Spec(
       name="quadruped", obs=tuple(obs), act=tuple(Var(j, "1", -1, 1) for j in JOINTS), control_s=CONTROL_S, episode_steps=EPISODE_STEPS,

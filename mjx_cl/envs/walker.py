@@ -17,6 +17,8 @@ from mjx_cl.types import EnvState, Model, Spec, Step, Var
 STAND_HEIGHT = 1.2  # [m]
 WALK_SPEED = 1.0    # [m/s]
 BODIES = ("torso", "right_thigh", "right_leg", "right_foot", "left_thigh", "left_leg", "left_foot")
+# deviation of each channel over 64 robots and 900 steps of the shipped agent
+SCALES = (0.027, 0.14, 0.46, 0.34, 0.22, 0.46, 0.52, 0.67, 0.045, 0.14, 0.2, 0.21, 0.1, 0.28, 0.067, 0.67, 0.55, 2.2, 10.0, 16.0, 15.0, 3.0, 5.7, 7.4)
 JOINTS = ("right_hip", "right_knee", "right_ankle", "left_hip", "left_knee", "left_ankle")
 
 
@@ -91,8 +93,9 @@ class Walker:
     self._mass = jnp.asarray(self.mj_model.body_mass[1:], jnp.float32)
     orientation = [Var(f"{b}_{k}", "1", -1, 1) for b in BODIES for k in ("xx", "xz")]
     speeds = [Var("vel_rootz", "m/s"), Var("vel_rootx", "m/s"), Var("vel_rooty", "rad/s")] + [Var(f"vel_{j}", "rad/s") for j in JOINTS]
+    obs = tuple(v._replace(scale=s) for v, s in zip(orientation + [Var("height", "m")] + speeds, SCALES))
     self.spec = Spec(
-        name="walker", obs=tuple(orientation + [Var("height", "m")] + speeds), act=tuple(Var(j, "1", -1, 1) for j in JOINTS),
+        name="walker", obs=obs, act=tuple(Var(j, "1", -1, 1) for j in JOINTS),
         control_s=0.025, episode_steps=1000,
         acceptance=0.8,         # mean reward per step; one that stands still earns 0.17, one that walks and never falls 0.95
         posture=(14, 0.9),      # mean torso height [m]; 1.2 is standing, 0.3 is lying
@@ -109,9 +112,10 @@ class Walker:
 
   def init(self, model: Model, key: jax.Array) -> tuple[EnvState, jax.Array]:
     """A fresh episode drawn from `key`: state and observation (24,)."""
-    del model
     key_leg, key_root = jax.random.split(key)
     legs = jax.random.uniform(key_leg, (6,), minval=self._low, maxval=self._high)
+    if "jnt_range" in model.mj:  # a joint that has lost range starts within what is left
+      legs = jnp.clip(legs, *model.mj["jnt_range"][3:].T)
     root = jax.random.uniform(key_root, (), minval=-jnp.pi, maxval=jnp.pi)
     qpos = jnp.concatenate([jnp.zeros(2), root[None], legs])
     qvel = jnp.zeros(9)

@@ -106,12 +106,12 @@ def _command(name, env, change, memory=(), not_monotone=""):
 
 
 def stuck(env) -> Fault:
-  """A command sticks at the value that it had when the fault began.
+  """A command sticks at the last value that it had before the fault began.
 
-    u_j' = (1 - severity) u_j + severity u_j(onset)
+    u_j' = (1 - severity) u_j + severity u_j(onset - 1)
 
   Severity: share of the held value [1]; 1 is stuck altogether. Target: an actuator, a group or all. Owns `ctrl`. Memory: the held command;
-  an episode's start sets it anew. Not visible to: a constant command. Source: stuck actuators of realworldrl_suite, facts 4.5.
+  an episode that starts later holds its own first command. Not visible to: a constant command. Source: stuck actuators of realworldrl_suite, facts 4.5.
   """
   def change(hit, held, severity, key, ports):
     held = jnp.where((severity > 0) & ~ports.first, held, ports.ctrl)

@@ -179,12 +179,15 @@ def drive(faults, injection: Injection, t: jax.Array, key: jax.Array, ports: Por
   faults = as_tuple(faults)
   walk = schedule.walk(injection.plan, injection.walk, t, jax.random.fold_in(key, 10_000))
   injection = injection._replace(walk=walk)
-  severity = schedule.severity(injection.plan, walk, t)
+  severity = schedule.severity(injection.plan, walk, t) * jnp.asarray([bool(f.owns) for f in faults], jnp.float32)  # `none` has no severity
   return *_apply(faults, injection, t, key, ports, severity, False), severity
 
 
 def sense(faults, injection: Injection, t: jax.Array, key: jax.Array, model: Model, obs: jax.Array, first=False):
-  """Applies every sensor fault to the observation that is read at control step t. Returns (injection', obs')."""
+  """Applies every sensor fault to the observation that is read at control step t. Returns (injection', obs').
+
+  A severity that walks at random stands where `drive` left it, one control step ago: at the boundary of a period a sensor follows one step late.
+  """
   faults = as_tuple(faults)
   if not any(f.senses for f in faults):
     return injection, obs

@@ -41,6 +41,7 @@ class Certificate(NamedTuple):
       for a fault that only changes the reward, |r - r_nominal|.
     monotone: at the step at which the greatest severity first differs, the differences do not fall with severity; None: single severity.
     reason: why it need not be monotone.
+    finite: every observation and reward is a number.
   """
   robot: str
   fault: str
@@ -55,14 +56,15 @@ class Certificate(NamedTuple):
   diff_100: float | None
   monotone: bool | None
   reason: str
+  finite: bool = True
 
 
-def lanes(faults: dict[str, faults_lib.Fault], severities=SEVERITIES, targets: int = 8) -> list[Lane]:
-  """Every severity on the first target, and severity 1 on up to `targets` more that may be drawn."""
+def lanes(faults: dict[str, faults_lib.Fault], severities=SEVERITIES, targets: bool = True) -> list[Lane]:
+  """Every severity on the first target, and severity 1 on all others; of a sensor, whose channels are many, on those that may be drawn."""
   out = []
   for name, f in faults.items():
     out += [Lane(name, f.targets[0], s) for s in severities]
-    out += [Lane(name, t, 1.0) for t in f.targets[1:min(f.drawn, targets + 1)]]
+    out += [Lane(name, t, 1.0) for t in f.targets[1:f.drawn if f.senses else None]] if targets else []
   return out
 
 
@@ -118,18 +120,21 @@ def program(env, faults: tuple):
 
 def plans(faults: dict[str, faults_lib.Fault], chosen: list[Lane], onset: int):
   """Plan (lanes, F) and targets (lanes, F): each lane has its own fault or faults, the others rest at severity 0."""
-  names = list(faults)
-  severity, target = np.zeros((len(chosen), len(names)), np.float32), np.zeros((len(chosen), len(names)), np.int32)
+  names, shape = list(faults), (len(chosen), len(faults))
+  columns = {"severity": np.zeros(shape), "onset": np.full(shape, onset), "duration": np.full(shape, faults_lib.FOREVER), "schedule": np.zeros(shape, int),
+             "period": np.full(shape, 1000), "share": np.full(shape, 0.5)}
+  target = np.zeros(shape, np.int32)
   for i, lane in enumerate(chosen):
     changes = (fault_presets.Change(lane.fault, lane.target, lane.severity),) if "/" not in lane.fault else fault_presets.PRESETS[lane.fault].changes
-    for change in changes:
-      f = names.index(change.fault)
-      severity[i, f] = change.severity
-      target[i, f] = 0 if change.target is None else faults[change.fault].targets.index(change.target)
-  full = lambda value, dtype: jnp.full(severity.shape, value, dtype)
-  plan = schedule.Plan(jnp.asarray(severity), full(onset, jnp.int32), full(faults_lib.FOREVER, jnp.int32), full(0, jnp.int32), full(1000, jnp.int32),
-                       full(0.5, jnp.float32))
-  return plan, jnp.asarray(target)
+    if len({c.fault for c in changes}) < len(changes):
+      raise ValueError(f"preset {lane.fault!r} has a fault twice, which one program cannot hold")
+    for c in changes:
+      f = names.index(c.fault)
+      values = (c.severity, onset + c.after, c.duration or faults_lib.FOREVER, list(schedule.SCHEDULES).index(c.schedule), c.period, c.share)
+      for column, value in zip(columns.values(), values):
+        column[i, f] = value
+      target[i, f] = 0 if c.target is None else faults[c.fault].targets.index(c.target)
+  return schedule.plan(**columns), jnp.asarray(target)
 
 
 def certify(env, faults: dict[str, faults_lib.Fault] | None = None, severities=SEVERITIES, chosen: list[Lane] | None = None, onset: int = 25,
@@ -166,7 +171,7 @@ def best(rows: tuple[Certificate, ...]) -> Certificate:
   acting = [r for r in rows if not r.identical] or [rows[0]]
   chosen = next((r for r in acting if r.monotone), acting[0])
   identical = all(r.identical for r in rows) if rows[0].severity == 0 else chosen.identical
-  return chosen._replace(identical=identical, early=any(r.early for r in rows), diff_1=max((r.diff_1 for r in rows), default=None)
+  return chosen._replace(identical=identical, early=any(r.early for r in rows), finite=all(r.finite for r in rows), diff_1=max((r.diff_1 for r in rows), default=None)
                          if rows[0].fault == "none" else chosen.diff_1)
 
 
@@ -193,7 +198,8 @@ def compare(env, faults, chosen, rows, plain, onset) -> list[Certificate]:
   paid = np.abs(reward - plain[1][None]) > REWARD_ROUNDING * (1.0 + np.abs(plain[1][None]))
   differs = (bits(obs) != bits(plain[0])[None]).any(-1) | paid | (terminated != plain[2][None])  # (lanes, T)
   size = np.sqrt(np.mean(((obs - plain[0][None]) / scale) ** 2, -1))
-  size = np.where(size > 0, size, np.abs(reward - plain[1][None]))
+  size = np.where(size == 0, np.abs(reward - plain[1][None]), size)
+  sound = np.isfinite(obs).all((1, 2)) & np.isfinite(reward).all(1)
   # an outcome of step t is read at t + 1: a sensor that fails at the onset already shows in the outcome of the step before
   out = [Certificate(env.spec.name, "none", "none", "all", 0.0, rounding < ROUNDING, False, None, rounding, None, None, None, "")]
   for i, lane in enumerate(chosen):
@@ -204,7 +210,7 @@ def compare(env, faults, chosen, rows, plain, onset) -> list[Certificate]:
     values = [float(size[i, first + k - 1]) if first is not None and first + k - 1 < size.shape[1] else None for k in AFTER]
     kind, reason = ("preset", "") if "/" in lane.fault else (faults_lib.family(lane.fault), faults[lane.fault].not_monotone)
     out.append(Certificate(env.spec.name, lane.fault, kind, lane.target, lane.severity, not at.size, first is not None and first < begin,
-                           None if first is None else first - begin, *values, monotone(chosen, differs, size, i), reason))
+                           None if first is None else first - begin, *values, monotone(chosen, differs, size, i), reason, bool(sound[i])))
   return out
 
 
@@ -230,6 +236,8 @@ def faulty(rows: list[Certificate]) -> list[str]:
       out.append(f"{c.robot}: with all faults at severity 0 it is not the robot without faults (relative difference {c.diff_1:.1e})")
     elif c.severity == 0 and not c.identical:
       out.append(f"{who} is not the nominal robot bit for bit (step {c.first_step} from the onset)")
+    if not c.finite:
+      out.append(f"{who} makes observations or rewards that are no numbers")
     if c.severity > 0 and c.identical:
       out.append(f"{who} changes nothing")
     if c.early:

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
+import numpy as np
 
 from mjx_cl.errors import UserError
 from mjx_cl.faults.base import Fault, fault
@@ -13,13 +14,15 @@ def reward_weight(env) -> Fault:
   Severity: lost share [1]. Target: a term of the reward (env.reward_terms). Owns `task.reward_weights`. Not visible to: the observation.
   """
   terms = getattr(env, "reward_terms", ())
-  if not terms:
+  weights = np.asarray(env.model.task.get("reward_weights", ()))
+  counted = [i for i, w in enumerate(weights[:len(terms)]) if w != 0]  # a term that counts nothing has nothing to lose
+  if not counted:
     raise UserError(f"fault 'reward_weight' needs a reward of weighted terms, which robot {env.spec.name!r} does not have")
 
-  def act(target, memory, severity, key, ports):
+  def act(hit, memory, severity, key, ports):
     value = ports.model.task["reward_weights"]
-    return memory, {"task.reward_weights": jnp.where(jnp.arange(value.shape[0]) == target, value * (1.0 - severity), value)}
-  return fault("reward_weight", env, ("task.reward_weights",), terms, act)
+    return memory, {"task.reward_weights": jnp.where(hit, value * (1.0 - severity), value)}
+  return fault("reward_weight", env, ("task.reward_weights",), [terms[i] for i in counted], act, rows=np.eye(len(weights), dtype=bool)[counted])
 
 
 def command_range(env) -> Fault:

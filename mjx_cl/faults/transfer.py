@@ -11,7 +11,7 @@ from mjx_cl.types import Model
 def gap(env) -> Fault:
   """One item of the gap between simulator and car, or all of them, appears or grows (env.widen).
 
-    x' = x + severity (x_real - x_simulator)
+    x' = x + severity (x_real - x_simulator),  acceleration, grip and mass:  x' = x (x_real / x_simulator)^severity
 
   Severity: 1 adds the whole difference of the item [its unit, see envs.car_real.GAP]: where the item is switched off it is then there in full, where it
   is on it is doubled. Target: an item, or all. Owns the leaves of the items. Source: named with each item.
