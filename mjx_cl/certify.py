@@ -11,7 +11,7 @@ from mjx_cl import agents, envs, faults as faults_lib, store
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.faults import certificate
 from mjx_cl.monitor import Monitor
-from mjx_cl.rollout import Rollout, nest, start
+from mjx_cl.rollout import Rollout, start
 from mjx_cl.scoring import bootstrap
 
 CHUNK = 50     # decisions

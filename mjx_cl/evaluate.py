@@ -24,10 +24,9 @@ def evaluate(env, agent, params, episodes: int, seed: int = 0, repeat: int = 1, 
   total, steps, sums, ended = live(env, rollout, agent, params, episodes, seed)
   out = {"episodes": episodes, "return_mean": float(total.mean()), "return_iqm": float(bootstrap.iqm(total)), "return_ci": bootstrap.interval(total),
          "terminations": int(ended.sum()), "returns": [round(float(x), 2) for x in total]}
-  mean = lambda x, axis: np.mean(x, axis)
-  for name, value in sums.items():
-    each = value / np.maximum(steps, 1)
-    out |= {name: float(value.sum() / max(1, steps.sum())), name + "_ci": bootstrap.interval(each, mean)}
+  for name, value in sums.items():  # a mean over steps, so that a short episode counts for little; drawn anew by episodes
+    over = lambda drawn, axis: value[drawn.astype(int)].sum(axis) / np.maximum(1, steps[drawn.astype(int)].sum(axis))
+    out |= {name: float(value.sum() / max(1, steps.sum())), name + "_ci": bootstrap.interval(np.arange(episodes), over)}
   rate = getattr(env, "termination_rate", None)
   if rate:
     out |= {rate: float(ended.mean()), rate + "_ci": bootstrap.wilson(int(ended.sum()), episodes)}

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from mjx_cl import faults as faults_lib
 from mjx_cl.dreamer.agent import Carry
 from mjx_cl.replay import Record
-from mjx_cl.types import EnvState, Step
+from mjx_cl.types import EnvState
 
 
 STRETCH = 16  # control steps under one random action, where a robot is shaken

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_cl import agents, checkpoint, detectors, envs, faults, memory, scoring, store
+from mjx_cl import agents, checkpoint, detectors, envs, faults, memory, store
 from mjx_cl.adapt import phase as phase_lib
 from mjx_cl.adapt.loop import Loop, LoopState
 from mjx_cl.config import RunConfig, changes

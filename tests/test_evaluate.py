@@ -43,6 +43,7 @@ def test_figures_are_those_of_single_episodes(case):
     assert "mean_speed_m_s" not in got
     return
   assert got["mean_speed_m_s"] == pytest.approx(np.mean(hand[0][1] + hand[1][1]), rel=1e-3)
+  assert got["mean_speed_m_s_ci"][0] <= got["mean_speed_m_s"] <= got["mean_speed_m_s_ci"][1]
   assert got["collision_rate"] == got["terminations"] / 2 and got["collision_rate_ci"][0] <= got["collision_rate"] <= got["collision_rate_ci"][1]
   driver = Rollout(env, agent, faults.none(env), expert=lambda s: env.reference(s.env))
   driven = [by_hand(env, agent, params, seed, driver, True) for seed in (5, 6)]

@@ -9,7 +9,6 @@ import importlib.resources
 import jax
 import jax.numpy as jnp
 import mujoco
-import numpy as np
 
 from mjx_cl import physics as physics_lib
 from mjx_cl.types import EnvState, Model, Spec, Step, Var

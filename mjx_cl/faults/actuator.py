@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_cl.errors import UserError
-from mjx_cl.faults.base import Fault, actuator_targets, fault, require
+from mjx_cl.faults.base import Fault, actuator_targets, fault, read
 
 MOST_DELAY = 9       # control steps at severity 1: the hard level of realworldrl_suite
 LOCK = (10.0, 1000.0)  # [kg m^2], [N m s/rad] at severity 1
@@ -52,8 +52,7 @@ def torque_loss(env) -> Fault:
   leaf = "task.strength" if "strength" in env.model.task else "mj.actuator_gear"
 
   def act(hit, memory, severity, key, ports):
-    kind, name = leaf.split(".")
-    value = getattr(ports.model, kind)[name]
+    value = read(ports, leaf)
     return memory, {leaf: jnp.where(hit.reshape((-1,) + (1,) * (value.ndim - 1)), value * (1.0 - severity), value)}
   reason = "" if leaf.startswith("mj.") else "the position loop runs at every physics step, so a joint held less firmly may end a control step anywhere"
   return fault("torque_loss", env, (leaf,), names, act, drawn=single, not_monotone=reason, rows=mask)

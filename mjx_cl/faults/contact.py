@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_cl.errors import UserError
-from mjx_cl.faults.base import Fault, fault
+from mjx_cl.faults.base import Fault, fault, read
 from mjx_cl.faults.body import force_map, heading_targets
 
 PUSH_EVERY = 100  # control steps between two pushes
@@ -36,8 +36,7 @@ def friction(env) -> Fault:
   mask = jnp.asarray([[i in hit for i in range(size)] for _, hit in feet])
 
   def act(hit, memory, severity, key, ports):
-    kind, name = leaf.split(".")
-    value = getattr(ports.model, kind)[name]
+    value = read(ports, leaf)
     return memory, {leaf: jnp.where(hit.reshape((-1,) + (1,) * (value.ndim - 1)), value * (1.0 - 0.95 * severity), value)}
   return fault("friction", env, (leaf,), names, act, rows=mask)
 
@@ -65,8 +64,7 @@ def slope(env) -> Fault:
   leaf = "task.gravity" if "gravity" in env.model.task else "mj.gravity"
 
   def act(direction, memory, severity, key, ports):
-    kind, name = leaf.split(".")
-    value = getattr(ports.model, kind)[name]
+    value = read(ports, leaf)
     angle = jnp.deg2rad(20.0) * severity
     tilted = jnp.linalg.norm(value) * (jnp.sin(angle) * direction - jnp.cos(angle) * jnp.asarray([0.0, 0.0, 1.0]))
     return memory, {leaf: tilted}
