@@ -34,7 +34,7 @@ class Cost:
     self.params = jax.tree.map(lambda x: x[None], trained.train.params)
     self.repeat = int(trained.card.get("repeat", 1))
     self.rollout = Rollout(env, self.agent, tuple(faults.values()), self.repeat)
-    self.monitor = Monitor(self.agent)
+    self.monitor = Monitor(self.agent, spec=self.env.spec)
     self.watch = jax.jit(self.monitor.update)
     self.begin = jax.jit(jax.vmap(lambda key, plan, target: start(env, self.agent, tuple(faults.values()), key, target=target, plan=plan)))
 

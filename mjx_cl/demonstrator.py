@@ -96,8 +96,37 @@ class Shaped:
 PPO = {"discounting": 0.995, "entropy_cost": 1e-2, "reward_scaling": 10.0}
 
 
-def train(env, out: str | os.PathLike, steps: int, seed: int = 0, evals: int = 12, progress=lambda row: None) -> list[dict]:
+HIDDEN = (128,) * 3  # policy and value
+
+
+def _template(env):
+  """(normaliser, policy, value) of the shapes that brax trains for `env`: what `latest.msgpack` is read into."""
+  from brax.training.acme import running_statistics, specs
+  from brax.training.agents.ppo import networks
+  size = len(env.spec.obs)
+  net = networks.make_ppo_networks(size, len(env.spec.act), running_statistics.normalize, policy_hidden_layer_sizes=HIDDEN,
+                                   value_hidden_layer_sizes=HIDDEN)
+  key = jax.random.key(0)
+  return running_statistics.init_state(specs.Array((size,), jnp.float32)), net.policy_network.init(key), net.value_network.init(key)
+
+
+def _latest(out: pathlib.Path, env) -> tuple[list[dict], tuple]:
+  """The curve and the networks that a run in `out` left behind."""
+  from flax import serialization
+  try:
+    rows = json.loads((out / "curve.json").read_text())
+    params = serialization.from_bytes(_template(env), (out / "latest.msgpack").read_bytes())
+    done = rows[-1]["step"]
+  except (OSError, ValueError, KeyError, IndexError) as e:
+    raise FileError(f"{out} holds no demonstrator training that can go on ({e}); leave out --resume to start one") from None
+  return [row for row in rows if row["step"] <= done], params
+
+
+def train(env, out: str | os.PathLike, steps: int, seed: int = 0, evals: int = 12, progress=lambda row: None, resume: bool = False) -> list[dict]:
   """Trains PPO and keeps one policy per evaluation as OUT/policy_NN.npz, with OUT/curve.json.
+
+  `resume` goes on from the last evaluation in `out` up to `steps` in all: networks and observation statistics are those of then, the optimiser's
+  moments and the environments start fresh (brax keeps neither), so the result is not bit for bit that of one run.
 
   Settings: 256 environments, unroll 30, 16 minibatches of 256 x 30, 6 epochs, lr 1e-3, observations normalised, policy and value 3 x 128, and `PPO`
   unless the robot has its own in `env.demonstration` (`ppo`, and `weights` and `bonus` of Shaped).
@@ -110,30 +139,39 @@ def train(env, out: str | os.PathLike, steps: int, seed: int = 0, evals: int = 1
   from brax.training.agents.ppo import networks, train as ppo
   out = pathlib.Path(out)
   out.mkdir(parents=True, exist_ok=True)
-  rows: list[dict] = []
-  start = time.monotonic()
+  rows, params = _latest(out, env) if resume else ([], None)
+  done, before = (rows[-1]["step"], rows[-1]["seconds"]) if rows else (0, 0.0)
+  if done >= steps:
+    return rows
+  start = time.monotonic() - before
 
   def on_progress(step, metrics):
-    rows.append({"step": int(step), "return": float(metrics["eval/episode_reward"]), "seconds": round(time.monotonic() - start, 1)})
+    if done and not int(step):
+      return  # the evaluation that the earlier run ended with
+    rows.append({"step": done + int(step), "return": float(metrics["eval/episode_reward"]), "seconds": round(time.monotonic() - start, 1)})
     tmp = out / "curve.json.tmp"
     tmp.write_text(json.dumps(rows, indent=1))
     os.replace(tmp, out / "curve.json")
     progress(rows[-1])
 
   def on_params(step, _, params):
-    save(out / f"policy_{step:09d}.npz", _to_policy(params))
+    from flax import serialization
+    save(out / f"policy_{done + int(step):09d}.npz", _to_policy(params))
+    tmp = out / "latest.msgpack.tmp"
+    tmp.write_bytes(serialization.to_bytes(jax.device_get(params)))
+    os.replace(tmp, out / "latest.msgpack")
 
   ppo.train(
-      environment=adapter, num_timesteps=steps, episode_length=env.spec.episode_steps, num_envs=256, unroll_length=30, num_minibatches=16,
-      batch_size=256, num_updates_per_batch=6, learning_rate=1e-3, normalize_observations=True, seed=seed, num_evals=evals,
+      environment=adapter, num_timesteps=steps - done, episode_length=env.spec.episode_steps, num_envs=256, unroll_length=30, num_minibatches=16,
+      batch_size=256, num_updates_per_batch=6, learning_rate=1e-3, normalize_observations=True, seed=seed + done, num_evals=evals, restore_params=params,
       progress_fn=on_progress, policy_params_fn=on_params,
-      network_factory=functools.partial(networks.make_ppo_networks, policy_hidden_layer_sizes=(128,) * 3, value_hidden_layer_sizes=(128,) * 3),
+      network_factory=functools.partial(networks.make_ppo_networks, policy_hidden_layer_sizes=HIDDEN, value_hidden_layer_sizes=HIDDEN),
       **PPO | own.get("ppo", {}))
   return rows
 
 
 def main() -> None:
-  """python -m mjx_cl.demonstrator ENV --out DIR --steps N --seed N"""
+  """python -m mjx_cl.demonstrator ENV --out DIR --steps N --seed N --resume"""
   from mjx_cl import envs, runtime
   runtime.setup()
   parser = argparse.ArgumentParser(prog="python -m mjx_cl.demonstrator", description="Train the demonstrator of the cpu preset with brax PPO.")
@@ -141,8 +179,10 @@ def main() -> None:
   parser.add_argument("--out", required=True)
   parser.add_argument("--steps", type=int, default=8_000_000)
   parser.add_argument("--seed", type=int, default=0)
+  parser.add_argument("--evals", type=int, default=12, help="how often it is evaluated and kept")
+  parser.add_argument("--resume", action="store_true", help="go on from the last evaluation in --out")
   args = parser.parse_args()
-  train(envs.make(args.env), args.out, args.steps, args.seed, progress=lambda row: print(json.dumps(row), file=sys.stderr, flush=True))
+  train(envs.make(args.env), args.out, args.steps, args.seed, args.evals, lambda row: print(json.dumps(row), file=sys.stderr, flush=True), args.resume)
 
 
 if __name__ == "__main__":

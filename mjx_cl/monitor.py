@@ -15,20 +15,50 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from mjx_cl.dreamer import rssm
 from mjx_cl.errors import UserError
+from mjx_cl.types import Spec, Var
+
+
+GROUPS = 8   # parts of the observation with a residual of their own
+LATENT = 16  # dimensions of the latent's projection
 
 
 class Residual(NamedTuple):
-  """Residuals of one row; what detectors see.
+  """What detectors see of one row. Whatever is not known is nan.
 
   Attributes:
-    opr, rpr: float32 (). variables: float32 (O,), in raw units. valid: bool (); an invalid row is nan.
+    opr, rpr: float32 (). variables: float32 (O,), in raw units. valid: bool (): opr, rpr, variables and groups are known.
+    groups: float32 (8,), mean residual of the parts `spec.watched`, in typical deviations of each variable.
+    reward: float32 (), of arriving. terminated: bool (), the episode ended in arriving.
+    surprise: float32 (), KL(posterior || prior) of the latent at the decision [nats].
+    latent: float32 (16,), a fixed projection of the posterior latent at the decision, see `Monitor.project`.
   """
   opr: jax.Array
   rpr: jax.Array
   variables: jax.Array
   valid: jax.Array
+  groups: jax.Array
+  reward: jax.Array
+  terminated: jax.Array
+  surprise: jax.Array
+  latent: jax.Array
+
+
+def unknown(leading: tuple[int, ...], variables: int) -> Residual:
+  """Rows of which nothing is known."""
+  nan, false = lambda *shape: jnp.full(leading + shape, jnp.nan), lambda: jnp.zeros(leading, bool)  # no two fields share a buffer: all are donated
+  return Residual(nan(), nan(), nan(variables), false(), nan(GROUPS), nan(), false(), nan(), nan(LATENT))
+
+
+def watched(spec) -> tuple[tuple[str, tuple[int, ...]], ...]:
+  """(name, indices) of the eight parts: `spec.watched`, or the observation in eight stretches of about equal length."""
+  if spec.watched:
+    return spec.watched
+  stretches = np.array_split(np.arange(len(spec.obs)), GROUPS)
+  return tuple((f"obs_{at[0]}_{at[-1]}" if len(at) else f"empty_{k}", tuple(int(i) for i in at)) for k, at in enumerate(stretches))
 
 
 class History(NamedTuple):
@@ -51,9 +81,10 @@ class Monitor:
     form: `paper` or `streaming`.
     actions: `recorded`, or `policy` (the literal reading of the paper: the policy imagines its own actions).
     least: fewest steps a cut window may keep.
+    spec: of the robot, for `groups`; None: eight stretches of the observation in raw units.
   """
 
-  def __init__(self, agent, n: int = 15, form: str = "paper", actions: str = "recorded", least: int = 5):
+  def __init__(self, agent, n: int = 15, form: str = "paper", actions: str = "recorded", least: int = 5, spec=None):
     if form not in ("paper", "streaming"):
       raise UserError(f"unknown residual form {form!r}; choose from: paper, streaming")
     if actions not in ("recorded", "policy"):
@@ -61,6 +92,15 @@ class Monitor:
     if not 1 <= least <= n:
       raise UserError(f"least must lie in 1..n={n}; got {least}")
     self.agent, self.n, self.form, self.actions, self.least = agent, n, form, actions, least
+    spec = spec or Spec("", (Var("", ""),) * agent.obs_size, (), 1.0, 1, 0.0, None, ())
+    self._groups = np.zeros((agent.obs_size, GROUPS), np.float32)  # variables -> groups
+    for k, (_, at) in enumerate(watched(spec)):
+      for i in at:
+        self._groups[i, k] = 1.0 / (len(at) * spec.obs[i].scale)
+    rng = np.random.default_rng(LATENT)
+    self._projection = (rng.standard_normal((agent.size.deter + agent.stoch_size, LATENT))
+                        / np.sqrt(np.concatenate([np.full(agent.size.deter, agent.size.deter), np.full(agent.stoch_size, agent.size.stoch)]))[:, None]
+                        ).astype(np.float32)
 
   def init(self, groups: int, members: int) -> History:
     """The history before a run."""
@@ -81,7 +121,9 @@ class Monitor:
     chunk = History(rows.deter, rows.stoch, rows.action, rows.final_obs, rows.reward, done, jnp.ones_like(done))
     seq = jax.tree.map(lambda a, b: jnp.concatenate([a, b.astype(a.dtype)]), history, chunk)
     per_group = jax.vmap(self._group, (0, 1, 0), 1)
-    residual = per_group(params, seq, keys)
+    opr, rpr, variables, valid = per_group(params, seq, keys)
+    surprise, latent = jax.vmap(self._look, (0, 1, 1, 1), 1)(params, rows.obs, rows.deter, rows.stoch)
+    residual = Residual(opr, rpr, variables, valid, variables @ self._groups, rows.reward, rows.terminated, surprise, latent)
     return jax.tree.map(lambda x: x[-(self.n - 1):], seq) if self.n > 1 else history, residual
 
   def _group(self, params, seq: History, key):
@@ -112,4 +154,13 @@ class Monitor:
     mean = jnp.sum(jnp.where(valid[..., None], error, 0.0), 0) / jnp.maximum(1, count)[..., None]
     good = (count >= self.least) & seq.exists[:rows]  # n steps since the run began
     mean = jnp.where(good[..., None], mean, jnp.nan)
-    return Residual(jnp.mean(mean[..., :-1], -1), mean[..., -1], mean[..., :-1], good)
+    return jnp.mean(mean[..., :-1], -1), mean[..., -1], mean[..., :-1], good
+
+  def _look(self, params, obs, deter, stoch):
+    """Surprise [nats] and projected latent (16,) of decisions: obs (..., O), deter (..., D), stoch (..., stoch) int."""
+    logits = [x.astype(jnp.float32) for x in self.agent.beliefs(params, deter, obs)]
+    return rssm.kl(*logits), self.project(deter, stoch)
+
+  def project(self, deter: jax.Array, stoch: jax.Array) -> jax.Array:
+    """float32 (..., 16): one fixed Gaussian projection (NumPy's default_rng(16)) of [deter / sqrt(D), one-hot stoch / sqrt(variables)]."""
+    return jnp.concatenate([deter.astype(jnp.float32), self.agent.hot(stoch)], -1) @ self._projection

@@ -30,7 +30,7 @@ def record(env, trained, keys, steps: int, fault: str = "none", severity: float 
   agent = trained.agent
   the_fault = faults_lib.make(fault, env)
   rollout = Rollout(env, agent, the_fault, int(trained.card.get("repeat", 1)))
-  monitor = Monitor(agent, form=form)
+  monitor = Monitor(agent, form=form, spec=env.spec)
   streams = nest(lambda k: start(env, agent, the_fault, k, severity, onset, target=target), 0, 0)(keys[None])
   params = jax.tree.map(lambda x: x[None], trained.train.params)
   history = monitor.init(1, len(keys))

@@ -62,7 +62,7 @@ class Runner:
     self.changes = changes(config)
     self.faults, plan, target = faults.build(self.changes, self.env, config.onset)
     detector = detectors.make(config.detector, **config.settings)
-    monitor = Monitor(agent, n=15, form=config.form, actions=config.actions)
+    monitor = Monitor(agent, n=15, form=config.form, actions=config.actions, spec=spec)
     self.rollout = Rollout(self.env, agent, self.faults, self.repeat, config.deterministic)
     self.chunk_steps = CHUNK * self.repeat
     self.chunks = -(-config.steps // self.chunk_steps)

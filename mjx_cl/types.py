@@ -61,6 +61,8 @@ class Spec(NamedTuple):
     obs_groups: (name, indices into obs), such as all joint speeds.
     feet: (name, indices), what touches the ground: geoms of the MuJoCo model, or axles of a model that is none.
     bodies: (name, indices), bodies whose mass may change, the trunk first; empty where there are none by name.
+    watched: (name, indices into obs), the eight parts of the observation whose residuals a detector sees one by one, each of one kind; what the
+      world model cannot foresee (commands, the robot's own last action) is left out. Empty: the observation in eight stretches.
   """
   name: str
   obs: tuple[Var, ...]
@@ -74,6 +76,7 @@ class Spec(NamedTuple):
   obs_groups: tuple[tuple[str, tuple[int, ...]], ...] = ()
   feet: tuple[tuple[str, tuple[int, ...]], ...] = ()
   bodies: tuple[tuple[str, tuple[int, ...]], ...] = ()
+  watched: tuple[tuple[str, tuple[int, ...]], ...] = ()
 
 
 class EnvState(NamedTuple):

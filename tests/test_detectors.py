@@ -12,7 +12,7 @@ import scipy.stats
 from mjx_cl import detectors
 from mjx_cl.detectors import Alarm, Detector, any_of, on, rolling_sigma
 from mjx_cl.errors import UserError
-from mjx_cl.monitor import Residual
+from mjx_cl.monitor import GROUPS, LATENT, Residual, unknown
 
 # one detector a file, named as the file; a map over one float32
 SCALAR = {m.name: f for m in pkgutil.iter_modules(detectors.__path__)
@@ -23,13 +23,16 @@ STREAMS, STEPS = 3, 700
 
 
 def residuals(key, steps=STEPS, streams=None, invalid=0.1):
-  """Gaussian residuals around 1; a tenth of the rows is invalid, that is nan."""
+  """Gaussian residuals around 1; a tenth of the rows is unknown, that is nan throughout."""
   shape = (steps,) if streams is None else (steps, streams)
   keys = jax.random.split(key, 3)
   valid = jax.random.uniform(keys[0], shape) >= invalid
   draw = lambda k: jnp.where(valid, 1.0 + 0.1 * jax.random.normal(k, shape), jnp.nan)
   opr = draw(keys[1])
-  return Residual(opr, draw(keys[2]), opr[..., None] * jnp.ones(4), valid)
+  wide = lambda k, n: jnp.where(valid[..., None], 1.0 + 0.1 * jax.random.normal(k, shape + (n,)), jnp.nan)
+  more = jax.random.split(keys[2], 4)
+  return Residual(opr, draw(keys[2]), opr[..., None] * jnp.ones(4), valid, wide(more[0], GROUPS), draw(more[1]), jnp.zeros(shape, bool), draw(more[2]),
+                  wide(more[3], LATENT))
 
 
 @pytest.fixture(params=ALL, scope="module")
@@ -80,7 +83,8 @@ def test_an_invalid_row_changes_nothing(case, same):
   state, _ = program(residuals(jax.random.key(3), streams=STREAMS))
   nan = jnp.full(STREAMS, jnp.nan)
   for filling in (nan, jnp.full(STREAMS, 1e9)):  # whatever the row holds
-    row = Residual(filling, filling, jnp.tile(filling[:, None], 4), jnp.zeros(STREAMS, bool))
+    wide = lambda n: jnp.tile(filling[:, None], n)
+    row = unknown((STREAMS,), 4)._replace(opr=filling, rpr=filling, variables=wide(4), groups=wide(GROUPS))
     new, alarm = jax.jit(jax.vmap(detector.update))(state, row)
     assert same(new, state)
     assert not alarm.fired.any() and np.isnan(alarm.score).all()
@@ -101,7 +105,8 @@ def test_a_step_change_is_found(case):
   onset, steps = 2000, 2300  # a long past: every sample of the change enters the reference of a rolling rule
   xs = residuals(jax.random.key(5), steps, STREAMS, invalid=0.0)
   late = (jnp.arange(steps) >= onset)[:, None]
-  xs = xs._replace(opr=jnp.where(late, xs.opr + 1.0, xs.opr), rpr=jnp.where(late, xs.rpr + 1.0, xs.rpr))  # ten deviations
+  jump = lambda x: x + 1.0 * (late if x.ndim == 2 else late[..., None])  # ten deviations, in whatever a detector looks at
+  xs = xs._replace(**{k: jump(getattr(xs, k)) for k in ("opr", "rpr", "variables", "groups", "surprise", "latent")}, reward=xs.reward - 1.0 * late)
   assert program(xs)[1].fired[onset:].any(0).all()
 
 
@@ -231,7 +236,7 @@ def echo(threshold):
 
 
 def row(opr, rpr, valid=True):
-  return Residual(jnp.float32(opr), jnp.float32(rpr), jnp.zeros(4), jnp.bool_(valid))
+  return unknown((), 4)._replace(opr=jnp.float32(opr), rpr=jnp.float32(rpr), valid=jnp.bool_(valid))
 
 
 def test_on_picks_its_channel():

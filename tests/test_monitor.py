@@ -6,9 +6,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from mjx_cl import envs
 from mjx_cl.errors import UserError
-from mjx_cl.monitor import Monitor
+from mjx_cl.monitor import GROUPS as GROUPS_SEEN, Monitor, watched
 from mjx_cl.rollout import Row
+from mjx_cl.types import Spec, Var
 
 GROUPS, MEMBERS, OBS, ACT, DETER, STOCH, CLASSES = 2, 2, 3, 2, 4, 2, 3
 PAST = np.random.default_rng(0)
@@ -36,6 +38,13 @@ class Stub:
       out.append(params["gain"] * deter @ C)
     return jnp.stack(out)[..., :-1], jnp.stack(out)[..., -1]
 
+  stoch_size = STOCH * CLASSES
+
+  def beliefs(self, params, deter, obs):
+    """Posterior logits move with the observation, prior logits with the state."""
+    shape = deter.shape[:-1] + (STOCH, CLASSES)
+    return (jnp.tile(obs, 2).reshape(shape), jnp.tile(deter[..., :CLASSES], 2).reshape(shape))
+
   def dream(self, params, deter, stoch, steps, key):
     out = []
     for _ in range(steps):
@@ -51,7 +60,7 @@ def make_rows(steps, resets=0.1, seed=1, agent=Stub):
   normal = lambda *more: jnp.asarray(rng.normal(size=shape + more), jnp.float32)
   done, kind = rng.random(shape) < resets, rng.random(shape) < 0.5
   stoch = jnp.asarray(rng.integers(0, CLASSES, shape + (agent.size.stoch,)))
-  return Row(None, None, None, normal(agent.act_size), normal(agent.size.deter), stoch, normal(), None, normal(agent.obs_size), jnp.asarray(done & kind), jnp.asarray(done & ~kind), None, None, None, None)
+  return Row(normal(agent.obs_size), None, None, normal(agent.act_size), normal(agent.size.deter), stoch, normal(), None, normal(agent.obs_size), jnp.asarray(done & kind), jnp.asarray(done & ~kind), None, None, None, None)
 
 
 def part(rows, start, stop):
@@ -177,7 +186,7 @@ def test_with_a_real_agent(tiny, tiny_params):
   shape = (steps, 2, 1)
   normal = lambda *more: jnp.asarray(rng.normal(size=shape + more), jnp.float32)
   never = jnp.zeros(shape, bool)
-  rows = Row(None, None, None, normal(6), normal(128), jnp.asarray(rng.integers(0, 8, shape + (8,))), normal(), None, normal(24), never, never,
+  rows = Row(normal(24), None, None, normal(6), normal(128), jnp.asarray(rng.integers(0, 8, shape + (8,))), normal(), None, normal(24), never, never,
              None, None, None, None)
   monitor = Monitor(tiny)
   residual = jax.jit(monitor.update)(tiny_params, monitor.init(2, 1), rows, KEYS)[1]
@@ -195,3 +204,31 @@ def test_with_a_real_agent(tiny, tiny_params):
       np.testing.assert_allclose(residual.variables[t, g, 0], each, rtol=1e-4, atol=1e-5)
       np.testing.assert_allclose(residual.opr[t, g, 0], each.mean(), rtol=1e-4)
       np.testing.assert_allclose(residual.rpr[t, g, 0], np.abs(reward[:, t] - rows.reward[own, g, 0]).mean(), rtol=1e-4)
+
+
+def test_what_detectors_see_beside_the_residuals():
+  """Groups, reward, surprise and latent against sums in NumPy."""
+  rows = make_rows(8)
+  spec = Spec("", tuple(Var(f"o{k}", "", scale=s) for k, s in enumerate((0.5, 1.0, 2.0))), (), 1.0, 1, 0.0, None, (),
+              watched=(("a", (0, 2)), ("b", (1,))) + tuple((f"none{k}", (0,)) for k in range(6)))
+  monitor = Monitor(Stub(), n=1, least=1, spec=spec)
+  seen = monitor.update(Stub.params, monitor.init(GROUPS, MEMBERS), rows, KEYS)[1]
+  v = np.asarray(seen.variables)
+  np.testing.assert_allclose(seen.groups[..., 0], (v[..., 0] / 0.5 + v[..., 2] / 2.0) / 2, rtol=1e-5)  # float32 sums of two numbers
+  np.testing.assert_allclose(seen.groups[..., 1], v[..., 1], rtol=1e-5)
+  np.testing.assert_array_equal(seen.reward, rows.reward)
+  np.testing.assert_array_equal(seen.terminated, rows.terminated)
+  mixed = lambda x: 0.99 * np.exp(x) / np.exp(x).sum(-1, keepdims=True) + 0.01 / CLASSES
+  q, p = mixed(np.asarray(rows.obs, float)), mixed(np.asarray(rows.deter, float)[..., :CLASSES])
+  np.testing.assert_allclose(seen.surprise, 2 * (q * np.log(q / p)).sum(-1), rtol=1e-4)  # both variables of the stub are alike
+  hot = np.eye(CLASSES)[np.asarray(rows.stoch)].reshape(8, GROUPS, MEMBERS, -1)
+  np.testing.assert_allclose(seen.latent, np.concatenate([rows.deter, hot], -1) @ monitor._projection, rtol=1e-4, atol=1e-5)
+
+
+def test_every_robot_has_eight_watched_parts():
+  for name in envs.ENVS:
+    spec = envs.make(name).spec
+    parts = watched(spec)
+    indices = [i for _, at in parts for i in at]
+    assert len(parts) == GROUPS_SEEN == len({n for n, _ in parts}) and all(at for _, at in parts)
+    assert len(set(indices)) == len(indices) and set(indices) <= set(range(len(spec.obs)))

@@ -14,7 +14,7 @@ from mjx_cl import replay as replay_lib
 from mjx_cl.adapt import phase as phase_lib
 from mjx_cl.config import AdaptConfig
 from mjx_cl.dreamer.agent import Agent, Batch, TrainState
-from mjx_cl.monitor import History, Monitor, Residual
+from mjx_cl.monitor import History, Monitor, unknown
 from mjx_cl.rollout import records
 
 
@@ -80,7 +80,7 @@ class Loop:
     spread = lambda tree: jax.tree.map(lambda x: jnp.broadcast_to(x, (groups,) + x.shape).copy(), tree)
     empty = replay_lib.init(1, self.capacity, a.obs_size, a.act_size, a.size.deter, a.size.stoch)
     rows = max(1, self.config.refit // self.repeat)
-    past = Residual(jnp.zeros((rows, groups)), jnp.zeros((rows, groups)), jnp.zeros((rows, groups, a.obs_size)), jnp.zeros((rows, groups), bool))
+    past = unknown((rows, groups), a.obs_size)
     return LoopState(spread(train), spread(train.params), spread(empty), self.monitor.init(groups, 1), spread(self.detector.init()), spread(phase_lib.init(self.config)),
                      past, jnp.zeros(groups), jnp.zeros(groups, jnp.int32))
 

@@ -5,15 +5,35 @@ import jax
 import jax.numpy as jnp
 
 from mjx_cl.detectors.base import Alarm, Detector
+from mjx_cl.errors import UserError
+
+CHANNELS = ("opr", "rpr", "reward", "surprise") + tuple(f"group_{k}" for k in range(8))
 
 
-def on(channel: str, detector: Detector) -> Detector:
-  """A single-residual detector on one field (`opr` or `rpr`) of monitor.Residual. An invalid row leaves its state unchanged."""
+def read(channel: str, residual) -> jax.Array:
+  """One number of a monitor.Residual: `opr`, `rpr`, `reward`, `surprise`, or `group_0` .. `group_7`. Unknown values are nan."""
+  if channel.startswith("group_"):
+    return residual.groups[int(channel[6:])]
+  return getattr(residual, channel)
+
+
+def on(channel: str, detector: Detector, log: bool = False) -> Detector:
+  """A single-residual detector on one channel of monitor.Residual. A sample that is invalid or no finite number leaves its
+  state unchanged.
+
+  Args:
+    log: ln max(x, 1e-9) in place of x; residuals are positive and skewed.
+  """
+  if channel not in CHANNELS:
+    raise UserError(f"unknown channel {channel!r}; choose from: {', '.join(CHANNELS)}")
+
   def update(state, residual):
-    x = jnp.where(residual.valid, getattr(residual, channel), 0.0)
-    new, alarm = detector.update(state, x)
-    state = jax.tree.map(lambda a, b: jnp.where(residual.valid, a, b), new, state)
-    return state, Alarm(alarm.fired & residual.valid, jnp.where(residual.valid, alarm.score, jnp.nan))
+    x = read(channel, residual)
+    valid = jnp.isfinite(x) & (residual.valid | (channel in ("reward", "surprise")))
+    x = jnp.where(valid, x, 0.0)
+    new, alarm = detector.update(state, jnp.log(jnp.maximum(x, 1e-9)) if log else x)
+    state = jax.tree.map(lambda a, b: jnp.where(valid, a, b), new, state)
+    return state, Alarm(alarm.fired & valid, jnp.where(valid, alarm.score, jnp.nan))
   return Detector(detector.init, update)
 
 

@@ -315,6 +315,12 @@ class Agent:
     """Observation (..., O) in raw units and reward (...) at states."""
     return nets.symexp(self._apply(params, "dec", deter, stoch)), nets.two_hot_mean(self._apply(params, "rew", deter, stoch), self.bins)
 
+  def beliefs(self, params, deter, obs):
+    """Logits (..., stoch, classes) of the posterior at `obs` and of the prior, both at `deter`."""
+    flat, tokens = deter.reshape(-1, deter.shape[-1]), self._apply(params, "enc", obs.reshape(-1, obs.shape[-1]))
+    shape = deter.shape[:-1] + (self.size.stoch, self.size.classes)
+    return (self._apply(params, "dyn", flat, tokens, method="posterior").reshape(shape), self._apply(params, "dyn", flat, method="prior").reshape(shape))
+
   def dream(self, params, deter, stoch, steps: int, key: jax.Array):
     """As `open_loop`, with the actions that the policy imagines for itself."""
     deters, stochs, _ = self.imagine(params, deter, stoch, key, steps)

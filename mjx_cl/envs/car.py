@@ -48,9 +48,13 @@ def spec(name: str, course: Course, acceptance: float) -> Spec:
   beams, side = np.arange(course.beams), np.pi / 4
   parts = {"lidar": beams, "lidar_right": beams[course.angles < -side], "lidar_front": beams[np.abs(course.angles) <= side],
            "lidar_left": beams[course.angles > side], "motion": course.beams + np.arange(3)}
+  fans = tuple((f"lidar_{side}", tuple(int(i) for i in at))
+               for side, at in zip(("right", "front_right", "front", "front_left", "left"), np.array_split(beams, 5)))
+  motion = tuple((v.name, (course.beams + k,)) for k, v in enumerate(own))
   return Spec(name=name, obs=lidar + own, act=(Var("steering", "1", -1, 1), Var("motor", "1", -1, 1)), control_s=CONTROL_S, episode_steps=EPISODE,
               acceptance=acceptance, posture=None, targets=("steering", "motor"),
-              obs_groups=tuple((part, tuple(int(i) for i in at)) for part, at in parts.items()), feet=(("front", (0,)), ("rear", (1,))))
+              obs_groups=tuple((part, tuple(int(i) for i in at)) for part, at in parts.items()), feet=(("front", (0,)), ("rear", (1,))),
+              watched=fans + motion)
 
 
 def command(action: jax.Array) -> tuple[jax.Array, jax.Array]:

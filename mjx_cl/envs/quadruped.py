@@ -265,7 +265,9 @@ def make_spec(mj_model: mujoco.MjModel) -> Spec:
       posture=None,    # upright is a least value of no channel (gravity's z is then -1); a fall ends the episode, standing still earns too little
       targets=JOINTS, act_groups=legs + (("all", tuple(range(12))),), obs_groups=tuple(groups),
       feet=tuple((leg, (mj_model.geom(f"{leg}_foot").id,)) for leg in LEGS),
-      bodies=tuple((mj_model.body(b).name, (b,)) for b in range(1, mj_model.nbody)))
+      bodies=tuple((mj_model.body(b).name, (b,)) for b in range(1, mj_model.nbody)),
+      watched=tuple((group, at) for group, at in groups if group in ("base_lin_vel", "base_ang_vel", "projected_gravity", "joint_pos"))
+      + tuple((f"joint_vel_{leg}", tuple(dict(groups)["joint_vel"][3 * k:3 * k + 3])) for k, leg in enumerate(LEGS)))
 
 
 class Quadruped:

@@ -101,7 +101,9 @@ class Walker:
         targets=JOINTS, act_groups=(("right_leg", (0, 1, 2)), ("left_leg", (3, 4, 5)), ("all", tuple(range(6)))),
         obs_groups=(("orientations", tuple(range(14))), ("height", (14,)), ("velocities", tuple(range(15, 24)))),
         feet=(("right_foot", (self.mj_model.geom("right_foot").id,)), ("left_foot", (self.mj_model.geom("left_foot").id,))),
-        bodies=tuple((b, (self.mj_model.body(b).id,)) for b in BODIES))
+        bodies=tuple((b, (self.mj_model.body(b).id,)) for b in BODIES),
+        watched=(("torso_orientation", (0, 1)), ("right_orientation", tuple(range(2, 8))), ("left_orientation", tuple(range(8, 14))), ("height", (14,)),
+                 ("torso_velocity", (15, 16)), ("torso_pitch_rate", (17,)), ("right_velocity", (18, 19, 20)), ("left_velocity", (21, 22, 23))))
     self.reward_terms = tuple(REWARD_TERMS)
     self.model = Model(
         mj=physics_lib.leaves(self.mj_model, "actuator_gear", "geom_friction", "body_mass", "body_inertia", "body_ipos", "dof_armature", "dof_damping",
