@@ -77,12 +77,17 @@ def seeds_mesh(seeds: int):
 
 
 def expert(env, name: str):
-  """A demonstrator, Stream -> action: `reference`, the environment's own driver that knows its state, or a policy's .npz."""
+  """A demonstrator, Stream -> action: `reference`, the environment's own driver that knows its state, or a policy's .npz.
+
+  A policy sees the observation without its noise where the robot can give it (`noiseless`): labels then follow from what a latent can know.
+  """
   if name == "reference":
     if not hasattr(env, "reference"):
       raise UserError(f"robot {env.spec.name!r} has no reference driver; give a policy's .npz or `ppo`")
     return lambda stream: env.reference(stream.env)
   policy = demonstrator.load(name)
+  if hasattr(env, "noiseless"):
+    return lambda stream: policy(env.noiseless(env.model, stream.env))
   return lambda stream: policy(stream.obs)
 
 

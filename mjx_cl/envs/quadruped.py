@@ -349,5 +349,10 @@ class Quadruped:
     """
     return {"velocity_error_m_s": state.physics.velocity_error}
 
+  def noiseless(self, model: Model, state: EnvState) -> jax.Array:
+    """The observation (48,) at `state` without its noise: what a demonstrator is shown."""
+    p = state.physics
+    return observe(p.qpos, p.qvel, model.mj.get("gravity", self._gravity), p.command, p.action)
+
   def _sense(self, key: jax.Array, obs: jax.Array) -> jax.Array:
     return obs + NOISE * jax.random.uniform(key, obs.shape, minval=-1.0, maxval=1.0)
