@@ -138,6 +138,26 @@ class Certify:
 
 
 @dataclass(frozen=True)
+class Record:
+  """Records residual streams of a suite: frozen agents, healthy and faulty robots side by side, to Parquet that pandas alone reads.
+
+  A recording that was cut off goes on where it stopped: parts that are finished are kept in OUT/work until all are there.
+  """
+  suite: Positional[str] = "leaderboard"
+  """Suite by name, see `mjx-cl list suites`, or a .toml file."""
+  out: str = "runs/streams"
+  """Folder of the set."""
+  robot: tuple[str, ...] = ()
+  """Only these robots of the suite."""
+  agent: str | None = None
+  """Trained agent: shipped name or folder; default: the shipped one of each robot."""
+  physics: str = "auto"
+  json: bool = False
+  overwrite: bool = False
+  """Replace a set that is in --out."""
+
+
+@dataclass(frozen=True)
 class Plot:
   """Draws figure.png of a run anew."""
   folder: Positional[str]
@@ -181,9 +201,15 @@ class Render:
 
 @dataclass(frozen=True)
 class Query:
-  """SQL over a run's files: trace, events, runs are views."""
-  folder: Positional[str]
-  sql: Positional[str]
+  """SQL over all results, read-only; without SQL: the views, their rows and columns.
+
+  `query SQL`: every table under results/ is a view named after its path (results/walker_gear/runs.parquet is walker_gear_runs).
+  `query FOLDER SQL`: the tables of one folder, under their own names (trace, events, runs).
+  """
+  words: Positional[tuple[str, ...]] = ()
+  """[FOLDER] [SQL]"""
+  within: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(name="in")] = ()
+  """One more folder, DIR or NAME=DIR: its tables are views that begin with its name. Repeatable."""
   json: bool = False
 
 
@@ -191,7 +217,7 @@ class Query:
 class List:
   """Names that other commands take."""
   what: Positional[str] = "all"
-  """envs, faults, fault-presets, schedules, detectors, presets, agents, arms, sizes or all."""
+  """envs, faults, fault-presets, schedules, detectors, presets, agents, arms, sizes, suites or all."""
   json: bool = False
 
 
@@ -202,7 +228,7 @@ class Doctor:
 
 
 Command = (Annotated[Run, tyro.conf.subcommand("run")] | Annotated[Train, tyro.conf.subcommand("train")] | Annotated[Eval, tyro.conf.subcommand("eval")]
-           | Annotated[Certify, tyro.conf.subcommand("certify")] | Annotated[Plot, tyro.conf.subcommand("plot")] | Annotated[Render, tyro.conf.subcommand("render")] | Annotated[Query, tyro.conf.subcommand("query")]
+           | Annotated[Certify, tyro.conf.subcommand("certify")] | Annotated[Record, tyro.conf.subcommand("record")] | Annotated[Plot, tyro.conf.subcommand("plot")] | Annotated[Render, tyro.conf.subcommand("render")] | Annotated[Query, tyro.conf.subcommand("query")]
            | Annotated[List, tyro.conf.subcommand("list")] | Annotated[Doctor, tyro.conf.subcommand("doctor")])
 
 
@@ -426,6 +452,36 @@ def do_certify(args: Certify) -> None:
     say(f"mjx-cl: {line}")
 
 
+def do_record(args: Record) -> None:
+  import shutil
+  from mjx_cl import streams
+  from mjx_cl.errors import FileError
+  suite = streams.suite(args.suite)
+  out = streams.pathlib.Path(args.out)
+  if (out / "config.json").exists():
+    if not args.overwrite:
+      raise UserError(f"{out} holds a recorded set; give --overwrite to replace it, or another --out")
+    shutil.rmtree(out)
+  elif out.exists() and (not out.is_dir() or {p.name for p in out.iterdir()} - {"work"} and not list(out.glob("*.parquet"))):
+    raise UserError(f"{out} is no folder of a recording; give another --out")
+  told = [0.0]
+
+  def progress(part, done, steps, lanes):
+    now = time.monotonic()
+    if now - told[0] > 10 or done >= steps:
+      told[0] = now
+      say(f"{part}: {done:,}/{steps:,} steps of {lanes} robots")
+  result = streams.record(suite, out, args.robot, args.physics, args.agent, "mjx-cl " + " ".join(sys.argv[1:]), progress)
+  shutil.rmtree(out / "work", ignore_errors=True)
+  if args.json:
+    emit(result)
+  else:
+    for robot, steps in result["stream_steps"].items():
+      speed = result["stream_steps_per_s"][robot]
+      print(f"{robot}: {steps:,} stream-steps" + (f", {speed:,.0f} a second" if speed else ", recorded before"))
+    print(f"{result['bytes'] / 1e6:.1f} MB in {out}")
+
+
 def do_plot(args: Plot) -> None:
   from mjx_cl import plots
   if not os.path.exists(os.path.join(args.folder, "trace.parquet")):
@@ -455,26 +511,37 @@ def do_render(args: Render) -> None:
 
 
 def do_query(args: Query) -> None:
+  import math
   from mjx_cl import store
-  names, rows = store.query(args.folder, args.sql)
+  *folder, sql = args.words or (None,)
+  if sql is not None and not folder and os.path.isdir(sql):
+    folder, sql = [sql], None
+  if len(folder) > 1:
+    raise UserError(f"query takes [FOLDER] [SQL], the SQL in quotes; got {len(args.words)} words")
+  if folder and args.within:
+    raise UserError("query takes a folder or --in, not both")
+  names, rows = store.query(folder[0] if folder else store.views(args.within), sql)
   if args.json:
-    print(json.dumps([dict(zip(names, r)) for r in rows], default=str))
+    for k, name in enumerate(names):  # two columns of one name would be one in JSON
+      names[k] = name if name not in names[:k] else f"{name}_{k}"
+    print(json.dumps([{n: None if isinstance(x, float) and not math.isfinite(x) else x for n, x in zip(names, r)} for r in rows], default=str))
     return
   from rich.console import Console
   from rich.table import Table
+  from rich.text import Text
   table = Table(*names)
   for r in rows:
-    table.add_row(*(str(x) for x in r))
+    table.add_row(*(Text(str(x)) for x in r))
   Console().print(table)
 
 
 def do_list(args: List) -> None:
-  from mjx_cl import agents, detectors, envs, fault_presets, faults, memory
+  from mjx_cl import agents, detectors, envs, fault_presets, faults, memory, streams
   first = lambda f: (f.__doc__ or "").strip().split("\n")[0]
   tables = {"envs": {k: first(v) for k, v in envs.ENVS.items()}, "faults": {k: faults.about(k) for k in faults.FAULTS},
             "detectors": {k: first(v) for k, v in detectors.DETECTORS.items()}, "presets": {k: p.about for k, p in PRESETS.items()},
             "agents": {k: "shipped" for k in agents.shipped()}, "arms": ARMS, "fault-presets": {k: f"{p.about} ({p.source})" for k, p in fault_presets.PRESETS.items()}, "schedules": fault_presets.SCHEDULES,
-            "sizes": memory.table()}
+            "sizes": memory.table(), "suites": streams.about()}
   chosen = tables if args.what == "all" else {args.what: choose("list", args.what, tables)}
   if args.json:
     emit(chosen)
@@ -495,7 +562,7 @@ def do_doctor(args: Doctor) -> None:
       print(f"{name:16s} {value if not isinstance(value, dict) else ', '.join(f'{k} {v}' for k, v in value.items())}")
 
 
-DO = {Run: do_run, Train: do_train, Eval: do_eval, Certify: do_certify, Plot: do_plot, Render: do_render, Query: do_query, List: do_list, Doctor: do_doctor}
+DO = {Run: do_run, Train: do_train, Eval: do_eval, Certify: do_certify, Record: do_record, Plot: do_plot, Render: do_render, Query: do_query, List: do_list, Doctor: do_doctor}
 
 
 def parse(argv: list[str] | None):

@@ -6,6 +6,7 @@ import json
 import os
 import pathlib
 import platform
+import re
 import subprocess
 
 from mjx_cl.errors import FileError, UserError
@@ -20,35 +21,39 @@ def plain(x):
   raise TypeError(f"{type(x).__name__} is no JSON value")
 
 
-def write_json(path, value) -> None:
-  """Writes JSON (nan and infinity refused) to a temporary name and renames it."""
+def atomic(path, write) -> None:
+  """Calls `write` with a binary file of a temporary name and renames it to `path`.
+
+  Raises:
+    FileError where the disk is full or the folder refuses; what was at `path` stays.
+  """
   path = pathlib.Path(path)
   tmp = path.with_name(path.name + ".tmp")
   try:
-    tmp.write_text(json.dumps(value, indent=1, allow_nan=False, default=plain) + "\n")
+    with open(tmp, "wb") as file:
+      write(file)
     os.replace(tmp, path)
   except OSError as e:
     tmp.unlink(missing_ok=True)
     raise FileError(f"cannot write {path}: {e.strerror or e}; what was there is unchanged") from None
 
 
-def write_table(path, columns: dict, nan_is_null: bool = True) -> None:
-  """Writes columns (name -> 1-D array or list) as Parquet; nan becomes null."""
+def write_json(path, value) -> None:
+  """Writes JSON (nan and infinity refused)."""
+  text = json.dumps(value, indent=1, allow_nan=False, default=plain) + "\n"
+  atomic(path, lambda file: file.write(text.encode()))
+
+
+def write_table(path, columns: dict, nan_is_null: bool = True, level: int | None = None) -> None:
+  """Writes columns (name -> 1-D array or list) as Parquet; nan becomes null. `level`: of the compression, zstd."""
   import numpy as np
   import pyarrow
   import pyarrow.parquet
-  path = pathlib.Path(path)
   arrays = {}
   for name, values in columns.items():
     floating = isinstance(values, np.ndarray) and values.dtype.kind == "f"
     arrays[name] = pyarrow.array(values, mask=np.isnan(values) if floating and nan_is_null else None)
-  tmp = path.with_name(path.name + ".tmp")
-  try:
-    pyarrow.parquet.write_table(pyarrow.table(arrays), tmp, compression="zstd")
-    os.replace(tmp, path)
-  except OSError as e:
-    tmp.unlink(missing_ok=True)
-    raise FileError(f"cannot write {path}: {e.strerror or e}; what was there is unchanged") from None
+  atomic(path, lambda file: pyarrow.parquet.write_table(pyarrow.table(arrays), file, compression="zstd", compression_level=level))
 
 
 def read_table(path) -> dict:
@@ -62,27 +67,92 @@ def read_table(path) -> dict:
   return {name: table[name].to_numpy() for name in table.column_names}
 
 
-def query(folder, sql: str) -> tuple[list[str], list[tuple]]:
-  """Runs SQL over a run's files; every FOLDER/*.parquet is a view of its own name."""
+def views(folders: tuple[str, ...] = (), results: str = "results") -> dict[str, pathlib.Path]:
+  """Names of result tables, each after its path: results/leaderboard.parquet is leaderboard, results/walker_gear/runs.parquet walker_gear_runs.
+
+  Args:
+    folders: more folders, DIR or NAME=DIR; tables in them, at any depth, carry NAME in front, by default the folder's own name.
+    results: the folder whose name is left out; it need not exist.
+  Raises:
+    UserError where a folder is missing, nothing is found, or two tables would have one name.
+  """
+  found, seen = {}, set()
+  for folder in (results, *folders):
+    name, sign, at = folder.partition("=")
+    if not sign or pathlib.Path(folder).is_dir():
+      name, at = "", folder
+    at = pathlib.Path(at)
+    if not at.is_dir():
+      if folder == results:
+        continue
+      raise UserError(f"no folder {at}")
+    first = () if folder == results else (name or at.resolve().name,)
+    for file in sorted(at.rglob("*.parquet")):
+      if file.resolve() in seen:
+        continue
+      seen.add(file.resolve())
+      name = "_".join(re.sub(r"\W+", "_", part) for part in (*first, *file.relative_to(at).with_suffix("").parts)).lower()
+      name = "_" + name if name[:1].isdigit() else name  # no SQL word begins with a digit
+      if name in found:
+        raise UserError(f"{found[name]} and {file} would both be the view {name}; give one of their folders a name by --in NAME=DIR, or rename a file")
+      found[name] = file
+  if not found:
+    raise UserError(f"no .parquet file in {' or '.join((results, *folders))}; give a folder, or --in DIR")
+  return found
+
+
+def query(tables, sql: str | None = None) -> tuple[list[str], list[tuple]]:
+  """Runs SQL over result files, which it can read and not change: SELECT statements alone (FROM, DESCRIBE, SHOW and SUMMARIZE are such), no
+  file outside the views, no settings, no extensions.
+
+  Args:
+    tables: a folder, every FOLDER/*.parquet is a view of its own name; or views by name, see `views`.
+    sql: None lists the views.
+  Returns:
+    (names of columns, rows).
+  """
   import duckdb
-  folder = pathlib.Path(folder)
-  files = sorted(folder.glob("*.parquet"))
-  if not files:
-    raise UserError(f"no .parquet file in {folder}")
-  with duckdb.connect() as db:
-    for file in files:
-      name, at = file.stem.replace('"', '""'), str(file).replace("'", "''")
+  if not isinstance(tables, dict):
+    tables = {file.stem: file for file in sorted(pathlib.Path(tables).glob("*.parquet"))} or _none(tables)
+  names = ", ".join(list(tables)[:20]) + (f" and {len(tables) - 20} more, listed by mjx-cl query without SQL" if len(tables) > 20 else "")
+  # no spill to disk, and no Python variable that happens to have the name of a table
+  with duckdb.connect(config={"temp_directory": "", "python_enable_replacements": False, "autoinstall_known_extensions": False,
+                              "autoload_known_extensions": False}) as db:
+    # a path is a pattern to read_parquet; a sign in brackets means itself, so that a folder may be called a[1]
+    paths = {name: re.sub(r"([*?\[])", r"[\1]", str(file)) for name, file in tables.items()}
+    for name, file in tables.items():
+      quoted, at = name.replace('"', '""'), paths[name].replace("'", "''")
       try:
-        db.execute(f"create view \"{name}\" as select * from read_parquet('{at}')")
+        db.execute(f"create view \"{quoted}\" as select * from read_parquet('{at}')")
       except duckdb.Error as e:
         raise FileError(f"cannot read {file}: {str(e).splitlines()[0]}") from None
+    db.execute("set allowed_paths = $1", [[*map(str, tables.values()), *paths.values()]])
+    db.execute("set enable_external_access = false")
+    db.execute("set lock_configuration = true")
+    if sql is None:
+      return ["view", "rows", "columns"], [_describe(db, name) for name in tables]
     try:
-      result = db.execute(sql)
-      if result is None:
-        raise UserError(f"query: no statement; views: {', '.join(f.stem for f in files)}")
+      statements = duckdb.extract_statements(sql)
+      for statement in statements:
+        if statement.type != duckdb.StatementType.SELECT:
+          kind = {"MULTI": "PIVOT without a list of values"}.get(statement.type.name, statement.type.name)
+          raise UserError(f"query: results are read-only, and {kind} is no select; views: {names}")
+      if not statements:
+        raise UserError(f"query: no statement; views: {names}")
+      for statement in statements:
+        result = db.execute(statement)
       return [c[0] for c in result.description], result.fetchall()
     except duckdb.Error as e:
-      raise UserError(f"query: {str(e).splitlines()[0]}; views: {', '.join(f.stem for f in files)}") from None
+      raise UserError(f"query: {str(e).splitlines()[0]}; views: {names}") from None
+
+
+def _none(folder):
+  raise UserError(f"no .parquet file in {folder}")
+
+
+def _describe(db, name: str) -> tuple[str, int, str]:
+  quoted = '"' + name.replace('"', '""') + '"'
+  return name, db.execute(f"select count(*) from {quoted}").fetchone()[0], ", ".join(c[0] for c in db.execute(f"select * from {quoted} limit 0").description)
 
 
 def provenance() -> dict:
