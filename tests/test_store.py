@@ -150,6 +150,127 @@ def test_query_of_a_broken_table_is_one_line(folder):
   assert "events.parquet" in one_line(error)
 
 
+@pytest.fixture
+def tree(tmp_path, monkeypatch):
+  """A working folder with results/, a run folder beside it, and a file that no query may see."""
+  monkeypatch.chdir(tmp_path)
+  for name, rows in (("results/leaderboard", 2), ("results/walker_gear/runs", 3), ("results/my-suite/2026", 4), ("runs/latest/trace", 5), ("runs/other/trace", 6),
+                     ("runs/a[1]/trace", 7), ("runs/a1/trace", 8)):
+    path = pathlib.Path(name + ".parquet")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    store.write_table(path, {"x": list(range(rows)), "y": ["z"] * rows})
+  (tmp_path / "secret.csv").write_text("a\n1\n")
+  return tmp_path
+
+
+def every_file(folder):
+  return {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def test_views_are_named_by_their_paths(tree):
+  named = {"leaderboard": "results/leaderboard.parquet", "walker_gear_runs": "results/walker_gear/runs.parquet", "my_suite_2026": "results/my-suite/2026.parquet"}
+  assert store.views() == {k: pathlib.Path(v) for k, v in named.items()}
+  more = store.views(("runs/latest", "B=runs/other", "results/walker_gear"))  # what is there already keeps its name
+  assert more == store.views() | {"latest_trace": pathlib.Path("runs/latest/trace.parquet"), "b_trace": pathlib.Path("runs/other/trace.parquet")}
+  assert store.query(more) == (["view", "rows", "columns"], [("leaderboard", 2, "x, y"), ("my_suite_2026", 4, "x, y"), ("walker_gear_runs", 3, "x, y"),
+                                                             ("latest_trace", 5, "x, y"), ("b_trace", 6, "x, y")])
+  assert store.query(more, "select (select count(*) from leaderboard) + count(*) as n from b_trace") == (["n"], [(8,)])
+
+
+def test_two_tables_of_one_name_are_named(tree):
+  store.write_table("results/walker_gear_runs.parquet", {"x": [1]})
+  with pytest.raises(UserError) as error:
+    store.views()
+  assert all(word in one_line(error) for word in ("results/walker_gear/runs.parquet", "results/walker_gear_runs.parquet", "NAME=DIR"))
+  os.remove("results/walker_gear_runs.parquet")
+  (tree / "more" / "latest").mkdir(parents=True)
+  store.write_table("more/latest/Trace.parquet", {"x": [1]})  # SQL does not tell trace from Trace
+  with pytest.raises(UserError, match="latest_trace"):
+    store.views(("runs/latest", "more/latest"))
+  assert len(store.views(("runs/latest", "again=more/latest"))) == 5
+
+
+def test_views_of_nothing(tmp_path, monkeypatch):
+  monkeypatch.chdir(tmp_path)
+  with pytest.raises(UserError, match="no .parquet file in results"):
+    store.views()
+  with pytest.raises(UserError, match="no folder none"):
+    store.views(("none",))
+
+
+@pytest.mark.parametrize("sql", ["select x from leaderboard", "from leaderboard select x", "with t as (select x from leaderboard) select * from t", "values (0), (1)",
+                                 "select 7; select x from leaderboard"])
+def test_a_reading_statement_is_run(tree, sql):
+  assert store.query(store.views(), sql)[1] == [(0,), (1,)]
+
+
+def test_a_summary_is_a_reading_statement(tree):
+  assert [r[0] for r in store.query(store.views(), "describe leaderboard")[1]] == ["x", "y"]
+  assert [r[:3] for r in store.query(store.views(), "summarize leaderboard")[1]] == [("x", "BIGINT", "0"), ("y", "VARCHAR", "z")]
+
+
+@pytest.mark.parametrize("sql", [
+    "copy leaderboard to 'out.csv'", "copy (select 1) to 'results/leaderboard.parquet' (format parquet)", "create table t as select 1", "create view t as select 1",
+    "insert into leaderboard values (1, 'z')", "update leaderboard set x = 1", "delete from leaderboard", "drop view leaderboard", "alter view leaderboard rename to l",
+    "attach 'new.db'", "install json", "load json", "export database 'out'", "import database 'out'", "pragma enable_profiling", "set threads = 1",
+    "set enable_external_access = true", "reset lock_configuration", "checkpoint", "call duckdb_settings()", "begin", "vacuum", "use memory",
+    "explain analyze copy leaderboard to 'out.csv'", "prepare p as select 1", "select 1; copy leaderboard to 'out.csv'", "pivot leaderboard on y using sum(x)"])
+def test_a_writing_statement_is_refused(tree, sql):
+  before = every_file(tree)
+  with pytest.raises(UserError) as error:
+    store.query(store.views(), sql)
+  assert "read-only" in one_line(error) and "leaderboard" in one_line(error) and error.value.exit_code == 2
+  assert every_file(tree) == before
+
+
+@pytest.mark.parametrize("sql", [
+    "select * from 'secret.csv'", "select * from read_csv('secret.csv')", "select * from read_text('{}/secret.csv')", "select * from read_blob('results/../secret.csv')",
+    "select * from 'results/leaderboard.parquet/../../secret.csv'", "select * from sniff_csv('secret.csv')", "select * from glob('*')",
+    "select * from read_parquet('runs/latest/trace.parquet')", "select * from read_parquet('results/*.parquet')", "select * from 'results/../runs/latest/trace.parquet'",
+    "select * from read_parquet('http://localhost:1/x.parquet')", "select * from query('copy (select 1) to ''out.csv''')",
+    "select * from query_table('secret.csv')", "with q as (insert into leaderboard values (1, 'z') returning x) select * from q", "select * from store", "select getenv('HOME')"])
+def test_a_path_trick_is_refused(tree, sql):
+  before = every_file(tree)
+  with pytest.raises(UserError) as error:
+    store.query(store.views(), sql.format(tree))
+  assert "leaderboard" in one_line(error)
+  assert every_file(tree) == before
+
+
+def test_a_python_variable_is_no_view(tree):
+  import pyarrow
+  variable = pyarrow.table({"a": [1]})  # noqa: F841  DuckDB would find it by its name
+  with pytest.raises(UserError, match="variable does not exist"):
+    store.query(store.views(), "select * from variable")
+
+
+def test_a_folder_whose_name_is_a_pattern(tree):
+  """runs/a[1] as a pattern means runs/a1."""
+  assert store.query("runs/a[1]", "select count(*) from trace")[1] == [(7,)]
+  assert store.query(store.views(("runs/a[1]", "runs/a1")))[1][-2:] == [("a_1__trace", 7, "x, y"), ("a1_trace", 8, "x, y")]
+
+
+def test_query_on_the_command_line(tree, capsys):
+  from mjx_cl import cli
+
+  def call(*argv):
+    code = cli.main(["query", *argv])
+    out, err = capsys.readouterr()
+    assert code == 0 and err == ""
+    return out
+  assert json.loads(call("select x, x from leaderboard order by x", "--json")) == [{"x": 0, "x_1": 0}, {"x": 1, "x_1": 1}]
+  assert json.loads(call("select 'nan'::float as x", "--json")) == [{"x": None}]
+  assert json.loads(call("--in", "runs/latest", "--in", "B=runs/other", "select max(x) - (select max(x) from latest_trace) as d from b_trace", "--json")) == [{"d": 1}]
+  assert json.loads(call("--json")) == [{"view": k, "rows": n, "columns": "x, y"} for k, n in (("leaderboard", 2), ("my_suite_2026", 4), ("walker_gear_runs", 3))]
+  assert json.loads(call("runs/latest", "--json")) == [{"view": "trace", "rows": 5, "columns": "x, y"}]
+  assert json.loads(call("runs/latest", "select count(*) as n from trace", "--json")) == [{"n": 5}]
+  assert "[red]x" in call("select '[red]x' as x")  # no markup
+  for argv, word in ((["a", "b", "c"], "quotes"), (["runs/latest", "select 1", "--in", "runs/other"], "not both"), (["drop view leaderboard"], "DROP")):
+    assert cli.main(["query", *argv]) == 2
+    out, err = capsys.readouterr()
+    assert out == "" and err.count("\n") == 1 and word in err
+
+
 # ---- the output folder ---------------------------------------------------------------------------------------------------------------
 
 def claim(out, resume=False, overwrite=False):
