@@ -117,14 +117,24 @@ class Monitor:
     Returns:
       (history', Residual with leading (T, groups, members)).
     """
-    done = rows.terminated | rows.truncated
-    chunk = History(rows.deter, rows.stoch, rows.action, rows.final_obs, rows.reward, done, jnp.ones_like(done))
-    seq = jax.tree.map(lambda a, b: jnp.concatenate([a, b.astype(a.dtype)]), history, chunk)
+    seq = self._join(history, rows)
     per_group = jax.vmap(self._group, (0, 1, 0), 1)
     opr, rpr, variables, valid = per_group(params, seq, keys)
     surprise, latent = jax.vmap(self._look, (0, 1, 1, 1), 1)(params, rows.obs, rows.deter, rows.stoch)
     residual = Residual(opr, rpr, variables, valid, variables @ self._groups, rows.reward, rows.terminated, surprise, latent)
-    return jax.tree.map(lambda x: x[-(self.n - 1):], seq) if self.n > 1 else history, residual
+    return self._last(history, seq), residual
+
+  def remember(self, history: History, rows) -> History:
+    """The history after a chunk, as `update` gives it, without looking."""
+    return self._last(history, self._join(history, rows))
+
+  def _join(self, history: History, rows) -> History:
+    done = rows.terminated | rows.truncated
+    chunk = History(rows.deter, rows.stoch, rows.action, rows.final_obs, rows.reward, done, jnp.ones_like(done))
+    return jax.tree.map(lambda a, b: jnp.concatenate([a, b.astype(a.dtype)]), history, chunk)
+
+  def _last(self, history: History, seq: History) -> History:
+    return jax.tree.map(lambda x: x[-(self.n - 1):], seq) if self.n > 1 else history
 
   def _group(self, params, seq: History, key):
     """One parameter set; seq has leading (n - 1 + T, members)."""

@@ -115,9 +115,8 @@ def query(tables, sql: str | None = None) -> tuple[list[str], list[tuple]]:
   if not isinstance(tables, dict):
     tables = {file.stem: file for file in sorted(pathlib.Path(tables).glob("*.parquet"))} or _none(tables)
   names = ", ".join(list(tables)[:20]) + (f" and {len(tables) - 20} more, listed by mjx-cl query without SQL" if len(tables) > 20 else "")
-  # no spill to disk, and no Python variable that happens to have the name of a table
-  with duckdb.connect(config={"temp_directory": "", "python_enable_replacements": False, "autoinstall_known_extensions": False,
-                              "autoload_known_extensions": False}) as db:
+  # nothing is spilled to disk; without external access no Python variable is taken for a table either
+  with duckdb.connect(config={"temp_directory": "", "autoinstall_known_extensions": False, "autoload_known_extensions": False}) as db:
     # a path is a pattern to read_parquet; a sign in brackets means itself, so that a folder may be called a[1]
     paths = {name: re.sub(r"([*?\[])", r"[\1]", str(file)) for name, file in tables.items()}
     for name, file in tables.items():
