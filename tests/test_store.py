@@ -237,13 +237,6 @@ def test_a_path_trick_is_refused(tree, sql):
   assert every_file(tree) == before
 
 
-def test_a_python_variable_is_no_view(tree):
-  import pyarrow
-  variable = pyarrow.table({"a": [1]})  # noqa: F841  DuckDB would find it by its name
-  with pytest.raises(UserError, match="variable does not exist"):
-    store.query(store.views(), "select * from variable")
-
-
 def test_a_folder_whose_name_is_a_pattern(tree):
   """runs/a[1] as a pattern means runs/a1."""
   assert store.query("runs/a[1]", "select count(*) from trace")[1] == [(7,)]
