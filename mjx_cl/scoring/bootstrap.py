@@ -1,6 +1,7 @@
 """Aggregates with intervals, after rliable's definitions (Agarwal et al. 2021): interquartile mean and percentile bootstrap."""
 from __future__ import annotations
 
+import functools
 import math
 
 import numpy as np
@@ -37,6 +38,39 @@ def interval(x, statistic=iqm, seed: int = 0, level: float = 0.95) -> list[float
   stats = statistic(draws, axis=-1)
   low, high = np.quantile(stats, [(1 - level) / 2, (1 + level) / 2], method="nearest")
   return [finite(low), finite(high)]
+
+
+@functools.lru_cache(maxsize=64)
+def draws(n: int, reps: int, seed: int = 0) -> np.ndarray:
+  """Resampled runs of a bootstrap, int (reps, n), read-only. Whatever shares them keeps what its numbers have in common within a run."""
+  index = np.random.default_rng(seed).integers(0, n, (reps, n))
+  index.flags.writeable = False
+  return index
+
+
+@functools.lru_cache(maxsize=64)
+def weights(n: int, reps: int, seed: int = 0) -> np.ndarray:
+  """How often each run is in each of `draws`, over n: float (reps, n), read-only; weights @ values are the means of the resampled values."""
+  counts = np.zeros((reps, n))
+  np.add.at(counts, (np.arange(reps)[:, None], draws(n, reps, seed)), 1.0 / n)
+  counts.flags.writeable = False
+  return counts
+
+
+def ends(statistics, level: float = 0.95) -> list[list[float | None] | None]:
+  """Percentile intervals of several bootstrapped statistics at once.
+
+  Args:
+    statistics: float (k, reps). nan: undefined in that draw, left out; inf: a censored time, an end that falls on one is None.
+  Returns:
+    k times [low, high], None where fewer than half of the draws define the statistic or both ends are undefined.
+  """
+  out = []
+  for row in np.sort(np.asarray(statistics, float), -1):  # nan comes last
+    known = len(row) - int(np.sum(np.isnan(row)))
+    pair = [finite(row[int(round((known - 1) * q))]) for q in ((1 - level) / 2, (1 + level) / 2)] if 2 * known >= len(row) and known else None
+    out.append(None if pair in (None, [None, None]) else pair)
+  return out
 
 
 def censored_median(x, axis: int = -1) -> np.ndarray:

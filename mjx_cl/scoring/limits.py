@@ -1,0 +1,271 @@
+"""How early a detector could know: limits of the delay at a given rate of false alarms, always of a declared channel.
+
+Physics is deterministic: whoever sees every input of a simulated robot needs one step. A limit therefore belongs to the channel that detectors are
+given (such as the logarithm of OPR), and to a model of it. Three are offered, from the most to the least demanding of assumptions:
+
+  brownian      closed form for a known shift of the mean of independent Gaussian values; `closed_form` prints it only where a stream passes for such
+  likelihood-ratio CUSUM (detectors/likelihood_ratio.py) on `fit`, run on the same streams at the same ARL0: `efficiency` compares with it
+  bound         any detector, any dependence, given the information that the channel carries
+
+Delay counts the samples used, so delay = latency_steps + 1: an alarm in the first faulty step has used one.
+"""
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from mjx_cl.errors import UserError
+from mjx_cl.scoring import bootstrap, special
+
+EXCESS = 1.166  # 2 x 0.583: mean overshoot at both ends of a Gaussian random walk, Siegmund 1985, Sequential Analysis
+WHITE = 0.01    # Ljung-Box p-value from which innovations pass for white
+FLOOR = 1e-6    # least innovation variance, of the channel's nominal variance: a frozen sensor has none
+REPS = 2_000    # bootstrap draws
+
+
+class Limit(NamedTuple):
+  """Attributes:
+    delay: expected samples until the alarm, worst case: evidence at zero when the change comes. threshold: of the log-likelihood-ratio CUSUM.
+  """
+  delay: float
+  threshold: float
+
+
+def brownian(arl0: float, shift: float, discrete: bool = True) -> Limit:
+  """The least worst-case delay of any detector with this ARL0, for a known mean shift of independent Gaussian values.
+
+    solve  arl0 = 2 (e^u - u - 1) / shift^2  for u > 0;   delay = 2 (e^-u + u - 1) / shift^2
+
+  Exact for a Brownian motion with drift. In discrete time the same delay belongs to the same ARL0 to about 1 %, and Siegmund's correction moves
+  the threshold alone: evidence overshoots, so the boundary that reaches this ARL0 is u - 1.166 shift in place of u.
+
+  Args:
+    arl0: mean samples between false alarms. shift: of the mean [deviations]. discrete: correct the threshold.
+  Blind to: an onset at a random time finds evidence above zero, so that a mean delay measured so can be slightly below this one.
+  References: Shiryaev 1996, Russian Math. Surveys 51, 750-751; Moustakides 2004, Ann. Statist. 32, 302-315 (closed form, optimality);
+    Moustakides 1986, Ann. Statist. 14, 1379-1387 (optimality in discrete time); Siegmund 1985, Sequential Analysis.
+  """
+  if not (arl0 > 0 and shift != 0 and math.isfinite(arl0) and math.isfinite(shift)):
+    raise UserError(f"brownian needs arl0 above 0 and a shift other than 0; got {arl0}, {shift}")
+  shift = abs(shift)
+  want, low, high = arl0 * shift ** 2 / 2, 0.0, 700.0  # e^700 is near the largest float64
+  for _ in range(200):
+    u = (low + high) / 2
+    low, high = (u, high) if math.expm1(u) - u < want else (low, u)
+  return Limit(2 * (math.expm1(-u) + u) / shift ** 2, u - EXCESS * shift if discrete else u)
+
+
+def bound(false_alarm: float, miss: float, information: float) -> float | None:
+  """Least steps after which any detector, on data of any dependence, can have alarmed with probability 1 - miss, if its chance of an alarm within
+  as many healthy steps is at most `false_alarm`.
+
+    information t >= (1 - miss) ln((1 - miss) / false_alarm) + miss ln(miss / (1 - false_alarm))
+
+  Args:
+    false_alarm, miss: probabilities inside (0, 1). information: KL rate of the faulty from the healthy channel [nats per step].
+  Returns:
+    Steps (not rounded); 0 where false_alarm >= 1 - miss, which tossing a coin achieves; None without information.
+  Source: the data-processing inequality for the event "alarmed within t" (Wald's inequality).
+  """
+  if not (0 < false_alarm < 1 and 0 < miss < 1):
+    raise UserError(f"bound needs false_alarm and miss inside (0, 1); got {false_alarm}, {miss}")
+  if not information > 0:
+    return None
+  if false_alarm >= 1 - miss:
+    return 0.0
+  return ((1 - miss) * math.log((1 - miss) / false_alarm) + miss * math.log(miss / (1 - false_alarm))) / information
+
+
+class Conditional(NamedTuple):
+  """Gaussian autoregression: x_t ~ N(intercept + sum_k lags[k] x_{t-1-k}, covariance), whitener covariance whitener' = 1.
+
+  Attributes:
+    intercept: float (C,). lags: float (order, C, C), lags[0] acts on the newest value. whitener: float (C, C), inverse of the Cholesky factor.
+    log_det: float (), ln det covariance.
+  """
+  intercept: np.ndarray
+  lags: np.ndarray
+  whitener: np.ndarray
+  log_det: np.ndarray
+
+
+class Parameters(NamedTuple):
+  """Conditional densities of a channel, healthy and faulty: what detectors.likelihood_ratio takes."""
+  before: Conditional
+  after: Conditional
+
+
+def _streams(x, name: str) -> np.ndarray:
+  """(T, S, C) from (T,), (T, S) or (T, S, C)."""
+  x = np.asarray(x, float)
+  if not 1 <= x.ndim <= 3:
+    raise UserError(f"{name} must be (T,), (T, S) or (T, S, C); got shape {x.shape}")
+  return x.reshape(x.shape + (1,) * (3 - x.ndim))
+
+
+def _design(x: np.ndarray, order: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+  """Past (T - order, S, order C), newest first, present (T - order, S, C) and where both are known (T - order, S)."""
+  if len(x) <= order:
+    raise UserError(f"an autoregression of order {order} needs more than {order} steps; got {len(x)}")
+  steps = len(x) - order
+  past = np.concatenate([x[order - 1 - k:order - 1 - k + steps] for k in range(order)], -1) if order else np.zeros(x.shape[:2] + (0,))
+  now = x[order:]
+  return past, now, np.isfinite(past).all(-1) & np.isfinite(now).all(-1)
+
+
+def _conditional(x: np.ndarray, order: int, floor: np.ndarray) -> Conditional:
+  """Least squares over all streams of x (T, S, C)."""
+  past, now, known = _design(x, order)
+  past, now = past[known], now[known]
+  channels = now.shape[1]
+  if len(now) < 2 * (past.shape[1] + 1) + channels:
+    raise UserError(f"too few known samples for an autoregression of order {order} on {channels} channel(s): {len(now)}")
+  coefficients, *_ = np.linalg.lstsq(past - past.mean(0), now - now.mean(0), rcond=1e-10)
+  left = now - now.mean(0) - (past - past.mean(0)) @ coefficients
+  factor = np.linalg.cholesky(left.T @ left / len(left) + np.diag(floor))
+  return Conditional(now.mean(0) - past.mean(0) @ coefficients, np.swapaxes(coefficients.reshape(order, channels, channels), 1, 2),
+                     np.linalg.inv(factor), 2 * np.log(np.diag(factor)).sum())
+
+
+def fit(nominal, faulty, order: int = 8) -> Parameters:
+  """Conditional densities before and after the change, by least squares over all streams.
+
+  Args:
+    nominal, faulty: float (T, S), (T, S, C): healthy steps, and steps after the onset alone; T and S of the two may differ. A step counts where it
+      and the `order` steps before it are finite.
+    order: of the autoregression; 0 takes steps as independent.
+  Returns:
+    Parameters, arrays float64.
+  """
+  nominal, faulty = _streams(nominal, "nominal"), _streams(faulty, "faulty")
+  if nominal.shape[2] != faulty.shape[2]:
+    raise UserError(f"healthy and faulty streams must have the same channels; got {nominal.shape[2]} and {faulty.shape[2]}")
+  floor = FLOOR * np.maximum(np.nanvar(nominal, axis=(0, 1)), 1e-12)
+  return Parameters(_conditional(nominal, order, floor), _conditional(faulty, order, floor))
+
+
+def innovations(x, model: Conditional) -> np.ndarray:
+  """Whitened one-step errors (T - order, S, C) of streams x: independent standard normal where the model holds; nan where a lag is unknown."""
+  x = _streams(x, "x")
+  past, now, known = _design(x, len(model.lags))
+  flat = np.swapaxes(model.lags, 1, 2).reshape(-1, x.shape[2])
+  return np.where(known[..., None], (now - model.intercept - past @ flat) @ model.whitener.T, np.nan)
+
+
+def log_ratio(x, parameters: Parameters) -> np.ndarray:
+  """ln p_after(x_t | past) - ln p_before(x_t | past) of each step, (T - order, S); nan where a lag is unknown."""
+  term = lambda m: -0.5 * (np.sum(innovations(x, m) ** 2, -1) + m.log_det)
+  return term(parameters.after) - term(parameters.before)
+
+
+def information(nominal, faulty, order: int = 8, reps: int = REPS) -> dict:
+  """Estimated KL rate of the faulty from the healthy channel, with Gaussian autoregressions fitted on other seeds than it is measured on.
+
+    I = mean over faulty steps of ln p_after(x_t | past) / p_before(x_t | past);  even seeds are measured with the fit of odd seeds, and the reverse
+    for a mean shift of d deviations: d^2 / 2 if steps are independent, (d^2 / 2) (1 - phi) / (1 + phi) in an AR(1)
+
+  It can err both ways. It is KL(true after || fitted before) - KL(true after || fitted after): a healthy channel with heavier tails than a Gaussian
+  makes the first too large, a faulty one that the model does not describe the second. A fit on n steps loses
+  about parameters / 2n nats, so that it may come out below 0 where there is nothing to know. It knows neither the other channels nor dependence
+  beyond `order` steps, and takes all faulty steps as alike: a fault that acts at once and fades has more at first.
+
+  Args:
+    nominal, faulty: (T, S) or (T, S, C), stream s of both is seed s; faulty: steps after the onset alone. S >= 2.
+  Returns:
+    {information_nats_per_step, its _ci: bootstrap over seeds, None for fewer than two}.
+  """
+  nominal, faulty = _streams(nominal, "nominal"), _streams(faulty, "faulty")
+  seeds = faulty.shape[1]
+  if seeds < 2 or nominal.shape[1] != seeds:
+    raise UserError(f"information needs two or more seeds, the same ones healthy and faulty; got {nominal.shape[1]} and {seeds}")
+  rate = np.empty(seeds)
+  for half in (0, 1):
+    ratio = log_ratio(faulty[:, half::2], fit(nominal[:, 1 - half::2], faulty[:, 1 - half::2], order))
+    known = np.isfinite(ratio)
+    rate[half::2] = np.where(known, ratio, 0).sum(0) / np.where(known.any(0), known.sum(0), np.nan)
+  rate = rate[np.isfinite(rate)]
+  interval = bootstrap.ends((bootstrap.weights(len(rate), reps) @ rate)[None])[0] if len(rate) > 1 else None
+  return {"information_nats_per_step": bootstrap.finite(rate.mean()) if len(rate) else None, "information_nats_per_step_ci": interval}
+
+
+def whiten(x, order: int = 8) -> tuple[np.ndarray, Conditional]:
+  """Innovations (T - order, S) of one channel x (T,) or (T, S) under its own autoregression, in deviations, and the autoregression."""
+  x = _streams(x, "x")
+  if x.shape[2] != 1:
+    raise UserError(f"whiten takes one channel; got {x.shape[2]}")
+  model = _conditional(x, order, FLOOR * np.maximum(np.nanvar(x, axis=(0, 1)), 1e-12))
+  return innovations(x, model)[..., 0], model
+
+
+def ljung_box(e, lags: int = 20, fitted: int = 0) -> tuple[float, float]:
+  """Test that streams are white.
+
+    Q = sum over streams and k = 1 .. lags of n (n + 2) r_k^2 / (n - k),   chi-square with (streams x lags - fitted) degrees if they are white
+
+  Args:
+    e: float (T,) or (T, S), nan left out. lags: autocorrelations tested. fitted: autoregressive coefficients that were fitted to all of them.
+  Returns:
+    (Q, p): p small: not white. Long streams fail for correlations too small to matter.
+  Reference: Ljung and Box 1978, Biometrika 65, 297-303.
+  """
+  e = _streams(e, "e")[..., 0]
+  if len(e) <= lags or e.shape[1] * lags <= fitted:
+    raise UserError(f"ljung_box needs more steps than lags and more autocorrelations than fitted coefficients; got {e.shape}, {lags}, {fitted}")
+  known = np.isfinite(e)
+  n = known.sum(0)
+  e = np.where(known, e - np.nanmean(e, 0), 0.0)
+  r = np.stack([np.sum(e[k:] * e[:-k], 0) for k in range(1, lags + 1)]) / np.maximum(np.sum(e * e, 0), 1e-300)
+  q = float(np.sum(n * (n + 2) * r ** 2 / (n - np.arange(1, lags + 1)[:, None])))
+  return q, special.chi_square_tail(q, e.shape[1] * lags - fitted)
+
+
+def closed_form(nominal, faulty, arl0: float, order: int = 8, lags: int = 20) -> dict:
+  """The closed form of `brownian` for one channel, where it applies: after whitening a mean shift in independent values.
+
+  It is printed only if the whitened healthy streams pass Ljung and Box's test (p >= 0.01, `lags` autocorrelations) and the fault is a shift of the
+  mean of the innovations, s deviations: s^2 / 2 must be 80 to 125 % of the information of the channel. The first innovations after the onset are
+  larger than the later ones where values are positively correlated, so that a delay can be below it.
+
+  Args:
+    nominal, faulty: (T, S), as for `information`.
+  Returns:
+    {optimal_delay_steps: samples or None, note: the reason for None, else None, ljung_box_p}.
+  """
+  white, model = whiten(nominal, order)
+  _, p = ljung_box(white, lags, order)
+  shift = float(np.nanmean(innovations(faulty, model)))
+  rate = information(nominal, faulty, order)["information_nats_per_step"]
+  note = None
+  if p < WHITE:
+    note = f"no closed form: healthy innovations of order {order} are not white (Ljung-Box p = {p:.2g})"
+  elif rate is None or rate <= 0:
+    note = "no closed form: the fault does not show in this channel"
+  elif not 0.8 <= shift ** 2 / 2 / rate <= 1.25:
+    note = f"no closed form: the fault is no mere shift of the mean (which would carry {shift ** 2 / 2:.3g} of {rate:.3g} nats per step)"
+  return {"optimal_delay_steps": brownian(arl0, shift).delay if note is None else None, "note": note, "ljung_box_p": p}
+
+
+def efficiency(oracle_latencies, detector_latencies, horizon: int, reps: int = REPS) -> dict:
+  """Delay of the oracle over that of a detector, both at one ARL0 and on the same streams.
+
+    restricted mean delay = mean of min(latency_steps + 1, horizon), a miss counts the horizon;   efficiency = oracle's / detector's
+
+  Args:
+    oracle_latencies, detector_latencies: (S,) of the same seeds [control steps], None or inf or nan = missed. horizon: [control steps].
+  Returns:
+    {efficiency, efficiency_ci: bootstrap over seeds, drawn in pairs, None for fewer than two; oracle_delay_steps, delay_steps: restricted means;
+    note: a sentence where the efficiency is above 1, else None}.
+  """
+  sides = [np.array([np.inf if x is None else x for x in side], float) for side in (oracle_latencies, detector_latencies)]
+  if len(sides[0]) != len(sides[1]) or not len(sides[0]):
+    raise UserError(f"efficiency needs the same seeds of oracle and detector; got {len(sides[0])} and {len(sides[1])}")
+  oracle, mine = (np.minimum(np.where(np.isnan(x), np.inf, x) + 1, horizon) for x in sides)
+  value, interval = float(oracle.mean() / mine.mean()), None
+  if len(mine) > 1:
+    w = bootstrap.weights(len(mine), reps)
+    interval = bootstrap.ends(((w @ oracle) / (w @ mine))[None])[0]
+  note = ("above 1: the oracle is optimal only for the worst onset and for data of the Gaussian autoregression that was fitted to it; this detector "
+          "was luckier, or uses what that model leaves out") if value > 1 else None
+  return {"efficiency": value, "efficiency_ci": interval, "oracle_delay_steps": float(oracle.mean()), "delay_steps": float(mine.mean()), "note": note}
