@@ -40,6 +40,8 @@ class DreamerConfig:
     lr, warmup: learning rate and updates of its linear warm-up.
     bins: classes of the two-hot heads.
     entropy: weight of the policy's entropy.
+    obs_scale: one number per observation variable that it is divided by before encoder and decoder loss, `spec`: the robot's typical deviations
+      (Var.scale); None: raw units, as the authors. In raw units a joint angle of 0.2 rad counts a hundredth of a joint speed of 2 rad/s.
   """
   size: str = "size12m"
   batch: int = 16
@@ -59,9 +61,16 @@ class DreamerConfig:
   repval_scale: float = 0.3
   range_rate: float = 0.01
   slow_rate: float = 0.02
+  obs_scale: tuple[float, ...] | str | None = None
 
   def __post_init__(self):
     choose("size", self.size, SIZES)
+    if isinstance(self.obs_scale, (list, tuple)):
+      object.__setattr__(self, "obs_scale", tuple(self.obs_scale))  # a card holds a list
+      if not all(isinstance(x, (int, float)) and x > 0 for x in self.obs_scale):
+        raise UserError(f"obs_scale needs numbers above 0; got {self.obs_scale}")
+    elif self.obs_scale not in (None, "spec"):
+      raise UserError(f"obs_scale is `spec`, numbers above 0, or none; got {self.obs_scale!r}")
     positive(self, "batch", "length", "imagine", "horizon", "lr", "bins")
     if self.context != 1:
       raise UserError(f"context must be 1, as in the authors' code; got {self.context}")

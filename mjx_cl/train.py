@@ -321,6 +321,8 @@ def build(env, dreamer: DreamerConfig, config: TrainConfig, out, seed: int, seed
     config = dataclasses.replace(config, demonstrator=str(path))
   elif demonstrator_name:
     config = dataclasses.replace(config, demonstrator=demonstrator_name)
+  if dreamer.obs_scale == "spec":
+    dreamer = dataclasses.replace(dreamer, obs_scale=tuple(float(v.scale) for v in env.spec.obs))
   trainer = Trainer(env, dreamer, config, out, seed, seeds)
   trainer.about = {"env": env.spec.name, "preset": preset, "command": command, "seed": seed, "repeat": config.repeat,
                    "dreamer": dataclasses.asdict(dreamer), "train": dataclasses.asdict(config), "started_from": agent_name}

@@ -15,6 +15,7 @@ import optax
 from mjx_cl.config import DreamerConfig
 from mjx_cl.dreamer import behaviour, heads, losses, nets, optim, rssm
 from mjx_cl.dreamer.sizes import SIZES
+from mjx_cl.errors import UserError
 
 sg = jax.lax.stop_gradient
 
@@ -97,6 +98,11 @@ class Agent:
     self.config, self.obs_size, self.act_size, self.clone_std = config, obs_size, act_size, clone_std
     self.size = s = SIZES[config.size]
     self.bins = jnp.asarray(nets.two_hot_bins(config.bins))
+    if isinstance(config.obs_scale, str):
+      raise UserError("obs_scale `spec` is for training, where there is a robot; an agent takes the numbers")
+    if config.obs_scale and len(config.obs_scale) != obs_size:
+      raise UserError(f"obs_scale has {len(config.obs_scale)} numbers for {obs_size} observation variables")
+    self.obs_scale = jnp.asarray(config.obs_scale or 1.0, jnp.float32)
     self.enc, self.dyn = heads.Encoder(s.units), rssm.RSSM(s)
     self.dec = heads.Decoder(s.units, obs_size)
     self.rew, self.con = heads.Head(1, s.units, config.bins, 0.0), heads.Head(1, s.units, 1, 1.0)
@@ -120,6 +126,9 @@ class Agent:
   def _apply(self, params, name, *args, **kwargs):
     own = params[name]
     return getattr(self, name).apply(own if "params" in own else {"params": own}, *args, **kwargs)
+
+  def _encode(self, params, obs):
+    return self._apply(params, "enc", obs / self.obs_scale)
 
   def prepare(self, params):
     """The same parameters with what a scan over the core would otherwise re-arrange at every step; every method takes either form."""
@@ -148,7 +157,7 @@ class Agent:
     """
     key_z, key_a = jax.random.split(key)
     deter = self._core(params, carry.deter[None], carry.stoch[None], carry.action[None])
-    logits = self._apply(params, "dyn", deter, self._apply(params, "enc", obs[None]), method="posterior")
+    logits = self._apply(params, "dyn", deter, self._encode(params, obs[None]), method="posterior")
     stoch = rssm.sample(logits, jax.random.uniform(key_z, (1, self.size.stoch))).reshape(1, -1)
     mean, std = nets.normal(*self._apply(params, "pol", deter, stoch))
     action = mean if deterministic else mean + std * jax.random.normal(key_a, mean.shape)
@@ -160,7 +169,7 @@ class Agent:
     """Posterior states of the T trained steps, time-major: deter (T, B, D), stoch (T, B, S), posterior logits (T, B, stoch, classes)."""
     length, rows = batch.obs.shape[1] - 1, batch.obs.shape[0]
     params = self.prepare(params)
-    tokens = self._apply(params, "enc", batch.obs[:, 1:].swapaxes(0, 1))
+    tokens = self._encode(params, batch.obs[:, 1:].swapaxes(0, 1))
     uniform = jax.random.uniform(key, (length, rows, self.size.stoch))
 
     def step(state, x):
@@ -235,7 +244,7 @@ class Agent:
     prior = self._apply(params, "dyn", deter, method="prior")
     dyn = jnp.maximum(c.free_nats, rssm.kl(sg(logits), prior))
     rep = jnp.maximum(c.free_nats, rssm.kl(logits, sg(prior)))
-    rec = jnp.sum(jnp.square(self._apply(params, "dec", deter, stoch) - nets.symlog(obs)), -1)
+    rec = jnp.sum(jnp.square(self._apply(params, "dec", deter, stoch) - nets.symlog(obs / self.obs_scale)), -1)
     rew = nets.two_hot_loss(self._apply(params, "rew", deter, stoch), reward, self.bins)
     con_logit = self._apply(params, "con", deter, stoch)[..., 0]
     con_target = (1.0 - terminal) * gamma
@@ -313,11 +322,11 @@ class Agent:
 
   def predict(self, params, deter, stoch):
     """Observation (..., O) in raw units and reward (...) at states."""
-    return nets.symexp(self._apply(params, "dec", deter, stoch)), nets.two_hot_mean(self._apply(params, "rew", deter, stoch), self.bins)
+    return self.obs_scale * nets.symexp(self._apply(params, "dec", deter, stoch)), nets.two_hot_mean(self._apply(params, "rew", deter, stoch), self.bins)
 
   def beliefs(self, params, deter, obs):
     """Logits (..., stoch, classes) of the posterior at `obs` and of the prior, both at `deter`."""
-    flat, tokens = deter.reshape(-1, deter.shape[-1]), self._apply(params, "enc", obs.reshape(-1, obs.shape[-1]))
+    flat, tokens = deter.reshape(-1, deter.shape[-1]), self._encode(params, obs.reshape(-1, obs.shape[-1]))
     shape = deter.shape[:-1] + (self.size.stoch, self.size.classes)
     return (self._apply(params, "dyn", flat, tokens, method="posterior").reshape(shape), self._apply(params, "dyn", flat, method="prior").reshape(shape))
 
