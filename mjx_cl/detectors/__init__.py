@@ -4,9 +4,23 @@ from __future__ import annotations
 import importlib.metadata
 import inspect
 
+from mjx_cl.detectors import combine
+from mjx_cl.detectors import references
 from mjx_cl.detectors.base import Alarm, Detector, scalar
-from mjx_cl.detectors.combine import any_of, on
+from mjx_cl.detectors.bfar import bfar
+from mjx_cl.detectors.combine import all_of, any_of, cool_down, on, patience, standardised, whitened
+from mjx_cl.detectors.cusum import cusum
+from mjx_cl.detectors.ewma import ewma
+from mjx_cl.detectors.glr import glr
+from mjx_cl.detectors.page_hinkley import page_hinkley
+from mjx_cl.detectors.hotelling import hotelling
+from mjx_cl.detectors.knn import knn
+from mjx_cl.detectors.max_variables import max_variables
+from mjx_cl.detectors.mewma import mewma
 from mjx_cl.detectors.rolling_sigma import rolling_sigma
+from mjx_cl.detectors.surprise import surprise
+from mjx_cl.detectors.shiryaev_roberts import shiryaev_roberts
+from mjx_cl.detectors.z_score import z_score
 from mjx_cl.errors import UserError, choose
 
 
@@ -31,6 +45,11 @@ def calibrated_rule(**settings) -> Detector:
 CALIBRATED = {"window": 4000, "smooth": 400, "lag": 500, "threshold": 6.5, "patience": 1, "two_sided": False, "log": True}
 
 DETECTORS = {"rolling_sigma": calibrated_rule, "rolling_sigma_plain": paper_rule}
+DETECTORS |= {"z_score": z_score, "ewma": ewma, "cusum": cusum, "page_hinkley": page_hinkley, "shiryaev_roberts": shiryaev_roberts, "glr": glr}
+# over several fields of the residual
+DETECTORS |= {"hotelling": hotelling, "mewma": mewma, "max_variables": max_variables, "surprise": surprise, "knn": knn, "bfar": bfar}
+# what every score is printed beside; the oracle, which must be told the onset, is in references.REFERENCES alone
+DETECTORS |= {"never": references.never, "always": references.always, "periodic": references.periodic, "random": references.random}
 
 
 def _plugins() -> dict:
@@ -45,7 +64,8 @@ def _plugins() -> dict:
 DETECTORS |= _plugins()
 
 
-def make(name: str, channel: str | None = None, log: bool | None = None, **settings) -> Detector:
+def make(name: str, channel: str | None = None, log: bool | None = None, whiten: int = 0, patience: int = 1, cool_down: int = 0,
+         **settings) -> Detector:
   """Builds detector `name`, a map over monitor.Residual. Unknown settings are refused.
 
   Args:
@@ -53,6 +73,11 @@ def make(name: str, channel: str | None = None, log: bool | None = None, **setti
     channel: what a single-residual detector watches: one of combine.CHANNELS, or several joined by `+`, each with a detector of its own; the
       alarm of any counts. Default: `opr+rpr`.
     log: take the logarithm of the channel first; default: of all but the reward, which may be negative.
+    whiten: order of the autoregression whose innovations a single-residual detector sees in place of the channel, behind the logarithm; its own
+      warm-up begins after that of combine.whitened; 0: none.
+    patience: scores in a row above the threshold before a single-residual detector fires, see combine.patience; others have their own setting of
+      this name, or none.
+    cool_down: samples after an alarm in which no other counts, of the channels together, see combine.cool_down.
   """
   name, at, after = name.partition("@")
   if at:
@@ -60,14 +85,18 @@ def make(name: str, channel: str | None = None, log: bool | None = None, **setti
   build = choose("detector", name, DETECTORS)
   try:
     if getattr(build, "takes", "residual") != "scalar":
-      if channel is not None or log is not None:
-        raise UserError(f"detector {name!r} has channels of its own; leave out channel and log")
-      return build(**settings)
-    detector = build(**settings)
+      if channel is not None or log is not None or whiten:
+        raise UserError(f"detector {name!r} has channels of its own; leave out channel, log and whiten")
+      detector = build(**settings, **({} if patience == 1 else {"patience": patience}))
+      return combine.cool_down(detector, cool_down) if cool_down else detector
+    detector = build(**settings) if patience == 1 else combine.patience(build, patience, **settings)
   except TypeError as e:
     if "argument" not in str(e):
       raise
     known = ", ".join(p for p in inspect.signature(build).parameters)
     raise UserError(f"detector {name!r}: {e}; its settings are: {known}") from None
+  if whiten:
+    detector = whitened(detector, whiten)
   members = [on(c, detector, c != "reward" if log is None else log) for c in (channel or "opr+rpr").split("+")]
-  return members[0] if len(members) == 1 else any_of(*members)
+  detector = members[0] if len(members) == 1 else any_of(*members)
+  return combine.cool_down(detector, cool_down) if cool_down else detector
