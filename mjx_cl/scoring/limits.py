@@ -167,8 +167,8 @@ def information(nominal, faulty, order: int = 8, reps: int = REPS) -> dict:
     for a mean shift of d deviations: d^2 / 2 if steps are independent, (d^2 / 2) (1 - phi) / (1 + phi) in an AR(1)
 
   It can err both ways. It is KL(true after || fitted before) - KL(true after || fitted after): a healthy channel with heavier tails than a Gaussian
-  makes the first too large, a faulty one that the model does not describe the second. A fit on n steps loses
-  about parameters / 2n nats, so that it may come out below 0 where there is nothing to know. It knows neither the other channels nor dependence
+  makes the first too large, a faulty one that the model does not describe the second. A fit on n steps
+  loses about parameters / 2n nats, which cancels only in part, so that it may come out below 0 where there is nothing to know. It knows neither the other channels nor dependence
   beyond `order` steps, and takes all faulty steps as alike: a fault that acts at once and fades has more at first.
 
   Args:
@@ -225,8 +225,8 @@ def closed_form(nominal, faulty, arl0: float, order: int = 8, lags: int = 20) ->
   """The closed form of `brownian` for one channel, where it applies: after whitening a mean shift in independent values.
 
   It is printed only if the whitened healthy streams pass Ljung and Box's test (p >= 0.01, `lags` autocorrelations) and the fault is a shift of the
-  mean of the innovations, s deviations: s^2 / 2 must be 80 to 125 % of the information of the channel. The first innovations after the onset are
-  larger than the later ones where values are positively correlated, so that a delay can be below it.
+  mean of the innovations, s deviations: s^2 / 2 must be 80 to 125 % of the information of the channel. The first innovation after the onset is
+  larger than the later ones where values are positively correlated, so that a delay can be far below it; smaller where negatively.
 
   Args:
     nominal, faulty: (T, S), as for `information`.
