@@ -28,6 +28,7 @@ HORIZON_S = 20.0                 # a later alarm is no detection [s after onset]
 HALF_S = 5.0                     # delay after which half of what an immediate alarm saves is lost [s]
 HOURS_PER_FAULT = 0.1            # healthy operation for each fault, six minutes; sets how many false alarms stand against one miss [h]
 WITHIN_S = (0.5, 1.0, 5.0, 20.0)
+SHARES = ("miss_probability", *(f"detected_within_{x:g}s" for x in WITHIN_S))
 REPS = 2_000                     # bootstrap draws
 FEW = 50                         # alarms below which an ARL0 is marked
 
@@ -145,7 +146,7 @@ def row(alarm, score, onset, nominal_alarm, nominal_score, control_s: float, cou
     means = np.stack(list(values.values())) @ bootstrap.weights(streams, reps).T
     median_ci, *ends = bootstrap.ends(np.concatenate([medians[None], means]))
     intervals = dict(zip(values, ends))
-    for name in ("miss_probability", *(f"detected_within_{x:g}s" for x in WITHIN_S)):
+    for name in SHARES:
       intervals[name] = bootstrap.wilson(int(round(values[name].sum())), streams)
     if healthy_steps > 0 and not healthy_alarms.sum():
       hours = streams * healthy_steps * control_s / 3600.0
@@ -232,8 +233,9 @@ def overall(rows: list[dict], reps: int = REPS) -> Overall:
     range / sqrt(2), k detectors, n blocks
 
   Intervals: bootstrap over seeds, stratified by robot. The faults of one robot share their seeds' healthy streams, so a seed is drawn with all of
-  its faults. They say how far another set of seeds would move the mean on these faults, not what other faults would do. Blocks that share seeds
-  are not independent either: the critical difference is somewhat too small.
+  its faults; a share of 0 or 1 and a rate of 0 have Wilson's and Poisson's over the seeds of all robots. They say how far another set of seeds would
+  move the mean on these faults, not what other faults would do. Blocks that share seeds are not independent either: the critical difference is
+  somewhat too small.
 
   Args:
     rows: of `row`, with detector, robot, fault, severity.
@@ -283,8 +285,14 @@ def _means(rows: list[dict], reps: int) -> dict:
       sums = sums + np.stack(list(per_stream(latency, np.array(r["stream_healthy_alarms"]), r["healthy_steps"], r["control_s"]).values()))
     drawn = drawn + sums @ bootstrap.weights(sums.shape[1], reps, seed).T / len(rows)
   ends = bootstrap.ends(drawn) if enough else [None] * len(names)
+  seeds = sum(mine[0]["streams"] for mine in strata.values())
   out = {}
   for name, interval in zip(names, ends):
-    defined = all(r[name] is not None for r in rows)
-    out |= {name: float(np.mean([r[name] for r in rows])) if defined else None, f"{name}_ci": interval if defined else None}
+    value = float(np.mean([r[name] for r in rows])) if all(r[name] is not None for r in rows) else None
+    if enough and name in SHARES and value in (0.0, 1.0):
+      interval = bootstrap.wilson(int(value) * seeds, seeds)
+    elif enough and name == "false_alarms_per_hour" and value == 0:
+      hours = sum(r["streams"] * r["healthy_steps"] * r["control_s"] for r in (mine[0] for mine in strata.values())) / 3600.0
+      interval = [x / hours for x in special.poisson_interval(0)]
+    out |= {name: value, f"{name}_ci": None if value is None else interval}
   return out
