@@ -136,7 +136,7 @@ def about() -> dict[str, str]:
 # ---- reading -------------------------------------------------------------------------------------------------------------------------
 
 class Streams(NamedTuple):
-  """Streams of equal length, time-major NumPy arrays; unknown values are nan.
+  """Streams side by side, time-major NumPy arrays; unknown values are nan.
 
   Attributes:
     residual: monitor.Residual with leading (T, S); `variables` is empty. episode: int16 (T, S).
@@ -226,18 +226,18 @@ class StreamSet:
         z[step[keep], column] = np.stack([rows[f"z{k}"][own][keep] for k in range(LATENT)], -1)
 
   def get(self, robot: str, numbers) -> Streams:
-    """Streams of one robot, cut to the shortest."""
+    """Streams of one robot, the shorter ones filled up with unknown values to the longest."""
     from mjx_cl.monitor import Residual
     m = self.meta
     at = [int(np.flatnonzero(m["stream"] == n)[0]) for n in numbers]
     if not at:
       raise UserError(f"no such stream of robot {robot!r}; robots of this set: {', '.join(self.robots)}")
-    steps = int(min(m["steps"][at]))
+    steps = int(max(m["steps"][at]))
     shape = (steps, len(at))
     out = {c: np.full(shape, np.nan, np.float32) for c in COLUMNS} | {"episode": np.zeros(shape, np.int16), "terminated": np.zeros(shape, bool)}
     z = np.full(shape + (LATENT,), np.nan, np.float32)
     for column, number in enumerate(numbers):
-      self._fill(robot, int(number), steps, out, z, column)
+      self._fill(robot, int(number), int(m["steps"][at[column]]), out, z, column)
     groups = np.stack([out[f"group_{k}"] for k in range(GROUPS)], -1)
     valid = np.isfinite(out["opr"])
     residual = Residual(out["opr"], out["rpr"], np.zeros(shape + (0,), np.float32), valid, groups, out["reward"], out["terminated"], out["surprise"], z)

@@ -1,0 +1,351 @@
+"""Recorded streams and the leaderboard on a synthetic set: exact joins, thresholds at the asked rate, submissions, the same numbers whatever is added."""
+import dataclasses
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pyarrow.parquet
+import pytest
+
+from mjx_cl import detectors, leaderboard, store, streams
+from mjx_cl.detectors.host import HostDetector
+from mjx_cl.errors import FileError, UserError
+from mjx_cl.scoring import limits
+
+CONTROL_S, SEEDS = 0.5, 4
+SUITE = streams.Suite("small", 400.0, 200, (260, 300), 20.0, {"score": (0, SEEDS - 1), "tune": (100, 99 + SEEDS)},
+                      {"steps": 1024, "score": 2, "tune": 4}, {"nominal": 6, "after_s": 10.0},
+                      {"walker": {"score": {"gear": (0.5, 1.0), "bias": (1.0,)}, "tune": {"wind": (1.0,)}}})
+SHIFT = {("gear", 0.5): 0.5, ("gear", 1.0): 2.0, ("bias", 1.0): 4.0, ("wind", 1.0): 1.0}  # of ln OPR and all else, in deviations
+
+
+def part(lanes, onsets, steps, seed):
+  """Arrays of a recording: independent log-normal residuals, shifted from the onset on; a lane's past is its seed's."""
+  shape = (steps, len(lanes))
+  noise = {}
+  for lane in lanes:
+    noise.setdefault(lane.seed, np.random.default_rng([seed, lane.seed]).standard_normal((steps, 12 + 16)).astype(np.float32))
+  data = {c: np.zeros(shape, np.float32) for c in streams.COLUMNS} | {"latent": np.zeros(shape + (16,), np.float16)}
+  for i, lane in enumerate(lanes):
+    own = noise[lane.seed] if lane.fault else np.random.default_rng([seed, lane.seed, i]).standard_normal((steps, 28)).astype(np.float32)
+    if lane.fault is None and i < SEEDS and onsets.any():
+      own = noise[lane.seed]
+    late = (np.arange(steps) >= onsets[i])[:, None] * SHIFT.get((lane.fault, lane.severity), 0.0)
+    x = own + late
+    for k, c in enumerate(streams.COLUMNS):
+      data[c][:, i] = 0.5 - 0.1 * x[:, k] if c == "reward" else np.exp(0.3 * x[:, k])
+    data["latent"][:, i] = x[:, 12:]
+  data["opr"][50:55] = data["rpr"][50:55] = np.nan  # a window that was cut
+  episode = np.broadcast_to((np.arange(steps) // 100).astype(np.int16)[:, None], shape)
+  return data | {"episode": episode, "terminated": np.zeros(shape, bool), "target": np.asarray([lane.fault and "part" or "" for lane in lanes])}
+
+
+def make_set(folder, suite=SUITE, robots=("walker",)):
+  """A set as `record` writes it, from synthetic recordings."""
+  folder.mkdir(parents=True, exist_ok=True)
+  meta, details = {k: [] for k in streams.META}, {}
+  for robot in robots:
+    parts = {}
+    for split in ("score", "tune"):
+      seeds = suite.numbers(split)
+      who = [streams.Lane(s) for s in seeds for _ in range(suite.nominal[split])]
+      parts[split, "nominal"] = (who, np.zeros(len(who), int), part(who, np.zeros(len(who), int), suite.nominal["steps"], 1))
+      who = streams.lanes(suite, robot, split)
+      onsets = np.asarray([suite.onset_of(lane.seed) for lane in who])
+      parts[split, "fault"] = (who, onsets, part(who, onsets, int(onsets.max()) + suite.after(CONTROL_S), 2))
+    details[robot] = streams._write(suite, folder, robot, parts, meta, CONTROL_S, ",".join(f"g{k}" for k in range(8)))
+  types = {"stream": np.int32, "seed": np.int32, "severity": float, "steps": np.int32, "full": bool, "control_s": float}
+  store.write_table(folder / "streams.parquet", {k: np.asarray(v, types[k]) if k in types else v for k, v in meta.items()})
+  store.write_json(folder / "config.json", {"version": streams.VERSION, "suite": dataclasses.asdict(suite), "details": details})
+  return parts
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+  folder = tmp_path_factory.mktemp("set")
+  parts = make_set(folder)
+  return streams.StreamSet(folder), parts, folder
+
+
+# ---- streams -------------------------------------------------------------------------------------------------------------------------
+
+def test_what_was_recorded_comes_back_but_for_the_rounding(small):
+  held, parts, _ = small
+  who, onsets, data = parts["score", "fault"]
+  numbers = held.find("walker", "fault", "score")
+  got = held.get("walker", numbers)
+  faulty = [i for i, lane in enumerate(who) if lane.fault]
+  assert len(numbers) == len(faulty) == 3 * SEEDS and got.fault == [who[i].fault for i in faulty]
+  np.testing.assert_array_equal(got.onset, onsets[faulty])
+  for name in ("opr", "rpr", "surprise"):
+    x, y = getattr(got.residual, name), data[name][:, faulty]
+    for column, i in enumerate(faulty):
+      end = onsets[i] + SUITE.after(CONTROL_S)
+      assert np.isnan(x[end:, column]).all()
+      # an eighth of the deviation 0.3 of the logarithm, rounded: at most half of it off
+      np.testing.assert_allclose(np.log(x[:end, column]), np.log(y[:end, column]), atol=0.5 * 0.3 / 8 * 1.1)
+  np.testing.assert_array_equal(np.isnan(got.residual.opr[50:55]), True)
+  np.testing.assert_allclose(got.residual.reward[:300, 0], data["reward"][:300, faulty[0]], atol=0.5 * 0.1 / 8 * 1.1)
+  assert np.isfinite(got.residual.latent[onsets[faulty[0]] + 5, 0]).all()
+  assert np.isnan(got.residual.latent[onsets[faulty[0]] + 20 + 1, 0]).all()  # kept for 10 s
+
+
+def test_pandas_alone_can_read_it(small):
+  """The join of the module's text, on plain Parquet columns."""
+  held, _, folder = small
+  rows = pyarrow.parquet.read_table(folder / "walker.parquet").to_pydict()
+  assert set(rows) == set(streams.SCHEMA)
+  meta = pyarrow.parquet.read_table(folder / "streams.parquet").to_pylist()
+  one = next(m for m in meta if m["kind"] == "fault" and m["full"])
+  pick = lambda s, keep: [(t, x) for n, t, x in zip(rows["stream"], rows["step"], rows["opr"]) if n == s and keep(t)]
+  joined = pick(one["prefix"], lambda t: t < one["onset"]) + pick(one["stream"], lambda t: True)
+  assert [t for t, _ in joined] == list(range(one["steps"]))
+  got = held.get("walker", [one["stream"]]).residual.opr[:, 0]
+  np.testing.assert_array_equal(np.asarray([np.nan if x is None else x for _, x in joined], np.float32), got)
+
+
+def test_a_probe_is_another_stream_cut_off(small):
+  held, _, _ = small
+  probes = held.find("walker", "probe")
+  assert len(probes) == 5
+  for n in probes:
+    at = int(np.flatnonzero(held.meta["stream"] == n)[0])
+    whole, cut = held.get("walker", [int(held.meta["prefix"][at])]), held.get("walker", [n])
+    steps = int(held.meta["steps"][at])
+    np.testing.assert_array_equal(cut.residual.rpr[:steps], whole.residual.rpr[:steps])
+
+
+def test_other_pasts_are_refused(tmp_path, monkeypatch):
+  monkeypatch.setattr(np, "array_equal", lambda a, b, **_: False)
+  with pytest.raises(FileError, match="its past differs from that of the healthy robot"):
+    make_set(tmp_path / "x")
+
+
+def test_suites_that_ship_are_sound():
+  for name in ("leaderboard",):
+    s = streams.suite(name)
+    assert s.nominal["tune"] * 10 * (s.nominal["steps"] - s.count_from) / s.arl0 >= 20
+    from mjx_cl import envs, faults
+    for robot, tables in s.robots.items():
+      env = envs.make(robot)
+      for key in [k for t in tables.values() for k in t]:
+        fault, _, target = key.partition(":")
+        faults.target_index(faults.make(fault, env), target or None)
+
+
+@pytest.mark.parametrize("edit, text", [
+    ({"onset": [300, 300]}, "onset must be"), ({"seeds": {"score": [0, 9], "tune": [9, 12]}}, "without a common seed"),
+    ({"robots": {"walker": {"score": {"gear": [0.5]}, "tune": {"gear": [1.0]}}}}, "gear is to tune and to score"),
+    ({"robots": {"walker": {"score": {"gear": [1.5]}}}}, "severities in"), ({"robots": {}}, "no \\[robots"), ({"nominal": {"steps": 5}}, "needs")])
+def test_unsound_suites_are_refused_in_one_line(edit, text):
+  with pytest.raises(UserError, match=text) as e:
+    dataclasses.replace(SUITE, **edit)
+  assert "\n" not in str(e.value)
+
+
+def test_suite_files(tmp_path):
+  with pytest.raises(UserError, match="unknown suite 'nope'; choose from: .*leaderboard"):
+    streams.suite("nope")
+  (tmp_path / "a.toml").write_text("name = ")
+  with pytest.raises(FileError, match="is no TOML"):
+    streams.suite(str(tmp_path / "a.toml"))
+  (tmp_path / "a.toml").write_text("name = 'a'\nfoo = 1")
+  with pytest.raises(UserError, match="unknown 'foo'.*missing 'arl0'"):
+    streams.suite(str(tmp_path / "a.toml"))
+
+
+def test_foreign_folders(tmp_path, small):
+  with pytest.raises(FileError, match="holds no recorded streams"):
+    streams.StreamSet(tmp_path)
+  (tmp_path / "config.json").write_text(json.dumps({"version": 99}))
+  with pytest.raises(FileError, match="version 99"):
+    streams.StreamSet(tmp_path)
+  with pytest.raises(UserError, match="robots of this set: walker"):
+    small[0].get("car", [])
+
+
+# ---- thresholds ----------------------------------------------------------------------------------------------------------------------
+
+def test_narrow_finds_the_threshold_of_an_exponential_score():
+  """Alarms above t of n exponential scores: n exp(-t); the least threshold with at most 20 of 100,000 is ln 5000 = 8.5."""
+  score = np.random.default_rng(0).exponential(size=100_000)
+  calls = []
+
+  def count(t):
+    calls.append(t)
+    return (score[:, None] > t).sum(0)
+  threshold, tried = leaderboard.narrow(count, score, 20)
+  assert (score > threshold).sum() == 20 and len(calls) <= leaderboard.ROUNDS and all(len(t) == leaderboard.THRESHOLDS for t in calls)
+  assert dict(tried)[threshold] == 20
+  assert leaderboard.narrow(count, np.full(3, np.nan), 20) == (np.inf, [])
+
+
+def test_narrow_goes_below_the_scores_where_evidence_restarts():
+  """A CUSUM's scores without restarts lie far above its threshold."""
+  assert leaderboard.narrow(lambda t: np.where(t < 5.0, 1000, 3), np.linspace(1.0, 1e5, 1000), 10)[0] == pytest.approx(5.0, rel=0.02)
+
+
+@pytest.fixture(scope="module")
+def board(small):
+  entries = [leaderboard.entry("cusum", {"warmup": 150})] + [leaderboard.entry(n, {"use": n}) for n in ("never", "always")]
+  return leaderboard.score(small[0], entries)
+
+
+def pick(board, **want):
+  return [r for r in board.rows if all(r[k] == v for k, v in want.items())]
+
+
+def test_false_alarms_match_the_asked_rate(board):
+  (row,) = pick(board, detector="cusum", fault="bias")
+  steps = 16 * (1024 - 200)
+  assert steps / 400 - 3 <= row["arl0_alarms"] <= steps / 400 and row["arl0"] == pytest.approx(steps / row["arl0_alarms"])
+  # the scoring seeds' own healthy streams: 8 x 824 steps hold 16 alarms at that rate, four deviations of a Poisson count either way
+  per_hour = 3600 / CONTROL_S / 400
+  assert abs(row["false_alarms_per_hour"] - per_hour) < 4 * np.sqrt(16.5) / 16.5 * per_hour
+
+
+def test_stronger_faults_are_found_sooner_and_the_oracles_bound_all(board):
+  late = lambda d, f, s: pick(board, detector=d, fault=f, severity=s)[0]["delay_steps"]
+  assert late("cusum", "bias", 1.0) < late("cusum", "gear", 1.0) < late("cusum", "gear", 0.5)
+  for f, s in (("gear", 0.5), ("gear", 1.0), ("bias", 1.0)):
+    assert late("true onset (oracle)", f, s) == 1 <= late("likelihood_ratio (oracle)", f, s) <= late("cusum", f, s) + 2
+  assert [r["detector"] for r in board.overall.rows][0] == "true onset (oracle)"
+  assert pick(board, detector="true onset (oracle)", fault="bias")[0]["cost_standard"] == 100
+  assert pick(board, detector="never", fault="bias")[0]["cost_standard"] == 0
+  assert pick(board, detector="never", fault="bias")[0]["miss_probability"] == 1
+
+
+def test_information_of_the_channel_is_that_of_the_shift(board):
+  """Two independent channels, each shifted by 2 deviations: 2 x 2^2 / 2 = 4 nats; 2 seeds x 40 faulty steps fit 34 coefficients of the after
+  model, which costs a few tenths of a nat."""
+  row = pick(board, detector="cusum", fault="gear", severity=1.0)[0]
+  assert abs(row["information_nats_per_step"] - 4.0) < 0.8 and row["information_nats_per_step_ci"][0] < row["information_nats_per_step"]
+
+
+def test_a_fault_more_changes_no_other_number(small, board, tmp_path):
+  more = dataclasses.replace(SUITE, robots={"walker": {"score": SUITE.robots["walker"]["score"] | {"push": (1.0,)}, "tune": {"wind": (1.0,)}}})
+  make_set(tmp_path / "more", more)
+  other = leaderboard.score(streams.StreamSet(tmp_path / "more"), [leaderboard.entry("cusum", {"warmup": 150})])
+  for f, s in (("gear", 0.5), ("bias", 1.0)):
+    a, b = pick(board, detector="cusum", fault=f, severity=s)[0], pick(other, detector="cusum", fault=f, severity=s)[0]
+    assert {k: v for k, v in a.items() if k != "us_per_sample"} == {k: v for k, v in b.items() if k != "us_per_sample"}
+
+
+def test_restarted_cusum_equals_the_detector(small):
+  """The oracle's NumPy loop against detectors.likelihood_ratio with the same fit."""
+  from mjx_cl.detectors.likelihood_ratio import likelihood_ratio
+  held = small[0]
+  data = leaderboard.load(held, "walker")
+  healthy = leaderboard._channels(data.tune.residual, slice(0, 4))[200:]
+  own = np.flatnonzero(np.asarray(data.fault.fault) == "gear")[-SEEDS:]
+  after = np.stack([leaderboard._channels(data.fault.residual, slice(k, k + 1))[o:o + 40, 0] for k, o in zip(own, data.fault.onset[own])], 1)
+  p = limits.fit(healthy, after, 2)
+  x = jax.tree.map(lambda a: jnp.asarray(a[:200, own]), data.fault.residual)
+  x = x._replace(opr=jnp.nan_to_num(x.opr, nan=1.0), rpr=jnp.nan_to_num(x.rpr, nan=1.0), valid=jnp.ones_like(x.valid))  # gaps are bridged otherwise there
+  det = likelihood_ratio(p, 3.0, leaderboard.ORACLE)
+  start = jax.tree.map(lambda a: jnp.broadcast_to(a, (SEEDS,) + a.shape), det.init())
+  alarm = jax.lax.scan(jax.vmap(det.update), start, x)[1]
+  ratio = np.concatenate([np.full((2, SEEDS), np.nan), limits.log_ratio(leaderboard._channels(jax.tree.map(np.asarray, x)), p)])
+  fired, score = leaderboard.restarted(ratio, np.full(SEEDS, 3.0))
+  np.testing.assert_allclose(alarm.score, score, rtol=1e-3, atol=1e-3)  # float32 sums of a few hundred terms
+  assert (np.asarray(alarm.fired) == fired).mean() > 0.995
+
+
+# ---- other ways in -------------------------------------------------------------------------------------------------------------------
+
+def submission(held, score):
+  """{stream: scores} of every stream but pasts, by `score` on OPR (steps,)."""
+  m = held.meta
+  out = {"stream": [], "step": [], "score": []}
+  for n, steps, kind, full in zip(m["stream"], m["steps"], m["kind"], m["full"]):
+    if kind != "past" and full:
+      x = held.get("walker", [n]).residual.opr[:int(steps), 0]
+      out["stream"].append(np.full(len(x), n))
+      out["step"].append(np.arange(len(x)))
+      out["score"].append(score(x))
+  return {k: np.concatenate(v) for k, v in out.items()}
+
+
+def trailing(x):
+  """Mean of ln OPR over the last four known samples."""
+  known = np.nan_to_num(np.log(x))
+  return np.convolve(known, np.ones(4) / 4)[:len(x)]
+
+
+def test_a_file_of_scores_is_scored(small, tmp_path):
+  held = small[0]
+  store.write_table(tmp_path / "s.parquet", submission(held, trailing))
+  scores = leaderboard.read_submission(tmp_path / "s.parquet", held)
+  board = leaderboard.score(held, [], extra=[("mine", leaderboard.from_scores(scores))])
+  row = pick(board, detector="mine", fault="bias")[0]
+  assert row["latency_median_steps"] <= 4 and 20 <= row["arl0_alarms"] <= 16 * 824 / 400 and row["miss_probability"] == 0
+
+
+@pytest.mark.parametrize("spoil, text", [
+    (lambda t: {k: v[t["stream"] != t["stream"][-1]] for k, v in t.items()}, "streams are missing"),
+    (lambda t: {k: v[1:] for k, v in t.items()}, "must have one row for each of its steps"),
+    (lambda t: t | {"score": np.full_like(t["score"], np.nan)}, "no score is known"),
+    (lambda t: t | {"score": np.where(np.arange(len(t["score"])) == 7, np.inf, t["score"])}, "infinite"),
+    (lambda t: {"stream": t["stream"], "score": t["score"]}, "needs the columns"),
+])
+def test_broken_submissions_get_one_line(small, tmp_path, spoil, text):
+  store.write_table(tmp_path / "s.parquet", spoil(submission(small[0], trailing)))
+  with pytest.raises(FileError, match=text) as e:
+    leaderboard.read_submission(tmp_path / "s.parquet", small[0])
+  assert "\n" not in str(e.value)
+
+
+def test_a_score_that_looks_ahead_is_found_out(small, tmp_path):
+  ahead = lambda x: np.convolve(np.nan_to_num(np.log(x)), np.ones(5) / 5, "same")  # a centred mean sees two samples of the future
+  store.write_table(tmp_path / "s.parquet", submission(small[0], ahead))
+  with pytest.raises(FileError, match="looks ahead"):
+    leaderboard.read_submission(tmp_path / "s.parquet", small[0])
+
+
+class Above:
+  """A detector as a newcomer writes it."""
+
+  def __init__(self, threshold=2.0):
+    self.threshold, self.score = threshold, 0.0
+
+  def update(self, x):
+    self.score = x
+    return x > self.threshold
+
+
+def test_a_plain_python_class_is_calibrated_and_scored(small):
+  host = lambda value: HostDetector(lambda: Above(value), "above", "opr", False)
+  board = leaderboard.score(small[0], [], extra=[("above", leaderboard.from_host(host, "threshold"))])
+  row = pick(board, detector="above", fault="bias")[0]
+  assert 20 <= row["arl0_alarms"] <= 16 * 824 / 400 and row["latency_median_steps"] <= 6 and row["us_per_sample"] > 0
+  fixed = leaderboard.score(small[0], [], extra=[("above", leaderboard.from_host(HostDetector(lambda: Above(1.0), "above", "opr", False)))])
+  assert pick(fixed, detector="above", fault="bias")[0]["threshold"] is None and pick(fixed, detector="above", fault="bias")[0]["arl0"] < 10
+
+
+def test_crossings_count_excursions():
+  score = np.array([0, 2, 3, np.nan, 3, 0, np.nan, 5, 1.0])[:, None]
+  np.testing.assert_array_equal(np.flatnonzero(leaderboard.crossings(score, 1.5)[:, 0]), [1, 7])
+
+
+def test_export_is_whole_streams(small, tmp_path):
+  held = small[0]
+  (file,) = leaderboard.export(held, tmp_path)
+  table = store.read_table(file)
+  n = int(held.find("walker", "probe")[0])
+  own = table["stream"] == n
+  np.testing.assert_array_equal(table["opr"][own], held.get("walker", [n]).residual.opr[:, 0])
+  assert set(table) == {"stream", "step", "episode", "terminated"} | set(streams.COLUMNS)
+
+
+def test_files(small, board, tmp_path):
+  leaderboard.write(board, tmp_path, {"command": "mjx-cl leaderboard"})
+  table = store.read_table(tmp_path / "leaderboard.parquet")
+  assert len(table["detector"]) == len(board.rows) and {"cost_standard_low", "cost_standard_high", "auroc"} <= set(table)
+  assert "cusum" in (tmp_path / "leaderboard.html").read_text()
+
+
+def test_every_entry_of_the_default_board_is_built():
+  for name, settings in leaderboard.variants().items():
+    one = leaderboard.entry(name, settings)
+    assert isinstance(one.build(3.0), detectors.Detector) and one.about
