@@ -52,8 +52,8 @@ def bfar(block: int = 50, bins: int = 1, horizons: tuple[int, ...] = (1, 5), thr
     M = max over horizons h that are filled;  score = M / level, at the end of a block, nan between
     fired = score > threshold; then blocks are counted from nothing, while the references and the level are kept
 
-  level = (1 - alpha) quantile over `repetitions` of the largest M in a run of `blocks` healthy blocks. Each repetition draws m reference blocks, which
-  give it a mean and a deviation of its own, and then a run, both from the smoothed and variance-preserving bootstrap
+  level = (1 - alpha) quantile over `repetitions` of the largest M in a run of `blocks` healthy blocks. Each repetition draws m reference blocks,
+  which give it a mean and a deviation of its own, and then a run, both from the smoothed and variance-preserving bootstrap
     mean + (b_J - mean + g e) / sqrt(1 + g^2 / std^2),  g = 2.1 std m^(-1/5),  J uniform, e standard Gaussian
   since no draw from 20 blocks alone goes below the smallest of them, so that a level from such draws is crossed twice as often as stated; twice
   Silverman's width, since it keeps the statement for Gaussian blocks where once does not (measured, 20 and 100 blocks). So threshold = 1 means:

@@ -39,7 +39,7 @@ def mewma(rate: float = 0.02, threshold: float = 37.0, warmup: int = 1000, shrin
   Returns:
     Detector whose update takes a monitor.Residual and gives Alarm(fired: bool (), score: float32 ()).
   Blind to: a change of variance alone at small rates; a change much shorter than 1 / rate samples.
-  Reference: Lowry, Woodall, Champ, Rigdon 1992, Technometrics 34, 46-53; run lengths: Runger, Prabhu 1996, Commun. Statist. Theory 25, 1701-1706.
+  Reference: Lowry, Woodall, Champ, Rigdon 1992, Technometrics 34, 46-53; run lengths: Runger, Prabhu 1996, J. Amer. Statist. Assoc. 91, 1701-1706.
   Example: _, out = jax.lax.scan(det.update, det.init(), residuals)
   """
   names = many.split("mewma", channels)

@@ -52,8 +52,8 @@ def periodic(threshold: float = math.log(10_000)) -> Detector:
 
     n = known rows since the last alarm, this one included;  score = ln(n + 1/2);  fired = score > threshold; then n = 0
 
-  Printed beside every score because where changes are frequent, or the tolerance after them long, a clock finds many of them: half a period is its mean
-  delay. The threshold is ln of the interval, so calibration to an ARL0 works on it. float32 holds the interval to a row up to about 10^6 rows.
+  Printed beside every score because where changes are frequent, or the tolerance after them long, a clock finds many of them: half a period is its
+  mean delay. The threshold is ln of the interval, so calibration to an ARL0 works on it. float32 holds the interval to a row up to about 10^6 rows.
 
   Args:
     threshold: ln of the interval [ln control steps], at least 0.
@@ -117,9 +117,9 @@ def oracle(onset=0) -> Detector:
 
     t = rows before this one, known or not;  score = 1 if t >= onset, else 0;  fired = (t == onset)
 
-  Printed beside every score because it bounds what detection is worth: the best return that an agent could reach by being told, from which the loss of a
-  real detector is measured. No threshold. A detector does not see the onset, so it is not in the table: whoever scores it gives it the truth. It counts
-  every row, since an onset is a time, and fires at a row of which nothing is known; the contract on unknown rows does not hold for it.
+  Printed beside every score because it bounds what detection is worth: the best return that an agent could reach by being told, from which the loss of
+  a real detector is measured. No threshold. A detector does not see the onset, so it is not in the table: whoever scores it gives it the truth. It
+  counts every row, since an onset is a time, and fires at a row of which nothing is known; the contract on unknown rows does not hold for it.
 
   Args:
     onset: step of the change [control steps], may be traced.
