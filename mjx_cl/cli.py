@@ -158,6 +158,37 @@ class Record:
 
 
 @dataclass(frozen=True)
+class Leaderboard:
+  """Scores every registered detector on recorded streams; writes leaderboard.parquet and leaderboard.html into --out.
+
+  Ways in for a detector of one's own: a plug-in (entry point mjx_cl.detectors), --add with a Python class, --submit with a file of scores.
+  """
+  streams: Positional[str | None] = None
+  """Folder of `mjx-cl record`; default: the set that ships."""
+  out: str = "runs/leaderboard"
+  """Result folder."""
+  robot: tuple[str, ...] = ()
+  """Only these robots of the set."""
+  detector: tuple[str, ...] = ()
+  """Only these detectors, by their names on the board; `none`: only the oracles and one's own. Default: all."""
+  add: str | None = None
+  """module:Class or file.py:Class, a Python class with update(x) -> bool; a river detector works unchanged."""
+  set: tuple[str, ...] = ()
+  """Settings of --add, name=value ..."""
+  channel: str = "opr"
+  """What --add watches: opr, rpr, reward, surprise or group_0 .. group_7."""
+  threshold: str | None = None
+  """Setting of --add that is calibrated, larger = fewer alarms; default: it runs as it is, and its own rate of false alarms is printed."""
+  submit: str | None = None
+  """Parquet with the columns stream, step, score, for all streams that --export writes."""
+  name: str | None = None
+  """Name of --add or --submit on the board."""
+  export: str | None = None
+  """Only write the streams in full into this folder, one Parquet file per robot, for tools of one's own."""
+  json: bool = False
+
+
+@dataclass(frozen=True)
 class Plot:
   """Draws figure.png of a run anew."""
   folder: Positional[str]
@@ -200,6 +231,37 @@ class Render:
 
 
 @dataclass(frozen=True)
+class Detect:
+  """Watches a CSV log of one's own: thresholds from a nominal log, alarms in another.
+
+  A header row, columns of numbers; an empty cell or nan is a missing sample; `time` [s] or `step` tell when samples were taken. The nominal log counts
+  as the past of the other: detectors warm up on its first third (1,000 samples at most) and are calibrated on the rest. Every column has a
+  detector of its own, the alarm of any counts. Writes detect.json, alarms.csv and detect.png into --out.
+  """
+  file: Positional[str]
+  """Log to judge, .csv."""
+  nominal: str
+  """Log of the healthy system, .csv, same columns; three times --arl0 samples or more."""
+  column: tuple[str, ...] = ()
+  """Columns to watch; default: all columns of numbers that both files have."""
+  detector: tuple[str, ...] = ()
+  """Detectors of one number per sample, default: all; or module:Class, file.py:Class, a Python class with update(x) and a threshold of its own."""
+  set: tuple[str, ...] = ()
+  """Settings of such a class, name=value ..."""
+  arl0: float = 10_000
+  """Wanted mean number of samples between false alarms of one detector, all columns together."""
+  rate: float | None = None
+  """Samples (or steps of the column `step`) per second; default: from the column `time`."""
+  logarithm: bool = False
+  """Watch the logarithm; for residuals, which are positive and skewed."""
+  out: str | None = None
+  """Folder for the results; default: only the table."""
+  json: bool = False
+  overwrite: bool = False
+  """Replace an earlier detection in --out."""
+
+
+@dataclass(frozen=True)
 class Query:
   """SQL over all results, read-only; without SQL: the views, their rows and columns.
 
@@ -228,7 +290,7 @@ class Doctor:
 
 
 Command = (Annotated[Run, tyro.conf.subcommand("run")] | Annotated[Train, tyro.conf.subcommand("train")] | Annotated[Eval, tyro.conf.subcommand("eval")]
-           | Annotated[Certify, tyro.conf.subcommand("certify")] | Annotated[Record, tyro.conf.subcommand("record")] | Annotated[Plot, tyro.conf.subcommand("plot")] | Annotated[Render, tyro.conf.subcommand("render")] | Annotated[Query, tyro.conf.subcommand("query")]
+           | Annotated[Certify, tyro.conf.subcommand("certify")] | Annotated[Record, tyro.conf.subcommand("record")] | Annotated[Leaderboard, tyro.conf.subcommand("leaderboard")] | Annotated[Plot, tyro.conf.subcommand("plot")] | Annotated[Render, tyro.conf.subcommand("render")] | Annotated[Query, tyro.conf.subcommand("query")] | Annotated[Detect, tyro.conf.subcommand("detect")]
            | Annotated[List, tyro.conf.subcommand("list")] | Annotated[Doctor, tyro.conf.subcommand("doctor")])
 
 
@@ -482,6 +544,57 @@ def do_record(args: Record) -> None:
     print(f"{result['bytes'] / 1e6:.1f} MB in {out}")
 
 
+def do_leaderboard(args: Leaderboard) -> None:
+  import math
+  from mjx_cl import leaderboard, store, streams
+  held = streams.StreamSet(args.streams)
+  if args.export:
+    files = leaderboard.export(held, args.export)
+    emit(files) if args.json else print("\n".join(files))
+    return
+  known, extra = leaderboard.variants(), []
+  for name in args.detector:
+    if name != "none":
+      choose("detector", name, known)
+  entries = [leaderboard.entry(n, s) for n, s in known.items() if not args.detector or n in args.detector]
+  if args.add:
+    from mjx_cl.detectors import host
+    build = lambda value: host.load(args.add, settings(args.set) | ({args.threshold: value} if args.threshold else {}), args.name, args.channel)
+    one = build(10.0)
+    extra.append((one.host_name, leaderboard.from_host(build if args.threshold else one, args.threshold)))
+  if args.submit:
+    extra.append((args.name or os.path.basename(args.submit).removesuffix(".parquet"), leaderboard.from_scores(leaderboard.read_submission(args.submit, held))))
+  for name, _ in extra:
+    if name in known:
+      raise UserError(f"the board has a detector {name!r} already; give --name")
+  told = [0.0]
+
+  def progress(robot, name, done, total, seconds):
+    if time.monotonic() - told[0] > 2 or done == total:
+      told[0] = time.monotonic()
+      say(f"{done}/{total}  {robot}: {name}, {clock(seconds)} gone, {clock(seconds / done * (total - done))} left")
+  board = leaderboard.score(held, entries, args.robot, extra, progress)
+  meta = {"command": "mjx-cl " + " ".join(sys.argv[1:]), "seeds": {k: list(v) for k, v in held.suite.seeds.items()}, "arl0_target": held.suite.arl0,
+          "streams": held.config.get("command"), "wall_s": round(board.seconds, 1), "stream_steps": board.stream_steps, **store.provenance()}
+  files = leaderboard.write(board, args.out, meta)
+  if args.json:
+    emit([{k: v for k, v in r.items() if not k.startswith("stream_")} for r in board.rows])
+    return
+  from rich.console import Console
+  from rich.table import Table
+  table = Table(title=f"{len(board.rows):,} rows, ARL0 {held.suite.arl0:,.0f} steps, means over robots, faults and severities", title_justify="left")
+  for k, heading in enumerate(("detector", "score", "95 %", "within 1 s", "within 5 s", "missed", "false alarms/h", "mean rank")):
+    table.add_column(heading, justify="right" if k else "left", no_wrap=not k)
+  number = lambda x, form: "-" if x is None or not math.isfinite(x) else format(x, form)
+  for r in board.overall.rows:
+    ci = r["cost_standard_ci"]
+    table.add_row(r["detector"], number(r["cost_standard"], ".1f"), f"{number(ci[0], '.1f')} to {number(ci[1], '.1f')}" if ci else "-",
+                  number(r["detected_within_1s"], ".0%"), number(r["detected_within_5s"], ".0%"), number(r["miss_probability"], ".0%"),
+                  number(r["false_alarms_per_hour"], ".1f"), number(r["mean_rank"], ".1f"))
+  Console().print(table)
+  print(f"{board.stream_steps:,} stream-steps scored in {clock(board.seconds)}; files: {', '.join(files)}")
+
+
 def do_plot(args: Plot) -> None:
   from mjx_cl import plots
   if not os.path.exists(os.path.join(args.folder, "trace.parquet")):
@@ -508,6 +621,34 @@ def do_render(args: Render) -> None:
     emit({"env": args.env, "agent": args.agent or args.env, "fault": args.fault, **result})
   else:
     print(f"{result['file']}: {result['frames']} pictures, {result['fps']:g} a second, drawn by {result['drawn_by']}")
+
+
+def do_detect(args: Detect) -> None:
+  from mjx_cl import detect
+  out = None if args.out is None else detect.claim(args.out, args.overwrite)
+  tell = say if sys.stderr.isatty() else lambda text: None
+  result = detect.detect(args.file, args.nominal, args.column, args.detector, args.arl0, args.rate, args.logarithm, settings(args.set), tell)
+  if out:
+    detect.write(result, out)
+  for note in result.summary["notes"]:
+    say(f"mjx-cl: {note}")
+  if args.json:
+    emit(result.summary)
+    return
+  from rich.console import Console
+  from rich.table import Table
+  from rich.text import Text
+  table = Table()
+  for name in ("detector", "threshold", "nominal alarms", "first alarm", "at [s]", "alarms", "columns"):
+    table.add_column(Text(name), justify="left" if name in ("detector", "columns") else "right", no_wrap=name == "detector")
+  for row in result.summary["detectors"]:
+    mark = "" if row["calibrated"] else " own" if row["calibrated"] is None else " *"
+    shown = ("-" if row["threshold"] is None else f"{row['threshold']:.4g}") + mark, f"{row['nominal_alarms']:,}", *(
+        "-" if x is None else f"{x:,}" if isinstance(x, int) else f"{x:,.3f}" for x in (row["first_alarm"], row["first_alarm_s"], row["alarms"]))
+    table.add_row(Text(row["detector"]), *shown, Text(", ".join(row["columns"])))
+  Console().print(table)
+  if any(row["calibrated"] is False for row in result.summary["detectors"]):
+    print("* not calibrated")
 
 
 def do_query(args: Query) -> None:
@@ -562,7 +703,7 @@ def do_doctor(args: Doctor) -> None:
       print(f"{name:16s} {value if not isinstance(value, dict) else ', '.join(f'{k} {v}' for k, v in value.items())}")
 
 
-DO = {Run: do_run, Train: do_train, Eval: do_eval, Certify: do_certify, Record: do_record, Plot: do_plot, Render: do_render, Query: do_query, List: do_list, Doctor: do_doctor}
+DO = {Run: do_run, Train: do_train, Eval: do_eval, Certify: do_certify, Record: do_record, Leaderboard: do_leaderboard, Plot: do_plot, Render: do_render, Query: do_query, Detect: do_detect, List: do_list, Doctor: do_doctor}
 
 
 def parse(argv: list[str] | None):
