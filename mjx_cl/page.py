@@ -21,7 +21,7 @@ class Column(NamedTuple):
   """One column of the tables.
 
   Attributes:
-    key: of a row. label, help: of the header and its tooltip. kind: text, number, integer, share (0 to 1, shown in per cent) or score.
+    key: of a row. label, help: of the header and its tooltip. kind: text, number, integer, share (shown in per cent), ratio or score.
     better: 1 where a higher figure is better, -1 where a lower one is, 0 where neither; the first click sorts the best to the top.
     core: shown before `all columns` is chosen. tables: `rows`, `overall` or both. few: flag of a row that marks the figure.
   """
@@ -49,18 +49,19 @@ COLUMNS = (
          "Onset to first alarm, misses counted as later than all others; dash: half or more are missed", True),
   Column("latency_median_steps", "Median latency [steps]", "number", -1, "The same in control steps"),
   Column("miss_probability", "Missed", "share", -1, "Share of streams without an alarm before the horizon", True, BOTH),
-  Column("detected_within_0.5s", "Detected in 0.5 s", "share", 1, "Share of streams with an alarm at most 0.5 s after the onset"),
-  Column("detected_within_1s", "Detected in 1 s", "share", 1, "Share of streams with an alarm at most 1 s after the onset", True, BOTH),
-  Column("detected_within_5s", "Detected in 5 s", "share", 1, "Share of streams with an alarm at most 5 s after the onset", True, BOTH),
-  Column("detected_within_20s", "Detected in 20 s", "share", 1, "Share of streams with an alarm at most 20 s after the onset"),
-  Column("mean_rank", "Mean rank", "number", -1, "Rank by the standard cost score, mean over robots, faults and severities; 1 is best", True, ("overall",)),
+  Column("detected_within_0.5s", "Detected in 0.5\u00a0s", "share", 1, "Share of streams with an alarm at most 0.5 s after the onset"),
+  Column("detected_within_1s", "Detected in 1\u00a0s", "share", 1, "Share of streams with an alarm at most 1 s after the onset", True, BOTH),
+  Column("detected_within_5s", "Detected in 5\u00a0s", "share", 1, "Share of streams with an alarm at most 5 s after the onset", True, BOTH),
+  Column("detected_within_20s", "Detected in 20\u00a0s", "share", 1, "Share of streams with an alarm at most 20 s after the onset"),
+  Column("mean_rank", "Mean rank", "number", -1, "Mean over robots, faults and severities of the rank by the standard cost score; 1 is best", True,
+         ("overall",)),
   Column("false_alarms_per_hour", "False alarms per hour", "number", -1, "In healthy operation, per hour of robot time", True, few="arl0_few"),
   Column("arl0", "ARL0 [steps]", "number", 0, "Healthy steps per alarm, with restarts", True, few="arl0_few"),
   Column("arl0_alarms", "Alarms behind ARL0", "integer", 0, "Alarms that the ARL0 was counted from"),
   Column("episode_alarm_probability", "Alarm in a healthy episode", "share", -1, "Share of healthy episodes with an alarm", few="arl0_few"),
   Column("threshold", "Threshold", "number", 0, "Decision level after calibration", few="arl0_few"),
-  Column("auroc", "AUROC", "number", 1, "Ranks scores sample by sample; says nothing about delay or false alarms in a row", True),
-  Column("efficiency", "Efficiency", "number", 1, "Delay of the likelihood-ratio oracle / delay of this detector, at equal ARL0", True),
+  Column("auroc", "AUROC", "ratio", 1, "Ranks scores sample by sample; says nothing about delay or false alarms in a row", True),
+  Column("efficiency", "Efficiency", "ratio", 1, "Delay of the likelihood-ratio oracle / delay of this detector, at equal ARL0", True),
   Column("oracle_delay_steps", "Oracle delay [steps]", "number", 0, "Delay of the likelihood-ratio test fitted on other seeds"),
   Column("optimal_delay_steps", "Optimal delay [steps]", "number", 0, "Closed form; printed only where its assumptions hold"),
   Column("information_nats_per_step", "Information [nats/step]", "number", 0, "Estimated divergence of faulty from healthy streams"),

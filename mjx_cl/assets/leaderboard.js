@@ -9,6 +9,7 @@
   const FIRST_ROWS = 100;  // a long table is drawn in full on request only
   const BEST = 7;          // curves shown at first: as many as there are colours
   const SHAPES = 4;
+  const DASHES = ["", "7 3", "2 2", "9 3 2 3"];
   const NEAR_S = [-5, 20]; // what `around the onset` shows
 
   const byId = id => document.getElementById(id);
@@ -36,7 +37,8 @@
   const looks = new Map(names.map((name, i) => {
     const at = references.has(name) ? -1 : ranked.indexOf(name);
     const turn = at < 0 ? i : Math.floor(at / BEST);
-    return [name, {color: at < 0 ? "var(--reference)" : `var(--c${at % BEST})`, shape: turn % SHAPES, dash: at < 0 ? "2 3" : ["", "7 3", "2 2", "9 3 2 3"][turn % SHAPES]}];
+    const color = at < 0 ? "var(--reference)" : `var(--c${at % BEST})`;
+    return [name, {color, shape: turn % SHAPES, dash: at < 0 ? "2 3" : DASHES[turn % SHAPES]}];
   }));
   const firstShown = new Set([...ranked.slice(0, BEST), ...names.filter(name => references.has(name))]);
   const look = name => looks.get(name) || {color: "var(--reference)", shape: 0, dash: ""};
@@ -65,6 +67,7 @@
     if (isNull(value)) return DASH;
     if (typeof value !== "number") return String(value);
     if (kind === "score") return value.toFixed(1);
+    if (kind === "ratio") return value.toFixed(3);
     if (kind === "share") {
       const percent = 100 * value;
       return percent.toFixed(percent % 1 < 0.05 || (percent >= 10 && percent <= 90) ? 0 : 1);
@@ -85,7 +88,7 @@
     return `[${figure(ci[0], kind)}, ${figure(ci[1], kind)}]`;
   }
 
-  const seconds = value => `${value < 0 ? "\u2212" : "+"}${figure(Math.abs(value), "number")} s`;
+  const seconds = value => `${value < 0 ? "" : "+"}${figure(value, "number")} s`;
   const shorten = (text, length) => text.length > length ? `${text.slice(0, length - 1)}\u2026` : text;
 
   // ---- elements --------------------------------------------------------------------------------------------------------------------
@@ -96,7 +99,7 @@
       else if (value === true) node.setAttribute(name, "");
       else if (!isNull(value) && value !== false) node.setAttribute(name, value);
     }
-    node.append(...children.flat().filter(child => !isNull(child) && child !== ""));
+    node.append(...children.flat(Infinity).filter(child => !isNull(child) && child !== ""));
     return node;
   }
   const el = (tag, attributes, ...children) => fill(document.createElement(tag), attributes, children);
@@ -182,8 +185,9 @@
       const first = column.better > 0 ? `-${column.key}` : column.key;
       const next = order !== first ? first : first.startsWith("-") ? column.key : `-${column.key}`;
       const arrow = el("span", {class: "arrow", "aria-hidden": "true"}, {none: "", ascending: "\u25B2", descending: "\u25BC"}[now]);
-      const button = el("button", {type: "button", title: column.help, "data-focus": `${which}:${column.key}`, onclick: () => change({[which]: next})}, column.label, arrow);
-      return el("th", {scope: "col", "aria-sort": now, class: `${column.kind}${column.key === "detector" ? " pin" : ""}`, "data-key": column.key}, button);
+      const press = {type: "button", title: column.help, "data-focus": `${which}:${column.key}`, onclick: () => change({[which]: next})};
+      const kind = `${column.kind}${column.key === "detector" ? " pin" : ""}`;
+      return el("th", {scope: "col", "aria-sort": now, class: kind, "data-key": column.key}, el("button", press, column.label, arrow));
     });
     const body = list.map(row => el("tr", {class: references.has(row.detector) ? "reference" : null}, shown.map(column => cell(column, row))));
     return el("table", null, el("thead", null, el("tr", null, head)), el("tbody", null, body));
@@ -194,7 +198,8 @@
     const pin = column.key === "detector";
     const text = withUnit(value, column.kind);
     const linked = column.key === "fault" && pages.has(keyOf(row));
-    return el(pin ? "th" : "td", {class: `${column.kind}${pin ? " pin" : ""}${costKeys.includes(column.key) ? " cost" : ""}`, scope: pin ? "row" : null, "data-key": column.key},
+    const kind = `${column.kind}${pin ? " pin" : ""}${costKeys.includes(column.key) ? " cost" : ""}`;
+    return el(pin ? "th" : "td", {class: kind, scope: pin ? "row" : null, "data-key": column.key},
       pin ? swatch(row.detector, 14) : null,
       el("span", {class: "v"}, linked ? el("a", {href: pathOf([row.robot, row.fault, row.severity])}, text) : text),
       column.few && row[column.few] ? el("sup", {class: "mark", title: "rests on fewer than 50 alarms"}, FEW) : null,
@@ -204,9 +209,8 @@
   const FOOTNOTE = `${FEW} rests on fewer than 50 alarms of healthy robots: an order of magnitude rather than a figure. `;
 
   function footnotes(list) {
-    const few = list.some(row => row.few || row.arl0_few);
-    return el("p", {class: "foot"}, few ? el("span", {class: "few"}, FOOTNOTE) : null,
-      `Small grey figures are 95 % intervals. ${DASH} means undefined. Grey rows are references that look at nothing, or at the truth; they are not ranked.`);
+    return el("p", {class: "foot"}, list.some(row => row.few || row.arl0_few) ? el("span", {class: "few"}, FOOTNOTE) : null,
+      `Small figures are 95 % intervals. ${DASH}: undefined. Grey rows are references that look at nothing, or at the truth, and are not ranked.`);
   }
 
   function ranks() {
@@ -217,17 +221,18 @@
 
   function visible() {
     const words = state.q.toLowerCase().split(/\s+/).filter(Boolean);
-    return rows.filter(row => (state.refs !== "no" || !references.has(row.detector))
+    const text = row => [row.detector, row.robot, row.fault, row.note].filter(part => !isNull(part)).join("\n").toLowerCase();
+    return rows.filter(row => isKept(row.detector)
       && Object.keys(choices).every(key => !state[key] || String(row[key]) === state[key])
-      && words.every(word => [row.detector, row.robot, row.fault, row.note].some(text => !isNull(text) && String(text).toLowerCase().includes(word))));
+      && words.every(word => text(row).includes(word)));
   }
 
   /** Columns of the full table: of the three scores, the chosen profile's alone until all columns are shown. */
   const chosen = column => state.cols === "all" || (column.core && (!costKeys.includes(column.key) || column.key === `cost_${state.profile}`));
 
   function showTables() {
-    const cost = `-cost_${state.profile}`, keep = state.refs !== "no";
-    const top = sorted(ranks(), state.top || cost).filter(entry => keep || !references.has(entry.detector));
+    const cost = `-cost_${state.profile}`;
+    const top = sorted(ranks(), state.top || cost).filter(entry => isKept(entry.detector));
     byId("overall").replaceChildren(table("top", columns.overall, top, state.top || cost));
     byId("overall-foot").replaceChildren(footnotes(top));
     const list = visible();
@@ -274,7 +279,12 @@
 
   const line = (x1, y1, x2, y2, kind) => draw("line", {x1, y1, x2, y2, class: kind});
   const label = (x, y, text, kind, anchor) => draw("text", {x, y, class: kind, "text-anchor": anchor}, text);
-  const isOn = name => (state.show || firstShown).has(name) && (state.refs !== "no" || !references.has(name));
+  const gridX = (svg, values, x, top, bottom) => values.forEach(t => svg.append(
+    line(x(t), top, x(t), bottom, "grid"), label(x(t), bottom + 15, figure(t, "number"), "tick", "middle")));
+  const gridY = (svg, values, y, left, right) => values.forEach(t => svg.append(
+    line(left, y(t), right, y(t), "grid"), label(left - 6, y(t) + 4, figure(t, "number"), "tick", "end")));
+  const isKept = name => state.refs !== "no" || !references.has(name);
+  const isOn = name => (state.show || firstShown).has(name) && isKept(name);
 
   function showLegend() {
     const toggle = name => {
@@ -288,18 +298,19 @@
         for (const g of svg.querySelectorAll("g.series")) g.classList.toggle("hot", g.dataset.name === name);
       }
     };
-    byId("legend").replaceChildren(
-      ...names.filter(name => state.refs !== "no" || !references.has(name)).map(name => el("button",
-        {type: "button", class: "key", "aria-pressed": String(isOn(name)), "data-focus": `legend:${name}`, onclick: () => toggle(name), onpointerenter: () => focus(name),
-         onpointerleave: () => focus(null)}, swatch(name, 26), name)),
-      ...[[`Best ${BEST}`, null], ["All", new Set(names)], ["None", new Set()]].map(([text, show]) => el("button",
-        {type: "button", class: "plain", "data-focus": `legends:${text}`, onclick: () => change({show})}, text)));
+    const key = name => el("button", {type: "button", class: "key", "aria-pressed": String(isOn(name)), "data-focus": `legend:${name}`,
+      onclick: () => toggle(name), onpointerenter: () => focus(name), onpointerleave: () => focus(null)}, swatch(name, 26), name);
+    const many = [[`Best ${BEST}`, null], ["All", new Set(names)], ["None", new Set()]].map(([text, show]) => el("button",
+      {type: "button", class: "plain", "data-focus": `legends:${text}`, onclick: () => change({show})}, text));
+    byId("legend").replaceChildren(...names.filter(isKept).map(key), ...many);
   }
 
   /** Latency against false alarms per hour, one panel per robot on common axes. */
   function showCurves() {
-    const host = byId("curves"), robots = distinct([...curves.values()].flatMap(c => [...c.keys()])).filter(robot => !state.robot || robot === state.robot);
-    const points = [...curves.values()].flatMap(c => [...c.values()].flat()).filter(p => !isNull(p.latency_mean_s) && !isNull(p.false_alarms_per_hour));
+    const host = byId("curves"), all = [...curves.values()];
+    const robots = distinct(all.flatMap(c => [...c.keys()])).filter(robot => !state.robot || robot === state.robot);
+    const known = p => !isNull(p.latency_mean_s) && !isNull(p.false_alarms_per_hour);
+    const points = all.flatMap(c => [...c.values()].flat()).filter(known);
     if (!points.length || !robots.length) return host.replaceChildren(el("p", {class: "empty"}, "No curves were recorded."));
     const positive = points.map(p => p.false_alarms_per_hour).filter(v => v > 0);
     const low = Math.floor(Math.log10(Math.min(1, ...positive))), high = Math.max(low + 1, Math.ceil(Math.log10(Math.max(1, ...positive))));
@@ -307,30 +318,31 @@
     const yMax = Math.max(...points.map(p => p.latency_mean_s)) * 1.04 || 1;
     const space = host.clientWidth, across = Math.max(1, Math.min(robots.length, 3, Math.floor(space / 300)));
     const w = Math.floor((space - 16 * (across - 1)) / across), h = Math.min(300, Math.max(230, 0.8 * w));
-    const left = 40, right = w - 8, top = 24, bottom = h - 38, start = left + (zero ? 26 : 6);
+    const left = 40, right = w - 16, top = 24, bottom = h - 38, start = left + (zero ? 26 : 6);
     const x = v => v > 0 ? scale(low, high, start, right)(Math.log10(v)) : left + 8, y = scale(0, yMax, bottom, top);
     host.replaceChildren(...robots.map(robot => {
       const svg = draw("svg", {width: w, height: h, role: "group", "aria-label": `mean latency against false alarms per hour, ${robot}`});
       svg.append(label(left, 14, robot, "title"));
-      for (const t of ticks(0, yMax, 5)) svg.append(line(left, y(t), right, y(t), "grid"), label(left - 6, y(t) + 4, figure(t, "number"), "tick", "end"));
-      const every = Math.ceil((high - low) / Math.max(2, Math.floor((right - start) / 42)));
-      for (let d = low; d <= high; d += every) {
-        svg.append(line(x(10 ** d), top, x(10 ** d), bottom, "grid"), label(x(10 ** d), bottom + 16, d < -2 || d > 3 ? `1e${d}` : String(10 ** d), "tick", "middle"));
+      gridY(svg, ticks(0, yMax, 5), y, left, right);
+      const stride = Math.ceil((high - low) / Math.max(2, Math.floor((right - start) / 42)));
+      for (let d = low; d <= high; d += stride) {
+        const at = x(10 ** d), text = d < -2 || d > 3 ? `1e${d}` : String(10 ** d);
+        svg.append(line(at, top, at, bottom, "grid"), label(at, bottom + 16, text, "tick", "middle"));
       }
       if (zero) svg.append(label(x(0), bottom + 16, "0", "tick", "middle"), line(start - 8, bottom - 4, start - 12, bottom + 4, "axis"));
       svg.append(line(left, bottom, right, bottom, "axis"), label((left + right) / 2, h - 6, "false alarms per hour", "tick", "middle"));
       svg.append(label(right, 14, "mean latency [s]", "tick", "end"));
       for (const name of [...names].reverse()) {
         if (!isOn(name) || !curves.has(name) || !curves.get(name).has(robot)) continue;
-        const track = sorted(curves.get(name).get(robot).filter(p => !isNull(p.latency_mean_s) && !isNull(p.false_alarms_per_hour)), "false_alarms_per_hour");
+        const track = sorted(curves.get(name).get(robot).filter(known), "false_alarms_per_hour");
         const g = draw("g", {class: "series", "data-name": name}), {color, dash} = look(name);
         const path = track.map((p, i) => `${i ? "L" : "M"}${x(p.false_alarms_per_hour).toFixed(1)} ${y(p.latency_mean_s).toFixed(1)}`).join("");
         g.append(draw("path", {d: path, class: "curve", style: `stroke:${color};stroke-dasharray:${dash}`}));
         g.append(tip(draw("path", {d: path, class: "hit"}), [name, robot]));
         for (const p of track) {
           const dot = marker(name, x(p.false_alarms_per_hour), y(p.latency_mean_s), 3, isNull(p.detected) || p.detected < 0.5);
-          g.append(tip(dot, [name, robot, `${figure(p.false_alarms_per_hour, "number")} false alarms per hour`, `mean latency ${figure(p.latency_mean_s, "number")} s`,
-            `detected ${withUnit(p.detected, "share")}`]));
+          g.append(tip(dot, [name, robot, `${figure(p.false_alarms_per_hour, "number")} false alarms per hour`,
+            `mean latency ${figure(p.latency_mean_s, "number")} s`, `detected ${withUnit(p.detected, "share")}`]));
         }
         svg.append(g);
       }
@@ -341,7 +353,7 @@
   /** Cost scores with their intervals, and mean ranks with the critical difference. */
   function showIntervals() {
     const host = byId("intervals"), key = `cost_${state.profile}`, space = host.clientWidth;
-    const list = sorted(overall, `-${key}`).filter(entry => state.refs !== "no" || !references.has(entry.detector));
+    const list = sorted(overall, `-${key}`).filter(entry => isKept(entry.detector));
     if (!list.length) return host.replaceChildren(el("p", {class: "empty"}, "No detector was scored."));
     const wide = space >= 720, w = wide ? Math.floor((space - 16) / 2) : space;
     const real = list.filter(entry => !references.has(entry.detector));
@@ -351,23 +363,22 @@
     const last = Math.max(2, ...list.map(entry => entry.mean_rank).filter(v => !isNull(v)));
     const band = isNull(cd) || !Number.isFinite(best) ? null : {from: best, to: best + cd, text: `critical difference ${figure(cd, "number")}`};
     const cost = {key, kind: "score", low, high, title: `cost score, ${data.profiles[state.profile]} (higher is better)`};
-    const rank = {key: "mean_rank", kind: "number", low: 1, high: Math.max(last, band ? band.to : 0), title: "mean rank, standard score (lower is better)", band};
-    host.replaceChildren(dots(list, cost, w), dots(list, rank, w));
+    const rank = {key: "mean_rank", kind: "number", low: 1, high: Math.max(last, band ? band.to : 0), band};
+    host.replaceChildren(dots(list, cost, w), dots(list, {...rank, title: "mean rank, standard score (lower is better)"}, w));
   }
 
   function dots(list, {key, kind, low, high, title, band}, w) {
-    const row = 21, left = Math.min(150, 0.36 * w), right = w - 12, top = band ? 40 : 24, bottom = top + row * list.length, h = bottom + 22;
+    const row = 21, left = Math.min(150, 0.36 * w), right = w - 12, top = 36, bottom = top + row * list.length, h = bottom + 22;
     const x = scale(low, high, left + 8, right), letters = Math.floor((left - 4) / 6.6);
-    const svg = draw("svg", {width: w, height: h, role: "group", "aria-label": title}, label(left, 14, title, "title"));
+    const svg = draw("svg", {width: w, height: h, role: "group", "aria-label": title}, label(w < 500 ? 0 : left, 14, title, "title"));
     if (band) {
       const end = Math.min(right, x(band.to));
       svg.append(tip(draw("rect", {x: x(band.from), y: top - 4, width: Math.max(1, end - x(band.from)), height: bottom - top + 4, class: "band"}),
         [band.text, "ranks inside it cannot be told from the best"]));
-      svg.append(draw("path", {d: `M${x(band.from)} ${top - 4}v-5H${end}v5`, class: "bracket"}), label(x(band.from) + 2, top - 12, band.text, "tick"));
+      svg.append(draw("path", {d: `M${x(band.from)} ${top - 4}v-5H${end}v5`, class: "bracket"}));
+      svg.append(label(x(band.from) + 2, top - 12, band.text, "tick"));
     }
-    for (const t of ticks(low, high, Math.max(3, Math.floor((right - left) / 60)))) {
-      svg.append(line(x(t), top, x(t), bottom, "grid"), label(x(t), bottom + 15, figure(t, "number"), "tick", "middle"));
-    }
+    gridX(svg, ticks(low, high, Math.max(3, Math.floor((right - left) / 60))), x, top, bottom);
     list.forEach((entry, i) => {
       const name = entry.detector, at = top + row * (i + 0.5), value = entry[key], ci = entry[`${key}_ci`];
       const g = draw("g", {class: `series${isOn(name) ? "" : " off"}${references.has(name) ? " reference" : ""}`, "data-name": name});
@@ -376,7 +387,9 @@
         g.append(label(left + 12, at + 4, DASH, "tick"));
       } else {
         const inside = v => Math.min(high, Math.max(low, v)), outside = value < low || value > high;
-        if (ci && !isNull(ci[0]) && !isNull(ci[1])) g.append(draw("line", {x1: x(inside(ci[0])), x2: x(inside(ci[1])), y1: at, y2: at, class: "whisker", style: `stroke:${look(name).color}`}));
+        if (ci && !outside && !isNull(ci[0]) && !isNull(ci[1])) {
+          g.append(fill(line(x(inside(ci[0])), at, x(inside(ci[1])), at, "whisker"), {style: `stroke:${look(name).color}`}, []));
+        }
         g.append(outside ? label(x(inside(value)), at + 4, value < low ? "\u25C4" : "\u25BA", "far", "middle") : marker(name, x(value), at, 4));
       }
       g.append(draw("rect", {x: 0, y: at - row / 2, width: w, height: row, class: "hit"}));
@@ -392,23 +405,24 @@
 
   /** The fault that a hash names; a severity may be written in another way, such as 1.0 for 1. */
   function pageOf([robot, fault, severity]) {
-    return data.faults.find(f => f.robot === robot && f.fault === fault && (String(f.severity) === severity || (severity !== "" && Number(severity) === f.severity)));
+    const fits = given => String(given) === severity || (severity !== "" && Number(severity) === given);
+    return data.faults.find(f => f.robot === robot && f.fault === fault && fits(f.severity));
   }
 
   function showFault() {
     const host = byId("page"), fault = pageOf(route), back = el("a", {class: "back", href: `#${query()}`}, "\u2190 leaderboard");
     if (!fault) {
-      document.title = "mjx_cl leaderboard";
-      return host.replaceChildren(el("nav", null, back), el("h2", null, "No such fault"), el("p", {class: "empty"}, `No streams of ${route.join(" / ")} were recorded.`));
+      return host.replaceChildren(el("nav", null, back), el("h2", null, "No such fault"),
+        el("p", {class: "empty"}, `No streams of ${route.join(" / ")} were recorded.`));
     }
     const at = data.faults.indexOf(fault), title = `${fault.robot}: ${fault.fault}, severity ${figure(fault.severity, "number")}`;
     const neighbour = (other, text) => other ? el("a", {href: pathOf([other.robot, other.fault, other.severity])}, text) : null;
-    const alarms = [...entries(fault.alarms)].filter(([name]) => state.refs !== "no" || !references.has(name));
-    const own = rows.filter(row => keyOf(row) === keyOf(fault) && (state.refs !== "no" || !references.has(row.detector)));
+    const alarms = [...entries(fault.alarms)].filter(([name]) => isKept(name));
+    const own = rows.filter(row => keyOf(row) === keyOf(fault) && isKept(row.detector));
     const order = state.sort || `-cost_${state.profile}`;
     document.title = `${title} ${DASH} mjx_cl leaderboard`;
-    const span = text => el("button", {type: "button", "aria-pressed": String(state.span === text), "data-focus": `span:${text}`, onclick: () => change({span: text})},
-      text ? "Around the onset" : "Whole stream");
+    const span = value => el("button", {type: "button", "aria-pressed": String(state.span === value), "data-focus": `span:${value}`,
+      onclick: () => change({span: value})}, value ? "Around the onset" : "Whole stream");
     host.replaceChildren(
       el("nav", null, back, neighbour(data.faults[at - 1], "previous fault"), neighbour(data.faults[at + 1], "next fault")),
       el("h2", null, title), el("p", {class: "summary"}, summary(fault, alarms)),
@@ -420,19 +434,18 @@
   }
 
   function summary(fault, alarms) {
-    const after = alarms.filter(([name, step]) => !isNull(step) && step >= fault.onset && !references.has(name)).sort((a, b) => a[1] - b[1]);
-    const early = alarms.filter(([name, step]) => !isNull(step) && step < fault.onset && !references.has(name)).length;
-    const count = alarms.filter(([name]) => !references.has(name)).length;
+    const real = alarms.filter(([name]) => !references.has(name)), known = real.filter(([, step]) => !isNull(step));
+    const after = known.filter(([, step]) => step >= fault.onset).sort((a, b) => a[1] - b[1]), early = known.length - after.length;
     const first = after.length ? `; the first is ${after[0][0]}, ${figure((after[0][1] - fault.onset) * fault.control_s, "number")} s after it` : "";
-    return `The fault begins at step ${figure(fault.onset, "integer")} (${figure(fault.onset * fault.control_s, "number")} s). In this seed ${after.length} of ${count} detectors `
-      + `alarm after the onset${first}. ${early} had alarmed before.`;
+    return `The fault begins at step ${figure(fault.onset, "integer")} (${figure(fault.onset * fault.control_s, "number")} s). `
+      + `In this seed ${after.length} of ${real.length} detectors alarm after the onset${first}. ${early || "None"} had alarmed before.`;
   }
 
   function showStreams(fault, alarms) {
     const channels = entries(fault.channels), w = byId("streams").clientWidth, left = Math.min(150, 0.3 * w), right = w - Math.min(84, 0.2 * w);
     const every = fault.every || 1, first = fault.first || 0, time = step => (step - fault.onset) * fault.control_s;
     const longest = Math.max(0, ...[...channels.values()].map(values => values.length));
-    const ends = [time(first), Math.max(time(first + every * Math.max(0, longest - 1)), ...alarms.map(([, step]) => isNull(step) ? 0 : time(step)))];
+    const ends = [time(first), Math.max(time(first + every * Math.max(0, longest - 1)), ...alarms.map(([, step]) => time(step ?? fault.onset)))];
     const [low, high] = state.span === "near" ? [Math.max(NEAR_S[0], ends[0]), Math.min(NEAR_S[1], ends[1])] : ends;
     const x = scale(low, high, left, right), inside = t => t >= low && t <= high;
     const marks = alarms.filter(([name, step]) => !isNull(step) && isOn(name) && inside(time(step)));
@@ -450,8 +463,10 @@
       const svg = draw("svg", {width: w, height: h, class: "stream", role: "img", "aria-label": `${channel} over time`, "data-channel": channel},
         label(0, top + 10, shorten(channel, Math.floor(left / 7)), "title"));
       if (!known.length) return fill(svg, null, [label(left, h / 2, "no values", "tick")]);
-      for (const t of ticks(min, max, 3)) svg.append(line(left, y(t), right, y(t), "grid"), label(left - 6, y(t) + 4, figure(t, "number"), "tick", "end"));
-      for (const [name, step] of marks) svg.append(draw("line", {x1: x(time(step)), x2: x(time(step)), y1: top, y2: bottom, class: "alarm-line", style: `stroke:${look(name).color}`}));
+      gridY(svg, ticks(min, max, 3), y, left, right);
+      for (const [name, step] of marks) {
+        svg.append(fill(line(x(time(step)), top, x(time(step)), bottom, "alarm-line"), {style: `stroke:${look(name).color}`}, []));
+      }
       svg.append(draw("path", {d: path, class: "trace"}));
       if (inside(0)) svg.append(line(x(0), 0, x(0), h, "onset"));
       return svg;
@@ -461,13 +476,11 @@
 
   /** One lane per detector under the streams, on the same time axis; the earliest alarm after the onset first. */
   function alarmLanes(fault, alarms, {w, left, right, low, high, x, inside, time}) {
-    const place = step => isNull(step) ? Infinity : step < fault.onset ? 1e12 + step : step;
-    const list = [...alarms].sort((a, b) => place(a[1]) === place(b[1]) ? 0 : place(a[1]) - place(b[1]));
+    const place = step => isNull(step) ? Number.MAX_VALUE : step < fault.onset ? 1e12 + step : step;
+    const list = [...alarms].sort((a, b) => place(a[1]) - place(b[1]));
     const row = 20, top = 6, bottom = top + row * list.length;
     const svg = draw("svg", {width: w, height: bottom + 36, role: "group", "aria-label": "first alarm of each detector"});
-    for (const t of ticks(low, high, Math.max(3, Math.floor((right - left) / 80)))) {
-      svg.append(line(x(t), top, x(t), bottom, "grid"), label(x(t), bottom + 15, figure(t, "number"), "tick", "middle"));
-    }
+    gridX(svg, ticks(low, high, Math.max(3, Math.floor((right - left) / 80))), x, top, bottom);
     svg.append(line(left, bottom, right, bottom, "axis"), label((left + right) / 2, bottom + 31, "seconds after the onset", "tick", "middle"));
     if (inside(0)) svg.append(line(x(0), 0, x(0), bottom, "onset"));
     list.forEach(([name, step], i) => {
@@ -476,9 +489,9 @@
         label(left - 8, at + 4, shorten(name, Math.floor((left - 8) / 6.6)), "name", "end"), line(left, at, right, at, "rail"),
         label(right + 8, at + 4, text, t === null || t < 0 ? "tick" : "name"));
       if (t !== null && inside(t)) {
-        const dot = marker(name, x(t), at, 4.5, t < 0);
-        dot.classList.add("alarm");
-        g.append(tip(dot, [name, `first alarm at step ${figure(step, "integer")}`, t < 0 ? `${seconds(t)}: before the onset, false` : `${seconds(t)} after the onset`], true));
+        const dot = fill(marker(name, x(t), at, 4.5, t < 0), {class: "alarm"}, []);
+        const when = t < 0 ? `${text}: before the onset, false` : `${text} after the onset`;
+        g.append(tip(dot, [name, `first alarm at step ${figure(step, "integer")}`, when], true));
       }
       svg.append(g);
     });
@@ -498,15 +511,21 @@
         select("profile", "Profile", Object.entries(data.profiles)), select("robot", "Robot", any("robot")), select("fault", "Fault", any("fault")),
         select("severity", "Severity", any("severity")),
         el("label", {class: "grow"}, el("span", null, "Search"),
-          el("input", {id: "q", type: "search", placeholder: "detector, fault, note", autocomplete: "off", oninput: event => change({q: event.target.value})})),
+          el("input", {id: "q", type: "search", placeholder: "detector, robot, fault, note", autocomplete: "off",
+            oninput: event => change({q: event.target.value})})),
         check("refs", "", "no", "References"),
         el("button", {type: "button", id: "reset", onclick: () => change({...FIRST, show: null})}, "Reset")),
-      el("section", null, el("h2", null, "Overall"), el("p", {class: "sub"}, "Means over all robots, faults and severities; robot, fault, severity and search act on the plots and the table below."),
+      el("section", null, el("h2", null, "Overall"),
+        el("p", {class: "sub"}, "Means over all robots, faults and severities. The robot acts on the curves and the full table, fault, severity and "
+          + "search on the full table."),
         el("div", {class: "scroll", id: "overall", tabindex: "0", role: "region", "aria-label": "overall table"}), el("div", {id: "overall-foot"})),
       el("section", null, el("h2", null, "Latency against false alarms"),
-        el("p", {class: "sub"}, "Each point is one threshold; down and left is better. Hollow: fewer than half of the faults detected. Names switch curves on and off."),
+        el("p", {class: "sub"}, "Each point is one threshold; down and left is better. Hollow: fewer than half of the faults detected. "
+          + "Names switch curves on and off."),
         el("div", {id: "legend", class: "legend", role: "group", "aria-label": "detectors shown"}), el("div", {id: "curves", class: "charts"}),
-        el("h2", null, "Scores and ranks"), el("p", {class: "sub"}, "Bars are 95 % intervals. Ranks inside the shaded band cannot be told from the best one; arrows stand for values off the scale."),
+        el("h2", null, "Scores and ranks"),
+        el("p", {class: "sub"}, "Bars are 95 % intervals. Ranks inside the shaded band cannot be told from the best one; arrows stand for values "
+          + "off the scale."),
         el("div", {id: "intervals", class: "charts"})),
       el("section", null, el("h2", null, "Every robot, fault and severity"),
         el("div", {class: "bar"}, el("span", {id: "count", role: "status"}), check("cols", "all", "", "All columns")),
@@ -518,19 +537,24 @@
 
   function faultLinks() {
     const robots = distinct(data.faults.map(fault => fault.robot));
-    byId("pages").replaceChildren(el("h2", null, "Streams fault by fault"), ...robots.map(robot => el("div", {class: "chips"}, el("strong", null, robot),
-      data.faults.filter(fault => fault.robot === robot).map(fault => el("a", {href: pathOf([fault.robot, fault.fault, fault.severity])}, `${fault.fault} ${figure(fault.severity, "number")}`)))));
+    const link = fault => el("a", {href: pathOf([fault.robot, fault.fault, fault.severity])}, `${fault.fault} ${figure(fault.severity, "number")}`);
+    byId("pages").replaceChildren(el("h2", null, "Streams fault by fault"), ...robots.map(robot => el("div", {class: "chips"},
+      el("strong", null, robot), data.faults.filter(fault => String(fault.robot) === robot).map(link))));
     byId("pages").hidden = !robots.length;
   }
 
   /** What the figures rest on, from meta as it came. */
   function about() {
-    const plain = value => Array.isArray(value) ? value.map(plain).join(", ")
-      : value && typeof value === "object" ? Object.entries(value).map(([k, v]) => `${k} ${plain(v)}`).join(", ") : isNull(value) ? DASH : String(value);
+    const plain = value => {
+      if (Array.isArray(value)) return value.map(plain).join(", ");
+      if (value && typeof value === "object") return Object.entries(value).map(([k, v]) => `${k} ${plain(v)}`).join(", ");
+      return isNull(value) ? DASH : String(value);
+    };
     const {notes, critical_difference: cd, ...rest} = data.meta;
     const items = Object.entries({...rest, ...(isNull(cd) ? {} : {critical_difference: figure(cd, "number")})});
     byId("about").replaceChildren(el("h2", null, "How the figures were made"),
-      el("dl", null, items.map(([key, value]) => [el("dt", null, key.replaceAll("_", " ")), el("dd", null, key === "command" ? el("code", null, plain(value)) : plain(value))])),
+      el("dl", null, items.map(([key, value]) => [el("dt", null, key.replaceAll("_", " ")),
+        el("dd", null, key === "command" ? el("code", null, plain(value)) : plain(value))])),
       ...[notes || []].flat().map(note => el("p", null, plain(note))));
   }
 
@@ -539,10 +563,10 @@
     byId("board").hidden = route !== null;
     byId("page").hidden = route === null;
     byId("tip").hidden = true;
+    document.title = "mjx_cl leaderboard";
     if (route) {
       showFault();
     } else {
-      document.title = "mjx_cl leaderboard";
       for (const key of ["profile", ...Object.keys(choices), "q"]) if (byId(key).value !== state[key]) byId(key).value = state[key];
       byId("refs").checked = state.refs !== "no";
       byId("cols").checked = state.cols === "all";
@@ -560,11 +584,10 @@
   }
 
   function arrive() {
-    const before = route && keyOf({robot: route[0], fault: route[1], severity: route[2]});
+    const before = JSON.stringify(route);
     parse(location.hash.slice(1));
     render();
-    const after = route && keyOf({robot: route[0], fault: route[1], severity: route[2]});
-    if (before !== after) window.scrollTo(0, 0);
+    if (before !== JSON.stringify(route)) window.scrollTo(0, 0);
   }
 
   build();
@@ -572,8 +595,6 @@
   window.addEventListener("hashchange", arrive);
   let width = window.innerWidth;
   window.addEventListener("resize", () => {
-    if (width === window.innerWidth) return;  // a phone's address bar changes the height alone
-    width = window.innerWidth;
-    render();
+    if (width !== (width = window.innerWidth)) render();  // a phone's address bar changes the height alone
   });
 })();
