@@ -6,15 +6,20 @@ import inspect
 
 from mjx_cl.detectors import combine
 from mjx_cl.detectors import references
+from mjx_cl.detectors.adwin import adwin
 from mjx_cl.detectors.base import Alarm, Detector, scalar
 from mjx_cl.detectors.bfar import bfar
+from mjx_cl.detectors.bocpd import bocpd
 from mjx_cl.detectors.combine import all_of, any_of, cool_down, on, patience, standardised, whitened
+from mjx_cl.detectors.conformal import conformal
 from mjx_cl.detectors.cusum import cusum
+from mjx_cl.detectors.e_detector import e_detector
 from mjx_cl.detectors.ewma import ewma
 from mjx_cl.detectors.glr import glr
 from mjx_cl.detectors.page_hinkley import page_hinkley
 from mjx_cl.detectors.hotelling import hotelling
 from mjx_cl.detectors.knn import knn
+from mjx_cl.detectors.kswin import kswin
 from mjx_cl.detectors.max_variables import max_variables
 from mjx_cl.detectors.mewma import mewma
 from mjx_cl.detectors.rolling_sigma import rolling_sigma
@@ -46,6 +51,7 @@ CALIBRATED = {"window": 4000, "smooth": 400, "lag": 500, "threshold": 6.5, "pati
 
 DETECTORS = {"rolling_sigma": calibrated_rule, "rolling_sigma_plain": paper_rule}
 DETECTORS |= {"z_score": z_score, "ewma": ewma, "cusum": cusum, "page_hinkley": page_hinkley, "shiryaev_roberts": shiryaev_roberts, "glr": glr}
+DETECTORS |= {"adwin": adwin, "kswin": kswin, "bocpd": bocpd, "e_detector": e_detector, "conformal": conformal}
 # over several fields of the residual
 DETECTORS |= {"hotelling": hotelling, "mewma": mewma, "max_variables": max_variables, "surprise": surprise, "knn": knn, "bfar": bfar}
 # what every score is printed beside; the oracle, which must be told the onset, is in references.REFERENCES alone
