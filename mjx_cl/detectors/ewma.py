@@ -29,8 +29,8 @@ def ewma(rate: float = 0.1, threshold: float = 3.0, warmup: int = 1000) -> Detec
 
   Args:
     rate: weight of the newest sample, in (0, 1]; small ones find small shifts, 1 is the chart of single samples.
-    threshold: decision level [std of the average]. On independent Gaussian samples rate 0.1 and threshold 2.703 give ARL0 500 with the
-      asymptotic variance, 469 with the exact one, which is narrower at first and so fires more often just after a restart.
+    threshold: decision level [std of the average]. On independent Gaussian samples rate 0.1 and threshold 2.814 give ARL0 500 with the
+      asymptotic variance and 486 with the exact one, which is narrower at first and so fires more often just after a restart.
     warmup: samples that fit mean and std; nothing fires before they end; 0: x is standardised already [control steps].
   Returns:
     Detector whose update takes x, float32 (), and gives Alarm(fired: bool (), score: float32 (), nan during warm-up).

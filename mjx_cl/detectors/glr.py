@@ -34,7 +34,8 @@ def glr(threshold: float = 12.0, capacity: int = 32, warmup: int = 1000) -> Dete
   ahead: if the mean of z since s is positive and above the mean since the candidate before it. The others are dropped for good. Of n samples
   about ln(n) / 2 candidates are left on each side, ln(n) where the reference is off, and `capacity` fit. Where one more would come, it takes the
   place of the newest. The score is then never too large, and still exact over shifts of at most twice the slope between the two newest candidates
-  before, since all that are best for those are kept; a larger shift is seen through a window that begins somewhat early.
+  before (the smallest such bound since the start), since all that are best for those are kept; a larger shift is seen through a window that begins
+  somewhat early.
 
   Args:
     threshold: decision level [nats].

@@ -13,11 +13,13 @@ MODES = ("both", "up", "down")
 
 class PageHinkleyState(NamedTuple):
   """Attributes:
-    warm: reference. count: float32 (), samples since the start or the last alarm. mean: float32 (), of these.
+    warm: reference. count: float32 (), samples since the start or the last alarm. origin: float32 (), the first of them.
+    mean: float32 (), their mean less the origin, so that a distant level does not cost it digits.
     rise: float32 (), up - low. low: float32 (), smallest `up` so far. fall: float32 (), high - down. high: float32 (), largest `down`.
   """
   warm: Warm
   count: jax.Array
+  origin: jax.Array
   mean: jax.Array
   rise: jax.Array
   low: jax.Array
@@ -60,10 +62,12 @@ def page_hinkley(delta: float = 0.005, threshold: float = 50.0, alpha: float = 0
          min_instances=(min_instances, min_instances >= 1, "at least 1"), warmup=(warmup, warmup == 0 or warmup >= 2, "0 or at least 2"))
 
   def init():
-    return PageHinkleyState(cold(), *[jnp.float32(0)] * 6)
+    return PageHinkleyState(cold(), *[jnp.float32(0)] * 7)
 
   def update(state, x):
     warm, z, ready = standardise(state.warm, jnp.asarray(x, jnp.float32), warmup)
+    origin = jnp.where(state.count == 0, z, state.origin)
+    z = z - origin
     count = state.count + 1
     mean = state.mean + (z - state.mean) / count
     dev = z - mean
@@ -76,7 +80,7 @@ def page_hinkley(delta: float = 0.005, threshold: float = 50.0, alpha: float = 0
     known = ready & (count >= min_instances)
     fired = known & (score > threshold)
     keep = ready & ~fired
-    evidence = [jnp.where(keep, value, 0.0) for value in (count, mean, rise, low, fall, high)]
+    evidence = [jnp.where(keep, value, 0.0) for value in (count, origin, mean, rise, low, fall, high)]
     return PageHinkleyState(warm, *evidence), Alarm(fired, jnp.where(known, score, jnp.nan))
 
   return Detector(init, update)
