@@ -332,7 +332,7 @@ def test_friedman_equals_scipy_with_ties():
   base = random_row()
   scores = rng.integers(0, 6, (4, 9)) + np.arange(4)[:, None]
   for d in range(4):
-    rows += [base | {"detector": str(d), "robot": "walker", "fault": f"f{k}", "severity": 0.5, "cost_standard": float(scores[d, k])} for k in range(9)]
+    rows += [base | {"detector": str(d), "robot": "car", "fault": f"f{k}", "severity": 0.5, "cost_standard": float(scores[d, k])} for k in range(9)]
   got = metrics.overall(rows, reps=2)
   assert got.friedman_p == pytest.approx(scipy.stats.friedmanchisquare(*scores).pvalue) and 1e-6 < got.friedman_p < 0.5
   ranks = np.mean([scipy.stats.rankdata(-scores[:, k]) for k in range(9)], 0)

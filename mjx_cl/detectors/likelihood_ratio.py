@@ -76,3 +76,6 @@ def likelihood_ratio(parameters, threshold: float = 6.0, channels: tuple[str, ..
     return new, Alarm(fired, jnp.where(ready, score, jnp.nan))
 
   return Detector(init, update)
+
+
+likelihood_ratio.takes = "residual"  # and a fit first: it has no line in the table

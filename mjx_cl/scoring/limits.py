@@ -167,9 +167,9 @@ def information(nominal, faulty, order: int = 8, reps: int = REPS) -> dict:
     for a mean shift of d deviations: d^2 / 2 if steps are independent, (d^2 / 2) (1 - phi) / (1 + phi) in an AR(1)
 
   It can err both ways. It is KL(true after || fitted before) - KL(true after || fitted after): a healthy channel with heavier tails than a Gaussian
-  makes the first too large, a faulty one that the model does not describe the second. A fit on n steps
-  loses about parameters / 2n nats, which cancels only in part, so that it may come out below 0 where there is nothing to know. It knows neither the other channels nor dependence
-  beyond `order` steps, and takes all faulty steps as alike: a fault that acts at once and fades has more at first.
+  makes the first too large, a faulty one that the model does not describe the second. A fit on n steps loses about parameters / 2n nats, which
+  cancels only in part, so that it may come out below 0 where there is nothing to know. It knows neither the other channels nor dependence beyond
+  `order` steps, and takes all faulty steps as alike: a fault that acts at once and fades has more at first.
 
   Args:
     nominal, faulty: (T, S) or (T, S, C), stream s of both is seed s; faulty: steps after the onset alone. S >= 2.
