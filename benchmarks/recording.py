@@ -1,0 +1,73 @@
+"""Speed of recording residual streams: python benchmarks/recording.py [--json] [--streams 40] [--steps 512]
+
+40 healthy walkers (acting, physics, world model's predictions) in one batch, against a loop that calls the same jitted functions for one robot at a
+time; stream-steps per second without compile time. Both take turns, medians.
+"""
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import sys
+import time
+
+from mjx_cl import runtime
+
+runtime.setup()
+
+import jax  # noqa: E402
+
+from mjx_cl import agents, envs, faults  # noqa: E402
+from mjx_cl.monitor import Monitor  # noqa: E402
+from mjx_cl.record import stream_keys  # noqa: E402
+from mjx_cl.rollout import Rollout, nest, start  # noqa: E402
+
+
+def live(env, trained, streams: int, chunk: int):
+  """A call that lives one more chunk of `streams` robots side by side and looks at it."""
+  none = faults.none(env)
+  rollout, monitor = Rollout(env, trained.agent, none), Monitor(trained.agent, spec=env.spec)
+  watch = jax.jit(monitor.update)
+  params = jax.tree.map(lambda x: x[None], trained.train.params)
+  state = nest(lambda k: start(env, trained.agent, none, k), 0, 0)(stream_keys([0], streams)[None])
+  held = {"state": state, "history": monitor.init(1, streams), "n": 0}
+
+  def call():
+    held["state"], rows = rollout.chunk(params, held["state"], chunk)
+    key = jax.random.split(jax.random.fold_in(jax.random.key(0), held["n"]), 1)
+    held["history"], seen = watch(params, held["history"], rows, key)
+    held["n"] += 1
+    return jax.block_until_ready(seen)
+  return call
+
+
+def main() -> None:
+  parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+  parser.add_argument("--json", action="store_true", help="one JSON value on standard output")
+  parser.add_argument("--streams", type=int, default=40)
+  parser.add_argument("--steps", type=int, default=512)
+  args = parser.parse_args()
+  chunk = 64
+  env = envs.make("walker")
+  trained = agents.load(None, "walker", len(env.spec.obs), len(env.spec.act))
+  batch, single = live(env, trained, args.streams, chunk), live(env, trained, 1, chunk)
+  times = {"batch": [], "single": []}
+  for k in range(1 + args.steps // chunk):  # the first round compiles
+    for name, call in (("batch", batch), ("single", single)):
+      begin = time.perf_counter()
+      call()
+      if k:
+        times[name].append(time.perf_counter() - begin)
+  rate = {"batch": args.streams * chunk / statistics.median(times["batch"]), "single": chunk / statistics.median(times["single"])}
+  ratio = rate["batch"] / rate["single"]
+  rows = [{"name": f"recording, {args.streams} streams in one program", "value": round(rate["batch"]), "unit": "stream-steps/s", "goal": None, "holds": None},
+          {"name": "recording, one robot at a time", "value": round(rate["single"]), "unit": "stream-steps/s", "goal": None, "holds": None},
+          {"name": "ratio", "value": round(ratio, 2), "unit": "ratio", "goal": ">= 10", "holds": ratio >= 10}]
+  for r in rows:
+    print(f"{r['name']:42s} {r['value']:>10,} {r['unit']}", file=sys.stderr)
+  if args.json:
+    print(json.dumps(rows))
+
+
+if __name__ == "__main__":
+  main()
