@@ -252,8 +252,7 @@
 
   function ticks(low, high, count) {
     const rough = (high - low) / count || 1, power = 10 ** Math.floor(Math.log10(rough));
-    const step = [1, 2, 5, 10].map(k => k * power).find(s => s >= rough * 0.999);
-    const out = [];
+    const step = [1, 2, 5, 10].map(k => k * power).find(s => s >= rough * 0.999), out = [];
     for (let k = Math.ceil(low / step - 1e-9); k * step <= high + step * 1e-9; k++) out.push(Number((k * step).toPrecision(12)));
     return out;
   }
@@ -368,7 +367,7 @@
   }
 
   function dots(list, {key, kind, low, high, title, band}, w) {
-    const row = 21, left = Math.min(150, 0.36 * w), right = w - 12, top = 36, bottom = top + row * list.length, h = bottom + 22;
+    const row = 21, left = Math.min(150, 0.36 * w), right = w - 12, top = 42, bottom = top + row * list.length, h = bottom + 22;
     const x = scale(low, high, left + 8, right), letters = Math.floor((left - 4) / 6.6);
     const svg = draw("svg", {width: w, height: h, role: "group", "aria-label": title}, label(w < 500 ? 0 : left, 14, title, "title"));
     if (band) {
@@ -376,7 +375,7 @@
       svg.append(tip(draw("rect", {x: x(band.from), y: top - 4, width: Math.max(1, end - x(band.from)), height: bottom - top + 4, class: "band"}),
         [band.text, "ranks inside it cannot be told from the best"]));
       svg.append(draw("path", {d: `M${x(band.from)} ${top - 4}v-5H${end}v5`, class: "bracket"}));
-      svg.append(label(x(band.from) + 2, top - 12, band.text, "tick"));
+      svg.append(label(x(band.from) + 2, top - 13, band.text, "tick"));
     }
     gridX(svg, ticks(low, high, Math.max(3, Math.floor((right - left) / 60))), x, top, bottom);
     list.forEach((entry, i) => {
@@ -525,7 +524,7 @@
         el("div", {id: "legend", class: "legend", role: "group", "aria-label": "detectors shown"}), el("div", {id: "curves", class: "charts"}),
         el("h2", null, "Scores and ranks"),
         el("p", {class: "sub"}, "Bars are 95 % intervals. Ranks inside the shaded band cannot be told from the best one; arrows stand for values "
-          + "off the scale."),
+          + "off the scale; names that are switched off are hollow."),
         el("div", {id: "intervals", class: "charts"})),
       el("section", null, el("h2", null, "Every robot, fault and severity"),
         el("div", {class: "bar"}, el("span", {id: "count", role: "status"}), check("cols", "all", "", "All columns")),
