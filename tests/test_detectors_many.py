@@ -406,7 +406,8 @@ def test_bfar_has_the_stated_probability_of_a_false_alarm(phi, block, warmup):
   fired = jax.jit(lambda r: jax.lax.scan(jax.vmap(detector.update), start, rows((steps, streams), reward=r))[1].fired)(reward)
   assert not fired[:warmup].any()
   share = float(fired.any(0).mean())
-  # standard error sqrt(0.1 * 0.9 / 1500) = 0.8 %, 1.5 % of the 400 repetitions, which all streams share; smoothing and serial dependence bias by 1 or 2 %
+  # standard error sqrt(0.1 * 0.9 / 1500) = 0.8 %, and 1.5 % of the 400 repetitions, which all streams share; smoothing and serial dependence bias by
+  # 1 or 2 %
   assert abs(share - alpha) < 0.04, share
 
 

@@ -117,8 +117,8 @@ def oracle(onset=0) -> Detector:
 
     t = rows before this one, known or not;  score = 1 if t >= onset, else 0;  fired = (t == onset)
 
-  Printed beside every score because it bounds what detection is worth: the best return that an agent could reach by being told, from which the loss of
-  a real detector is measured. No threshold. A detector does not see the onset, so it is not in the table: whoever scores it gives it the truth. It
+  Printed beside every score because it bounds what detection is worth: the best return that an agent could reach by being told, from which the loss
+  of a real detector is measured. No threshold. A detector does not see the onset, so it is not in the table: whoever scores it gives it the truth. It
   counts every row, since an onset is a time, and fires at a row of which nothing is known; the contract on unknown rows does not hold for it.
 
   Args:
