@@ -58,7 +58,7 @@ def bfar(block: int = 50, bins: int = 1, horizons: tuple[int, ...] = (1, 5), thr
   since no draw from 20 blocks alone goes below the smallest of them, so that a level from such draws is crossed twice as often as stated; twice
   Silverman's width, since it keeps the statement for Gaussian blocks where once does not (measured, 20 and 100 blocks). So threshold = 1 means:
   an alarm within `blocks` blocks has probability `alpha`, if blocks are independent and the smoothed blocks are like the true ones; other
-  thresholds are calibrated. Measured with the defaults, 2,000 streams: 5 % for independent Gaussian rewards, 8 % for an AR(1) of 0.9, 23 % for rewards
+  thresholds are calibrated. Measured with the defaults, 2,000 runs: 5 % for independent Gaussian rewards, 8 % for an AR(1) of 0.9, 23 % for rewards
   with a log-normal tail downwards, which 20 blocks do not show. The draws are fixed numbers (NumPy's
   default_rng(0)), the same for every stream.
 
