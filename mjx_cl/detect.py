@@ -195,8 +195,8 @@ def calibrate(program: Program, nominal: np.ndarray, begin: int, arl0: float) ->
   Args:
     nominal: (T, C), standardised.
   Returns:
-    (threshold, True), or where fewer than EXPECTED alarms are wanted (highest nominal score + MARGIN x its distance from the median, False); (None, False)
-    where no score is known before the log ends.
+    (threshold, True), or where fewer than EXPECTED alarms are wanted (highest nominal score + MARGIN x its distance from the median, False);
+    (None, False) where no score is known before the log ends.
   """
   quiet = program(np.full(LEVELS, 1e30), program.start, nominal)[3][begin:]
   scores = quiet[np.isfinite(quiet)]
@@ -229,8 +229,8 @@ def _counted(nominal: np.ndarray, begin: int) -> int:
 
 class Detection(NamedTuple):
   """Attributes:
-    summary: what detect.json holds. xs: float64 (T, C) the log, past: float64 (N, C) the nominal log, as read. fired: detector -> bool (T, C), scores:
-    detector -> (T, C), before: detector -> nominal alarms of any column, bool (N,). seconds: float64 (T,) since the first sample, or None.
+    summary: what detect.json holds. xs: float64 (T, C) the log, past: float64 (N, C) the nominal log, as read. fired: detector -> bool (T, C),
+    scores: detector -> (T, C), before: detector -> nominal alarms of any column, bool (N,). seconds: float64 (T,) since the first sample, or None.
   """
   summary: dict
   xs: np.ndarray
@@ -282,8 +282,9 @@ def detect(path, nominal_path, columns: tuple[str, ...] = (), detectors: tuple[s
     threshold, calibrated, before[name], fired[name], scores[name] = run
     rows.append(_row(name, threshold, calibrated, before[name][warmup:], fired[name], found, seconds))
   counted = _counted(past, warmup)
-  summary = {"log": str(path), "nominal": str(nominal_path), "columns": found, "ignored": sorted({*log.ignored, *nominal.ignored}), "samples": len(xs),
-             "nominal_samples": len(past), "missing": int(np.isnan(xs).sum()), "nominal_missing": int(np.isnan(past).sum()), "warmup": warmup,
+  summary = {"log": str(path), "nominal": str(nominal_path), "columns": found, "ignored": sorted({*log.ignored, *nominal.ignored}),
+             "samples": len(xs), "nominal_samples": len(past), "missing": int(np.isnan(xs).sum()),
+             "nominal_missing": int(np.isnan(past).sum()), "warmup": warmup,
              "counted": counted, "arl0": arl0, "rate_hz": rate, "logarithm": logarithm, "detectors": rows, "notes": _notes(rows, counted, arl0)}
   return Detection(summary, xs, past, fired, scores, before, seconds)
 
@@ -302,7 +303,8 @@ def _registered(name: str, xs: np.ndarray, past: np.ndarray, warmup: int, arl0: 
   try:
     threshold, calibrated = calibrate(program, past, warmup, arl0)
   except jax.errors.ConcretizationTypeError:
-    raise UserError(f"detector {name!r} cannot be calibrated here: its factory asks for a threshold that is a number; use base.above to check it") from None
+    raise UserError(f"detector {name!r} cannot be calibrated here: its factory asks for a threshold that is a number; "
+                    "use base.above to check it") from None
   if threshold is None:
     return None, False, np.zeros(len(past), bool), np.zeros(xs.shape, bool), np.full(xs.shape, np.nan)
   levels = np.full(LEVELS, threshold)
@@ -317,7 +319,8 @@ def _host(one: host.HostDetector, xs: np.ndarray, past: np.ndarray):
   return None, None, fired[:len(past)].any(1), fired[len(past):], scores[len(past):]
 
 
-def _row(name: str, threshold: float | None, calibrated: bool | None, before: np.ndarray, fired: np.ndarray, columns: list[str], seconds) -> dict[str, Any]:
+def _row(name: str, threshold: float | None, calibrated: bool | None, before: np.ndarray, fired: np.ndarray, columns: list[str],
+         seconds: np.ndarray | None) -> dict[str, Any]:
   at, count = np.flatnonzero(fired.any(1)), int(before.sum())
   first = int(at[0]) if len(at) else None
   return {"detector": name, "threshold": threshold, "calibrated": calibrated, "nominal_alarms": count, "few": count < FEW, "first_alarm": first,
@@ -328,9 +331,12 @@ def _row(name: str, threshold: float | None, calibrated: bool | None, before: np
 def _notes(rows: list[dict], counted: int, arl0: float) -> list[str]:
   """What a reader must know, one line each."""
   notes = []
-  if any(r["calibrated"] is False and r["threshold"] is not None for r in rows):
-    notes.append(f"the nominal log is too short for an ARL0 of {arl0:g}: {counted:,} samples after the warm-up, {EXPECTED * arl0:,.0f} are needed; thresholds "
-                 f"are the highest nominal score and a margin, and the ARL0 is unknown (no alarm in {counted:,} samples: above {counted / 3:,.0f} with 95 % confidence)")
+  unsure = [r for r in rows if r["calibrated"] is False and r["threshold"] is not None]
+  if unsure:
+    silent = not any(r["nominal_alarms"] for r in unsure)  # an infinite score fires whatever the threshold
+    notes.append(f"the nominal log is too short for an ARL0 of {arl0:g}: {counted:,} samples after the warm-up, {EXPECTED * arl0:,.0f} are needed; "
+                 "thresholds are the highest nominal score and a margin, and the ARL0 is unknown"
+                 + (f" (no alarm in {counted:,} samples: above {counted / 3:,.0f} with 95 % confidence)" if silent else ""))
   blind = [r["detector"] for r in rows if r["calibrated"] is False and r["threshold"] is None]
   if blind:
     notes.append(f"the nominal log ends before these detectors know a score, so they watched nothing: {', '.join(blind)}")
@@ -388,7 +394,8 @@ def figure(result: Detection, file, panels: int = 8) -> None:
   hits = sum(fired.sum(0) for fired in result.fired.values())
   shown = sorted(sorted(range(len(names)), key=lambda c: -hits[c])[:panels])
   height = [1.5] * len(shown) + [0.35 + 0.22 * len(result.fired)]
-  fig, axes = plt.subplots(len(height), 1, figsize=(10, sum(height) + 1.0), sharex=True, constrained_layout=True, gridspec_kw={"height_ratios": height})
+  fig, axes = plt.subplots(len(height), 1, figsize=(10, sum(height) + 1.0), sharex=True, constrained_layout=True,
+                           gridspec_kw={"height_ratios": height})
   for axis, c in zip(axes, shown):
     axis.plot(*_envelope(result.past[:, c], -len(result.past)), color="0.6", lw=0.7)
     axis.plot(*_envelope(result.xs[:, c], 0), color="#1f5fa8", lw=0.7)

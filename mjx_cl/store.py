@@ -100,7 +100,8 @@ def views(folders: tuple[str, ...] = (), results: str = "results") -> dict[str, 
       name = "_".join(re.sub(r"\W+", "_", part) for part in (*first, *file.relative_to(at).with_suffix("").parts)).lower()
       name = "_" + name if name[:1].isdigit() else name  # no SQL word begins with a digit
       if name in found:
-        raise UserError(f"{found[name]} and {file} would both be the view {name}; give one of their folders a name by --in NAME=DIR, or rename a file")
+        raise UserError(f"{found[name]} and {file} would both be the view {name}; give one of their folders a name by --in NAME=DIR, "
+                        "or rename a file")
       found[name] = file
   if not found:
     raise UserError(f"no .parquet file in {' or '.join((results, *folders))}; give a folder, or --in DIR")
@@ -157,7 +158,8 @@ def _none(folder):
 
 def _describe(db, name: str) -> tuple[str, int, str]:
   quoted = '"' + name.replace('"', '""') + '"'
-  return name, db.execute(f"select count(*) from {quoted}").fetchone()[0], ", ".join(c[0] for c in db.execute(f"select * from {quoted} limit 0").description)
+  rows = db.execute(f"select count(*) from {quoted}").fetchone()[0]
+  return name, rows, ", ".join(c[0] for c in db.execute(f"select * from {quoted} limit 0").description)
 
 
 def provenance() -> dict:

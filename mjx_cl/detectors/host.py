@@ -170,8 +170,9 @@ def check_causal(factory: Callable[[], Any], xs: np.ndarray, cuts: tuple[int, ..
       part = run_host(factory, xs[:n, s:s + 1], host_name)
       differ = (part[0][:, 0] != whole[0][:n, s]) | ~((part[1][:, 0] == whole[1][:n, s]) | (np.isnan(part[1][:, 0]) & np.isnan(whole[1][:n, s])))
       if differ.any():
-        raise UserError(f"host detector {type(_fresh(factory, host_name or '')).__name__} is not causal: at step {int(differ.argmax())} of stream {s} it "
-                        f"answers otherwise when the stream ends after {n} samples than in the whole run (shared state, chance without a seed, or a look ahead)")
+        name = type(_fresh(factory, host_name or "")).__name__
+        raise UserError(f"host detector {name} is not causal: at step {int(differ.argmax())} of stream {s} it answers otherwise when the stream ends "
+                        f"after {n} samples than in the whole run (shared state, chance without a seed, or a look ahead)")
 
 
 def samples(host: HostDetector, residual) -> np.ndarray:
