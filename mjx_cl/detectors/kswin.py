@@ -51,7 +51,7 @@ def distance(a: jax.Array, b: jax.Array) -> jax.Array:
 
 
 @scalar
-def kswin(threshold: float = 6.5, window: int = 300, stat_size: int = 40, every: int = 10, keep: bool = False, seed: int = 0) -> Detector:
+def kswin(threshold: float = 7.0, window: int = 300, stat_size: int = 40, every: int = 10, keep: bool = False, seed: int = 0) -> Detector:
   """Kolmogorov-Smirnov windowing: is the newest part of a sliding window distributed as the rest of it?
 
     a = newest `stat_size` samples,  b = as many drawn without replacement from the `window` - `stat_size` older ones
@@ -59,14 +59,15 @@ def kswin(threshold: float = 6.5, window: int = 300, stat_size: int = 40, every:
     fired = score > threshold, at a test; then the window is filled anew, or from a on if `keep`
 
   Between tests the score is that of the last one. The draws come from a key in the state (from `seed`), so equal streams give equal alarms;
-  streams started alike share their draws. Any change of the distribution counts, of shape and spread too, and no unit is needed.
+  streams started alike share their draws. Any change of the distribution counts, of spread and shape too though these move F less, and no unit is needed.
   The p-value is that of one test on independent samples; tests overlap and residuals swing with the gait, so calibrate the threshold.
   Differences from river.drift.KSWIN: p < alpha where it has p <= alpha; it also wants D > 0.1, which p decides alone below some 300 samples; its
   draws start again from its seed after an alarm; it tests at each sample (every = 1, window = 100, stat_size = 30, threshold = 5.2983). The robot
   defaults span a gait cycle or two and test every tenth sample, as neighbouring tests share nearly all samples.
 
   Args:
-    threshold: -ln(alpha), compared with the score. May be traced.
+    threshold: -ln(alpha), compared with the score; 7 had one alarm in 20,000 independent samples, 6 to 6.5 one in 8,400 (p is discrete). May be
+      traced.
     window: samples of the window [control steps].
     stat_size: samples on each side of the test [control steps]; with ties (a constant stream) the test errs on the quiet side.
     every: samples from test to test [control steps]; an alarm comes up to every - 1 samples late.
