@@ -59,7 +59,7 @@ def kswin(threshold: float = 7.0, window: int = 300, stat_size: int = 40, every:
     fired = score > threshold, at a test; then the window is filled anew, or from a on if `keep`
 
   Between tests the score is that of the last one. The draws come from a key in the state (from `seed`), so equal streams give equal alarms;
-  streams started alike share their draws. Any change of the distribution counts, of spread and shape too though these move F less, and no unit is needed.
+  streams started alike share their draws. Any change of the distribution counts, though spread and shape move F less than a shift; no unit is needed.
   The p-value is that of one test on independent samples; tests overlap and residuals swing with the gait, so calibrate the threshold.
   Differences from river.drift.KSWIN: p < alpha where it has p <= alpha; it also wants D > 0.1, which p decides alone below some 300 samples; its
   draws start again from its seed after an alarm; it tests at each sample (every = 1, window = 100, stat_size = 30, threshold = 5.2983). The robot
