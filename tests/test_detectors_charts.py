@@ -72,7 +72,8 @@ def slow_page_hinkley(zs, delta, alpha, mode, min_instances):
 
 
 CHARTS = [
-  (ewma, slow_ewma, dict(rate=0.1, threshold=2.7)), (ewma, slow_ewma, dict(rate=0.02, threshold=2.0)), (ewma, slow_ewma, dict(rate=1.0, threshold=2.5)),
+  (ewma, slow_ewma, dict(rate=0.1, threshold=2.7)), (ewma, slow_ewma, dict(rate=0.02, threshold=2.0)),
+  (ewma, slow_ewma, dict(rate=1.0, threshold=2.5)),
   (cusum, slow_cusum, dict(slack=0.5, threshold=5.0, two_sided=True)), (cusum, slow_cusum, dict(slack=0.25, threshold=8.0, two_sided=False)),
   (cusum, slow_cusum, dict(slack=0.0, threshold=12.0, two_sided=True)),
   (shiryaev_roberts, slow_shiryaev_roberts, dict(shift=1.0, threshold=5.0, two_sided=True)),
@@ -167,7 +168,8 @@ def run_length(detector, shift=0.0, streams=STREAMS, steps=STEPS, seed=0):
   return mean, mean / np.sqrt(count)
 
 
-@pytest.mark.parametrize("threshold, shift, want, digit", [(5.0, 0.0, 465, 0.5), (5.0, 1.0, 10.4, 0.05), (4.0, 0.0, 168, 0.5), (4.0, 1.0, 8.38, 0.005)])
+@pytest.mark.parametrize("threshold, shift, want, digit", [(5.0, 0.0, 465, 0.5), (5.0, 1.0, 10.4, 0.05),
+                                                           (4.0, 0.0, 168, 0.5), (4.0, 1.0, 8.38, 0.005)])
 def test_cusum_has_the_published_run_lengths(threshold, shift, want, digit):
   """Montgomery, Introduction to Statistical Quality Control, table of the two-sided chart with slack 0.5. `digit`: half of its last one."""
   mean, error = run_length(cusum(0.5, threshold, warmup=0), shift)
@@ -289,7 +291,8 @@ def test_bad_settings_are_refused(name, settings):
     detectors.make(name, **settings)
 
 
-@pytest.mark.parametrize("factory, more", [(z_score, {}), (ewma, {}), (cusum, {}), (page_hinkley, dict(min_instances=1)), (shiryaev_roberts, {}), (glr, {})])
+@pytest.mark.parametrize("factory, more", [(z_score, {}), (ewma, {}), (cusum, {}), (page_hinkley, dict(min_instances=1)),
+                                           (shiryaev_roberts, {}), (glr, {})])
 def test_one_program_serves_all_thresholds(factory, more):
   xs, thresholds = jnp.asarray(stream()), (1.0, 3.0, 60.0)
 
