@@ -127,15 +127,8 @@ def choose_columns(log: Log, nominal: Log, names: tuple[str, ...], path, nominal
 # ---- detectors -----------------------------------------------------------------------------------------------------------------------
 
 def _rolling(threshold, warmup: int) -> Detector:
-  """`rolling_sigma` as the paper has it, its window as long as the warm-up; the threshold may be traced."""
-  inner = rolling_sigma(window=warmup, warmup=warmup)  # only its score is used: it wants a threshold that is a number
-
-  def update(state, x):
-    state, beyond = state
-    state, alarm = inner.update(state, x)
-    now = alarm.score > threshold
-    return (state, now), Alarm(now & ~beyond, alarm.score)  # one alarm per excursion
-  return Detector(lambda: (inner.init(), jnp.bool_(False)), update)
+  """`rolling_sigma` as the paper has it, its window as long as the warm-up."""
+  return rolling_sigma(threshold=threshold, window=warmup, warmup=warmup)
 
 
 def table() -> dict[str, Callable[..., Detector]]:

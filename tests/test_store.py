@@ -45,10 +45,9 @@ def test_json_refuses_what_it_cannot_say(tmp_path, value):
 
 # ---- a full disk ---------------------------------------------------------------------------------------------------------------------
 
-def half_written(path, *_, **__):
+def half_written(file):
   """A write that fills the disk: some bytes arrive, then the error."""
-  with open(path, "wb") as f:
-    f.write(b"half")
+  file.write(b"half")
   full()
 
 
@@ -61,10 +60,9 @@ def test_a_full_disk_leaves_the_earlier_file(tmp_path, monkeypatch, kind, where)
   before = path.read_bytes()
   if where == "rename":
     monkeypatch.setattr(os, "replace", full)
-  elif kind == "json":
-    monkeypatch.setattr(pathlib.Path, "write_text", half_written)
   else:
-    monkeypatch.setattr(pyarrow.parquet, "write_table", lambda table, path, **_: half_written(path))
+    atomic = store.atomic
+    monkeypatch.setattr(store, "atomic", lambda path, write: atomic(path, half_written))
   with pytest.raises(FileError) as error:
     write(2)
   text = one_line(error)

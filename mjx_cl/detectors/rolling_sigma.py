@@ -6,7 +6,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from mjx_cl.detectors.base import Alarm, Detector
+from mjx_cl.detectors.base import Alarm, Detector, above
 from mjx_cl.errors import UserError
 
 
@@ -45,7 +45,7 @@ def rolling_sigma(window: int = 1000, threshold: float = 3.0, patience: int = 1,
   Blind to: a change slower than window + lag, which the reference absorbs; with `patience`, a change that comes and goes faster.
   Reference: the paper, section on change detection.   Example: _, out = jax.lax.scan(det.update, det.init(), xs)
   """
-  if not (window >= 2 and patience >= 1 and threshold > 0 and min(warmup, window) >= 2 and smooth >= 1 and lag >= 0):
+  if not (window >= 2 and patience >= 1 and above(threshold, 0) and min(warmup, window) >= 2 and smooth >= 1 and lag >= 0):
     raise UserError("rolling_sigma needs window >= 2, patience >= 1, threshold > 0, warmup >= 2, smooth >= 1, lag >= 0; got "
                     f"{window}, {patience}, {threshold}, {warmup}, {smooth}, {lag}")
   warmup, size = min(warmup, window), window + lag
