@@ -1,0 +1,126 @@
+"""Recording a suite with real robots and a tiny agent, and the commands on what it writes: record, leaderboard."""
+import json
+
+import numpy as np
+import pytest
+from test_cli import mjx, refused  # noqa: F401  fixtures
+from test_leaderboard import submission, trailing
+from test_run import saved  # noqa: F401  a fixture
+
+from mjx_cl import leaderboard, store, streams
+
+SUITE = """
+name = "mini"
+arl0 = 100
+count_from = 64
+onset = [100, 120]
+horizon_s = 20.0
+seeds = {score = [0, 1], tune = [100, 101]}
+nominal = {steps = 256, score = 1, tune = 1}
+latents = {nominal = 1, after_s = 1.0}
+[robots.walker]
+score.gear = [0.5]
+score."noise:all" = [1.0]
+tune.push = [1.0]
+"""
+
+
+@pytest.fixture(scope="module")
+def recorded(saved, tmp_path_factory):
+  """(folder of a set, its suite file): two walkers a split, recorded by the command."""
+  from mjx_cl import cli
+  folder = tmp_path_factory.mktemp("record")
+  (folder / "mini.toml").write_text(SUITE)
+  assert cli.main(["record", str(folder / "mini.toml"), "--out", str(folder / "set"), "--agent", str(saved), "--physics", "native"]) == 0
+  return folder / "set", folder / "mini.toml"
+
+
+def test_a_set_of_real_robots(recorded):
+  held = streams.StreamSet(recorded[0])
+  assert held.robots == ["walker"] and held.faults("walker") == [("gear", 0.5), ("noise", 1.0)] and held.faults("walker", "tune") == [("push", 1.0)]
+  got = held.get("walker", held.find("walker", "fault", "score"))
+  healthy = held.get("walker", held.find("walker", "past", "score"))
+  assert got.fault == ["gear"] * 2 + ["noise"] * 2 and got.target[2] == "all" and set(got.seed) == {0, 1} and ((100 <= got.onset) & (got.onset < 120)).all()
+  for k, onset in enumerate(got.onset):
+    np.testing.assert_array_equal(got.residual.opr[:onset, k], healthy.residual.opr[:onset, k % 2])  # one past
+    x, y = got.residual.opr[onset + 20:onset + 400, k], healthy.residual.opr[onset + 20:onset + 400, k % 2]
+    assert (x != y).mean() > 0.9  # and another life afterwards
+  noisy = np.nanmean(got.residual.groups[130:, 2:], (0, 1)) / np.nanmean(healthy.residual.groups[130:], (0, 1))
+  assert (noisy > 1.05).sum() >= 4  # noise of one deviation on every channel shows in the groups, even of an untrained agent
+  tuned = held.get("walker", held.find("walker", "fault", "tune", "gear"))
+  assert np.isfinite(tuned.residual.opr[150:]).any() and np.isnan(tuned.residual.reward[tuned.onset[0]:]).all()  # for oracles: OPR and RPR alone
+  assert np.isfinite(got.residual.latent[got.onset[0] + 39, 0]).all() and np.isnan(got.residual.latent[got.onset[0] + 41, 0]).all()
+
+
+def test_a_recording_goes_on_where_it_was_cut_off(recorded, saved, tmp_path):
+  """Kept parts are taken as they are, a broken one is recorded again; the set has the same bytes."""
+  suite = streams.suite(str(recorded[1]))
+  lived = []
+  with pytest.raises(KeyboardInterrupt):
+    def stop(part, done, steps, lanes):
+      lived.append(part)
+      if part == "walker tune nominal":
+        raise KeyboardInterrupt
+    streams.record(suite, tmp_path, physics="native", agent=str(saved), progress=stop)
+  assert not list(tmp_path.glob("*.parquet")) and len(list((tmp_path / "work").glob("*.npz"))) == 2
+  part = tmp_path / "work" / "walker-score-nominal.npz"
+  part.write_bytes(part.read_bytes()[:1000])
+  lived.clear()
+  streams.record(suite, tmp_path, physics="native", agent=str(saved), progress=lambda part, *_: lived.append(part))
+  assert list(dict.fromkeys(lived)) == ["walker score nominal", "walker tune nominal", "walker tune fault"]
+  for name in ("walker.parquet", "walker_latents.parquet", "streams.parquet"):
+    assert (tmp_path / name).read_bytes() == (recorded[0] / name).read_bytes()
+
+
+def test_record_refuses(refused, recorded, tmp_path):
+  assert "holds a recorded set" in refused(2, "record", recorded[1], "--out", recorded[0])
+  assert "unknown suite 'x'; choose from: leaderboard" in refused(2, "record", "x", "--out", tmp_path / "a")
+  assert "has no robot 'car'; choose from: walker" in refused(2, "record", recorded[1], "--robot", "car", "--out", tmp_path / "b")
+  (tmp_path / "c").mkdir()
+  (tmp_path / "c" / "mine.txt").write_text("x")
+  assert "is no folder of a recording" in refused(2, "record", recorded[1], "--out", tmp_path / "c")
+  assert (tmp_path / "c" / "mine.txt").read_text() == "x"
+
+
+def test_the_leaderboard_command(mjx, recorded, tmp_path):
+  (tmp_path / "mine.py").write_text("class Mine:\n  def __init__(self, level=1.0):\n    self.level = level\n"
+                                    "  def update(self, x):\n    return x > self.level\n")
+  code, out, err = mjx("leaderboard", recorded[0], "--out", tmp_path / "board", "--detector", "never", "--add", f"{tmp_path / 'mine.py'}:Mine",
+                       "--threshold", "level", "--json")
+  assert code == 0, err
+  rows = json.loads(out)
+  assert {r["detector"] for r in rows} == {"never", "Mine", "true onset (oracle)", "likelihood_ratio (oracle)"} and len(rows) == 4 * 2
+  assert all(r["arl0_alarms"] <= 2 * 192 / 100 for r in rows if r["detector"] == "Mine")
+  assert {p.name for p in (tmp_path / "board").iterdir()} == {"leaderboard.parquet", "leaderboard_overall.parquet", "leaderboard.html", "leaderboard.json"}
+  code, out, _ = mjx("query", tmp_path / "board", "select count(*) as n from leaderboard where robot = 'walker'", "--json")
+  assert code == 0 and json.loads(out) == [{"n": 8}]
+
+
+def test_a_file_of_scores_through_the_command(mjx, refused, recorded, tmp_path):
+  held = streams.StreamSet(recorded[0])
+  store.write_table(tmp_path / "s.parquet", submission(held, trailing))
+  code, out, err = mjx("leaderboard", recorded[0], "--out", tmp_path / "board", "--detector", "none", "--submit", tmp_path / "s.parquet", "--name", "mine", "--json")
+  assert code == 0 and {r["detector"] for r in json.loads(out)} >= {"mine"}, err
+  (tmp_path / "bad.parquet").write_bytes(b"PAR1 not")
+  assert "cannot read" in refused(1, "leaderboard", recorded[0], "--submit", tmp_path / "bad.parquet")
+  code, out, _ = mjx("leaderboard", recorded[0], "--export", tmp_path / "out", "--json")
+  assert code == 0 and json.loads(out) == [str(tmp_path / "out" / "walker.parquet")]
+
+
+def test_the_leaderboard_refuses(refused, recorded, tmp_path):
+  assert "unknown detector 'x'; choose from:" in refused(2, "leaderboard", recorded[0], "--detector", "x")
+  assert "has no robot 'car'; choose from: walker" in refused(2, "leaderboard", recorded[0], "--detector", "never", "--robot", "car")
+  assert "holds no recorded streams" in refused(1, "leaderboard", tmp_path)
+  assert "the board has a detector 'never' already" in refused(2, "leaderboard", recorded[0], "--detector", "never", "--add", "river.drift:PageHinkley", "--name", "never")
+
+
+def test_pure_detectors_do_not_look_ahead(recorded):
+  """Every entry of the board on a stream and on the same stream cut off: equal up to there."""
+  held = streams.StreamSet(recorded[0])
+  import jax
+  whole = held.get("walker", held.find("walker", "nominal", "score")).residual
+  cut = jax.tree.map(lambda x: x[:200], whole)
+  for name in ("cusum", "rolling_sigma_plain"):
+    run = leaderboard.program(leaderboard.entry(name, {}).build)
+    a, b = (run(np.full(1, 3.0, np.float32), x) for x in (whole, cut))
+    np.testing.assert_array_equal(np.asarray(a[0])[:, :200], b[0])
