@@ -4,8 +4,8 @@ A set is a folder: `streams.parquet` (one row per stream, `META`), ROBOT.parquet
 ROBOT_latents.parquet (stream, step, z0..z15, where they were kept) and config.json. A fault stream shares its past with the healthy robot of the
 same seed: rows before its onset are those of the stream `prefix`, and stand there alone. `StreamSet` joins them; so does, in pandas,
   own = rows[rows.stream == s]; past = rows[(rows.stream == prefix) & (rows.step < onset)]; pandas.concat([past, own])
-Values are rounded to powers of two near an eighth of the deviation on healthy robots (a quarter for groups, half for latents), of the logarithm where
-they cannot be negative: a column's variance grows by 0.1 % (0.5 %, 2 %), the files shrink to a third. config.json holds the steps.
+Values are rounded to powers of two near a quarter of the deviation on healthy robots (half for groups and latents), of the logarithm where they cannot
+be negative: a column's variance grows by 0.5 % (2 %), the files shrink to a third. config.json holds the steps.
 """
 from __future__ import annotations
 
@@ -480,7 +480,7 @@ def _grain(healthy: dict) -> dict[str, float]:
 
 
 FLOOR = 1e-6  # residuals below are taken as this before the logarithm
-FINENESS = {"opr": 8, "rpr": 8, "reward": 8, "surprise": 8, "group": 4, "latent": 2}
+FINENESS = {"opr": 4, "rpr": 4, "reward": 4, "surprise": 4, "group": 2, "latent": 2}
 
 
 def absolute(name: str) -> bool:
