@@ -196,6 +196,8 @@ class RunConfig:
   Attributes:
     env, fault, target, severity, onset, duration: which robot meets what, when [control steps]. target None: drawn from the stream's seed.
       fault may name a preset (robot/name), which brings its own faults, targets and severities. severity None: 0.5, or the preset's.
+      Where a preset turns the robot into another one, that happens at the end of the first episode that ends at the onset or later; an onset
+      after the last step then means never.
     schedule, period, share: how the severity moves once the fault is there, see faults.schedule [control steps, 1].
     steps: control steps in all, counted from 0.
     seeds, first_seed: streams per arm; their seeds are first_seed, first_seed + 1, ...
@@ -229,14 +231,17 @@ class RunConfig:
   adapt: AdaptConfig = AdaptConfig()
 
   def __post_init__(self):
+    last = self.steps
     if "/" in self.fault:
       preset = fault_presets.find(self.fault, self.env)
-      if preset.becomes:
-        raise UserError(f"preset {self.fault!r} turns the robot into {preset.becomes!r}, which `run` does not do; choose a preset that stays with its robot")
       if self.severity is not None or self.target is not None:
         raise UserError(f"preset {self.fault!r} brings its own severity and target; leave --severity and --target out")
       if (self.schedule, self.period, self.share) != ("abrupt", 1000, 0.5):
         raise UserError(f"preset {self.fault!r} brings its own schedule; leave --schedule, --period and --share out")
+      if preset.becomes:
+        if self.duration is not None:
+          raise UserError(f"preset {self.fault!r} turns the robot into {preset.becomes!r} for good; leave --duration out")
+        last = 2**31 - 2 - max((c.after for c in preset.then), default=0)  # later than the last step: it never happens
     elif self.severity is None:
       object.__setattr__(self, "severity", 0.5)
     if self.severity is not None:
@@ -250,8 +255,8 @@ class RunConfig:
         raise UserError(f"{name} must be below 2,147,483,647 control steps; got {getattr(self, name)}")
     if self.first_seed < 0:
       raise UserError(f"first_seed must be at least 0; got {self.first_seed}")
-    if not 0 <= self.onset <= self.steps:
-      raise UserError(f"onset must lie in 0..steps={self.steps}; got {self.onset}")
+    if not 0 <= self.onset <= last:
+      raise UserError(f"onset must lie in 0..{'steps=' if last == self.steps else ''}{last}; got {self.onset}")
     if self.duration is not None:
       positive(self, "duration")
     for arm in self.arms:
@@ -262,11 +267,18 @@ class RunConfig:
       raise UserError(f"unknown physics {self.physics!r}; choose from: auto, native, mjx")
 
 
+def becomes(config: RunConfig) -> str | None:
+  """The environment that the robot of a run becomes, None: stays what it is."""
+  return fault_presets.find(config.fault, config.env).becomes if "/" in config.fault else None
+
+
 def changes(config: RunConfig) -> tuple[fault_presets.Change, ...]:
-  """The faults of a run, with its duration where the preset leaves it open."""
+  """The faults of a run, with its duration where the preset leaves it open; of a robot that becomes another one, those of that other one."""
   if "/" in config.fault:
-    return tuple(dataclasses.replace(c, duration=config.duration if c.duration is None else c.duration)
-                 for c in fault_presets.find(config.fault, config.env).changes)
+    preset = fault_presets.find(config.fault, config.env)
+    if preset.becomes:
+      return preset.then or (fault_presets.Change("none"),)
+    return tuple(dataclasses.replace(c, duration=config.duration if c.duration is None else c.duration) for c in preset.changes)
   return (fault_presets.Change(config.fault, config.target, config.severity, 0, config.duration, config.schedule, config.period, config.share),)
 
 

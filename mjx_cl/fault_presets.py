@@ -44,17 +44,21 @@ class Preset:
   """Named changes of one robot, `*` for any.
 
   Attributes:
-    robot: environment. changes: see Change. becomes: environment that the robot turns into at the onset, None: stays. source: of the figures.
+    robot: environment. changes: see Change. source: of the figures.
+    becomes: environment that the robot turns into at the end of its first episode that ends at the onset or later, None: stays.
+    then: changes of the robot that it has become, instead of `changes`; they come an episode after the onset or later.
   """
   robot: str
   changes: tuple[Change, ...]
   about: str
   source: str
   becomes: str | None = None
+  then: tuple[Change, ...] = ()
 
 
 THIRD = (1.0 - 1.0 / 3.0) / 0.95       # severity of velocity_limit that leaves a third
 SOCKS = (1.0 - 0.30 / 0.65) / 0.95     # severity of friction that leaves 0.30 of the car's 0.65 under the rear wheels
+SOCKS_AFTER = 42_000                   # control steps, 35 minutes
 LEVELS = {"easy": (1, 0.1, 0.01), "medium": (2, 0.3, 0.05), "hard": (3, 1.0, 0.1)}  # thirds of 9 steps of delay, deviation, probability
 
 PRESETS: dict[str, Preset] = {
@@ -62,6 +66,8 @@ PRESETS: dict[str, Preset] = {
     "quadruped/rh-velocity-third": Preset("quadruped", (Change("velocity_limit", "RH", THIRD),), "right hind leg's velocity limits cut to a third",
                                           "the paper, ANYmal"),
     "car/sim-to-real": Preset("car", (), "the simulated car becomes the stand-in for the real one at an episode's end", "the paper, race car", "car_real"),
+    "car/transfer-then-socks": Preset(
+        "car", (), f"the simulated car becomes the stand-in for the real one, with socks on its rear wheels {SOCKS_AFTER:,} control steps after the onset", "the paper, race car; friction as in car/socks", "car_real", (Change("friction", "rear", SOCKS, SOCKS_AFTER),)),
     "car/socks": Preset("car_real", (Change("friction", "rear", SOCKS),), "socks on the rear wheels: friction 0.30 in place of 0.65",
                         "the paper, race car; friction 0.2 to 0.4 is a guess, no figure of a sock was found"),
 }

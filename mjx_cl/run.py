@@ -1,4 +1,10 @@
-"""`run`: the whole loop for arms x seeds streams, a host loop over chunks; checkpoints, result files."""
+"""`run`: the whole loop for arms x seeds streams, a host loop over chunks; checkpoints, result files.
+
+Where the robot becomes another one (a preset with `becomes`, see transfer.py) each stream has an onset of its own: the step with which its first
+episode of the other robot begins. That step is its `onset` in events.parquet, from it on its `severity` is 1, and latency, windows and recovery
+in runs.parquet are counted from it. `onset` is null there, and every alarm a false one, for a stream that never changed. Faults that follow have
+events of their own at the run's onset plus their `after`.
+"""
 from __future__ import annotations
 
 import dataclasses
@@ -16,19 +22,20 @@ import numpy as np
 from mjx_cl import agents, checkpoint, detectors, envs, faults, memory, store
 from mjx_cl.adapt import phase as phase_lib
 from mjx_cl.adapt.loop import Loop, LoopState
-from mjx_cl.config import RunConfig, changes
+from mjx_cl.config import RunConfig, becomes, changes
 from mjx_cl.errors import FileError
 from mjx_cl.interrupt import Interruptible
 from mjx_cl.monitor import Monitor
 from mjx_cl.rollout import Rollout, Stream, nest, start
 from mjx_cl.scoring import alarms as alarm_score, bootstrap, recovery
+from mjx_cl.transfer import Moving, Transfer
 
 CHUNK = 64  # decisions
 
 
 class State(NamedTuple):
   """All arrays of a run: the robots and everything else."""
-  streams: Stream
+  streams: Stream | Moving
   loop: LoopState
 
 
@@ -55,18 +62,25 @@ class Runner:
   def __init__(self, config: RunConfig, out):
     self.config, self.out = config, pathlib.Path(out)
     self.env = envs.make(config.env, config.physics)
+    self.other = envs.make(becomes(config), config.physics) if becomes(config) else None  # what the robot becomes
+    self.robots = [self.env] + [self.other] * (self.other is not None)
     spec = self.env.spec
     self.trained = agents.load(config.agent, config.env, len(spec.obs), len(spec.act), lr=config.adapt.lr,
                                last_starts=config.adapt.last_starts, batch=config.adapt.batch)
     agent, self.repeat = self.trained.agent, int(self.trained.card.get("repeat", 1))
     self.changes = changes(config)
-    self.faults, plan, target = faults.build(self.changes, self.env, config.onset)
+    self.faults, plan, target = faults.build(self.changes, self.robots[-1], config.onset)
     detector = detectors.make(config.detector, **config.settings)
     monitor = Monitor(agent, n=15, form=config.form, actions=config.actions, spec=spec)
-    self.rollout = Rollout(self.env, agent, self.faults, self.repeat, config.deterministic)
+    if self.other is None:
+      self.rollout = Rollout(self.env, agent, self.faults, self.repeat, config.deterministic)
+      begin = lambda k: start(self.env, agent, self.faults, k, target=target, plan=plan)
+    else:
+      self.rollout = Transfer(self.env, self.other, agent, self.faults, self.repeat, config.deterministic)
+      begin = lambda k: self.rollout.start(k, target, plan, config.onset)
     self.chunk_steps = CHUNK * self.repeat
     self.chunks = -(-config.steps // self.chunk_steps)
-    capacity = (self.chunks + 1) * CHUNK + config.steps // spec.episode_steps + CHUNK
+    capacity = (self.chunks + 1) * CHUNK + config.steps // min(r.spec.episode_steps for r in self.robots) + CHUNK
     memory.check(agent.config.size, len(spec.obs), len(spec.act), capacity, len(config.arms) * config.seeds, ("steps", 1), agent.config.bins)
     self.loop = Loop(agent, monitor, detector, spec, config.adapt, self.repeat, capacity=capacity)
     self.seeds = [config.first_seed + i for i in range(config.seeds)]
@@ -75,7 +89,6 @@ class Runner:
     self.acts = jnp.asarray([arm == "detector" for arm, _ in self.labels])
     keys = jnp.stack([jax.random.key(seed) for _, seed in self.labels])[:, None]
     self.keys = jax.vmap(lambda k: jax.random.fold_in(k, 7))(keys[:, 0])
-    begin = lambda k: start(self.env, agent, self.faults, k, target=target, plan=plan)
     self.state = State(nest(begin, 0, 0)(keys), self.loop.init(self.trained.train, self.groups))
     self.done_chunks = 0
     self.seconds = {"physics": 0.0, "acting": 0.0, "digest": 0.0, "other": 0.0}
@@ -96,13 +109,13 @@ class Runner:
   def step(self) -> Progress:
     """Lives one chunk and logs it."""
     begin = time.perf_counter()
-    physics = getattr(self.env.physics, "seconds", 0.0)
+    physics = self._physics_seconds()
     streams, rows = self.rollout.chunk(self.state.loop.acting, self.state.streams, CHUNK)
     rows = jax.block_until_ready(rows)
     acted = time.perf_counter()
-    physics = getattr(self.env.physics, "seconds", 0.0) - physics
+    physics = self._physics_seconds() - physics
     now = (self.done_chunks + 1) * self.chunk_steps
-    loop, digest = self.loop.digest(self.state.loop, rows, jnp.int32(now), self.acts, self.keys)
+    loop, digest = self.loop.digest(self.state.loop, rows, jnp.int32(now), self.acts, self.keys, self._acceptance(streams, now))
     digest = jax.tree.map(np.asarray, jax.block_until_ready(digest))
     digested = time.perf_counter()
     self.state = State(streams, loop)
@@ -127,6 +140,21 @@ class Runner:
     self._alarms = self._alarms + digest.fired.sum(0)
     return Progress(min(now, self.config.steps), self.config.steps, sum(self.seconds.values()), [a for a, _ in self.labels], [s for _, s in self.labels],
                     digest.phase, digest.signals[:, 2], self._alarms, digest.updates)
+
+  def _physics_seconds(self) -> float:
+    return sum(getattr(robot.physics, "seconds", 0.0) for robot in self.robots)
+
+  def _acceptance(self, streams, now: int):
+    """Level (groups,) of the robot that each stream has after `now` control steps; None where robots stay what they are."""
+    if self.other is None:
+      return None
+    return jnp.where(streams.after.enter[:, 0] < now, jnp.float32(self.other.spec.acceptance), jnp.float32(self.env.spec.acceptance))
+
+  def onsets(self) -> list[int | None]:
+    """Each stream's onset; where the robot becomes another one: as far as it is known, None: not in this run."""
+    if self.other is None:
+      return [self.config.onset] * self.groups
+    return [int(step) if step < self.config.steps else None for step in np.asarray(self.state.streams.after.enter)[:, 0]]
 
   def _log(self, rows, digest) -> None:
     """Keeps a chunk's rows, (control steps, groups), and its chunk values (groups,)."""
@@ -194,7 +222,8 @@ class Runner:
 
   def config_dict(self) -> dict:
     """What config.json holds."""
-    return {"command": "run", **json.loads(json.dumps(dataclasses.asdict(self.config))), "physics": self.env.physics.name,
+    return {"command": "run", **json.loads(json.dumps(dataclasses.asdict(self.config))),
+            "physics": "+".join(dict.fromkeys(robot.physics.name for robot in self.robots)),
             "agent_card": self.trained.card, "agent_path": pathlib.Path(self.trained.path).name, "repeat": self.repeat,
             "control_s": self.env.spec.control_s, **store.provenance()}
 
@@ -203,8 +232,11 @@ class Runner:
     from mjx_cl import plots
     steps = self.config.steps
     trace = {k: v[:steps] if v.shape[0] >= steps else v for k, v in self._trace().items()}
-    targets = np.asarray(self.state.streams.injection.target)[:, 0]  # (groups, F)
-    names = ["+".join(f"{f.name}:{f.targets[t]}" for f, t in zip(self.faults, row)) for row in targets]
+    if self.other is None:
+      targets = np.asarray(self.state.streams.injection.target)[:, 0]  # (groups, F)
+      names = ["+".join(f"{f.name}:{f.targets[t]}" for f, t in zip(self.faults, row)) for row in targets]
+    else:
+      names = [self.config.fault] * self.groups
     table = self._trace_table(trace, names)
     events = self._events(trace, names)
     runs = self._runs(trace, events, names)
@@ -238,13 +270,17 @@ class Runner:
   def _events(self, trace, names) -> list[dict]:
     """Every onset, alarm, start, stop, abort and repair, with its reason."""
     c, events = self.config, []
-    for g, (arm, seed) in enumerate(self.labels):
+    for g, ((arm, seed), onset) in enumerate(zip(self.labels, self.onsets())):
+      onset = c.steps if onset is None else onset
+
       def add(step, kind, reason):
         events.append({"stream": g, "arm": arm, "seed": seed, "step": int(step), "kind": kind, "reason": reason, "fault": names[g]})
+      if self.other is not None and onset < c.steps:
+        add(onset, "onset", f"becomes {self.other.spec.name}, severity 1")
       for change in self.changes:
         begin = c.onset + change.after
         if change.fault != "none" and begin < c.steps:
-          several = f"{change.fault}, " if len(self.changes) > 1 else ""
+          several = f"{change.fault}, " if len(self.changes) > 1 or self.other is not None else ""
           add(begin, "onset", f"{several}severity {change.severity:g}" + ("" if change.schedule == "abrupt" else f", {change.schedule}"))
           if change.duration and begin + change.duration < c.steps:
             add(begin + change.duration, "repair", f"{several}after {change.duration} steps")
@@ -252,12 +288,12 @@ class Runner:
       started = {int(trace["since"][i, g]) for i in np.flatnonzero(decisions == phase_lib.START)}
       for step in np.flatnonzero(trace["alarm"][:, g]):
         if int(step) in started:
-          add(step, "alarm", "acted on" + (", before onset: a false alarm" if step < c.onset else ""))
+          add(step, "alarm", "acted on" + (", before onset: a false alarm" if step < onset else ""))
         else:
           phase = phase_lib.PHASES[trace["phase"][step, g]]
           late = decisions[step // self.chunk_steps] == phase_lib.START  # the phase changes at the end of the chunk
           why = "arm does not adapt" if arm == "none" else "warm-up" if step < c.adapt.warmup else "an alarm before it was" if late else f"phase {phase}"
-          add(step, "alarm", f"logged, not acted on: {why}" + (", before onset: a false alarm" if step < c.onset else ""))
+          add(step, "alarm", f"logged, not acted on: {why}" + (", before onset: a false alarm" if step < onset else ""))
       for i in np.flatnonzero(decisions):
         end = min((i + 1) * self.chunk_steps, c.steps) - 1
         decision = int(decisions[i])
@@ -268,15 +304,16 @@ class Runner:
   def _runs(self, trace, events, names) -> list[dict]:
     """One row per stream."""
     c, rows = self.config, []
-    onset, control_s = c.onset, self.env.spec.control_s
+    control_s = self.env.spec.control_s
+    onsets = [c.steps if onset is None else onset for onset in self.onsets()]
     pre, drop = {}, {}
-    for g, (arm, seed) in enumerate(self.labels):
+    for g, ((arm, seed), onset) in enumerate(zip(self.labels, onsets)):
       reward = trace["reward"][:, g].astype(float)
       acted = [int(s) for s, d in zip(trace["since"][:, g], trace["decision"][:, g]) if d == phase_lib.START]
       pre[g] = recovery.reward_pre(reward, onset, c.adapt.warmup, acted[0] if acted else None)
       if arm == "none":
         drop[seed] = recovery.reward_drop(reward, onset, pre[g]) if c.fault != "none" and onset < c.steps else None
-    for g, (arm, seed) in enumerate(self.labels):
+    for g, ((arm, seed), onset) in enumerate(zip(self.labels, onsets)):
       reward = trace["reward"][:, g].astype(float)
       own = [e for e in events if e["stream"] == g]
       score = alarm_score.score(trace["alarm"][:, g], onset)
@@ -286,10 +323,12 @@ class Runner:
       if starts and ends and ends[-1]["step"] > starts[-1]:
         reason = ends[-1]["reason"]
         outcome = "converged" if ends[-1]["kind"] == "stop" else "aborted_by_budget" if reason == phase_lib.REASONS[phase_lib.ABORT_BUDGET] else "aborted_by_rule"
-      affected = None if drop.get(seed) is None else bool(drop[seed] >= 0.1)
+      never = self.other is not None and onset == c.steps
+      affected = None if drop.get(seed) is None or never else bool(drop[seed] >= 0.1)
       back = recovery.recovery_step(reward, onset, pre[g])
       rows.append({
-          "stream": g, "arm": arm, "seed": seed, "fault": names[g], "onset": onset, "alarm_step": score.alarm_step, "latency_steps": score.latency_steps,
+          "stream": g, "arm": arm, "seed": seed, "fault": names[g], "onset": None if never else onset,
+          "alarm_step": score.alarm_step, "latency_steps": score.latency_steps,
           "latency_s": None if score.latency_steps is None else score.latency_steps * control_s, "false_alarms": score.false_alarms,
           "adapt_start": starts[0] if starts else None, "adapt_stop": ends[-1]["step"] if ends else None, "outcome": outcome,
           "reason": ends[-1]["reason"] if ends else None, "affected": affected, "recovery_step": back if affected else None,
@@ -300,7 +339,8 @@ class Runner:
 
   def _summary(self, runs, trace) -> dict:
     """summary.json: per arm the aggregates, each with its interval; arm `detector` also at the top level."""
-    out = {"env": self.config.env, "fault": self.config.fault, "severity": max(c.severity for c in self.changes), "onset": self.config.onset, "steps": self.config.steps,
+    severity = 1.0 if self.other is not None else max(c.severity for c in self.changes)
+    out = {"env": self.config.env, "fault": self.config.fault, "severity": severity, "onset": self.config.onset, "steps": self.config.steps,
            "detector": self.config.detector}
     arms = {arm: summarise([r for r in runs if r["arm"] == arm], self.config, self.env.spec.control_s) for arm in self.config.arms}
     out["arms"] = arms
@@ -333,7 +373,7 @@ def summarise(rows: list[dict], config: RunConfig, control_s: float) -> dict:
     put(name, hits, None if p is None else [p[0] * n, p[1] * n])
   count("alarms", sum(np.isfinite(x) for x in latency), len(rows))
   count("false_alarm_streams", sum(r["false_alarms"] > 0 for r in rows), len(rows))
-  hours = sum(min(r["onset"], config.steps) for r in rows) * control_s / 3600
+  hours = sum(config.steps if r["onset"] is None else min(r["onset"], config.steps) for r in rows) * control_s / 3600
   out["false_alarms_per_hour"] = sum(r["false_alarms"] for r in rows) / hours if hours else None
   median = lambda x: bootstrap.finite(bootstrap.censored_median(x)) if len(x) else None
   put("latency_median_steps", median(latency), bootstrap.interval(latency, bootstrap.censored_median) if latency else None)

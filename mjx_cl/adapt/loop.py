@@ -84,12 +84,13 @@ class Loop:
     return LoopState(spread(train), spread(train.params), spread(empty), self.monitor.init(groups, 1), spread(self.detector.init()), spread(phase_lib.init(self.config)),
                      past, jnp.zeros(groups), jnp.zeros(groups, jnp.int32))
 
-  def _digest(self, state: LoopState, rows, now, acts, keys):
+  def _digest(self, state: LoopState, rows, now, acts, keys, acceptance=None):
     """One chunk.
 
     Args:
       rows: rollout.Row, leading (T, groups, 1). now: int32 (), control steps done after the chunk. acts: bool (groups,).
       keys: (groups,), each stream's own, so that what a stream draws does not depend on its neighbours.
+      acceptance: float32 (groups,), of the robot that each stream has by now, where robots change; None: that of `spec`.
     Returns:
       (state', Digest).
     """
@@ -112,10 +113,11 @@ class Loop:
     acted = alarms.fired & (known >= self.config.warmup)[:, None]
     first = jnp.argmax(acted, 0)
     alarm_step = known[first]
-    acceptance = self.spec.acceptance if self.config.acceptance is None else self.config.acceptance
+    if acceptance is None or self.config.acceptance is not None:
+      acceptance = self.spec.acceptance if self.config.acceptance is None else self.config.acceptance
     step = functools.partial(phase_lib.update, config=self.config)
     was = state.phase.phase
-    phase, decision, ok = jax.vmap(step, (0, 0, 0, 0, 0, None, 0, None, None))(
+    phase, decision, ok = jax.vmap(step, (0, 0, 0, 0, 0, None, 0, 0 if jnp.ndim(acceptance) else None, None))(
         state.phase, signals, posture, jnp.any(acted, 0), alarm_step, now, acts, acceptance, least_posture)
 
     # replay holds what came after the alarm and nothing else
