@@ -437,7 +437,7 @@
     const after = known.filter(([, step]) => step >= fault.onset).sort((a, b) => a[1] - b[1]), early = known.length - after.length;
     const first = after.length ? `; the first is ${after[0][0]}, ${figure((after[0][1] - fault.onset) * fault.control_s, "number")} s after it` : "";
     return `The fault begins at step ${figure(fault.onset, "integer")} (${figure(fault.onset * fault.control_s, "number")} s). `
-      + `In this seed ${after.length} of ${real.length} detectors alarm after the onset${first}. ${early || "None"} had alarmed before.`;
+      + `In this seed ${after.length} of ${real.length} detectors alarm after the onset${first}.${early ? ` ${early} had alarmed before.` : ""}`;
   }
 
   function showStreams(fault, alarms) {
