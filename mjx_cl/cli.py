@@ -546,10 +546,16 @@ def do_record(args: Record) -> None:
 
 def do_leaderboard(args: Leaderboard) -> None:
   import math
-  from mjx_cl import leaderboard, store, streams
+  from mjx_cl import leaderboard, store, streams, submissions
+  for flag, given, other in (("--set", args.set, args.add), ("--threshold", args.threshold, args.add), ("--name", args.name, args.add or args.submit)):
+    if given and not other:
+      raise UserError(f"{flag} belongs to a detector of one's own; give --add" + (" or --submit" if flag == "--name" else ""))
+  if args.name and args.add and args.submit:
+    raise UserError("--name names one detector; give --add and --submit in two commands, or leave it out")
   held = streams.StreamSet(args.streams)
+  robots = held.choose(args.robot)
   if args.export:
-    files = leaderboard.export(held, args.export)
+    files = submissions.export(held, args.export, robots)
     emit(files) if args.json else print("\n".join(files))
     return
   known, extra = leaderboard.variants(), []
@@ -560,20 +566,23 @@ def do_leaderboard(args: Leaderboard) -> None:
   if args.add:
     from mjx_cl.detectors import host
     build = lambda value: host.load(args.add, settings(args.set) | ({args.threshold: value} if args.threshold else {}), args.name, args.channel)
-    one = build(10.0)
-    extra.append((one.host_name, leaderboard.from_host(build if args.threshold else one, args.threshold)))
+    one = build(1.0)
+    extra.append((one.host_name, submissions.from_host(build if args.threshold else one, args.threshold)))
   if args.submit:
-    extra.append((args.name or os.path.basename(args.submit).removesuffix(".parquet"), leaderboard.from_scores(leaderboard.read_submission(args.submit, held))))
+    scores = submissions.read_submission(args.submit, held, robots)
+    extra.append((args.name or os.path.basename(args.submit).removesuffix(".parquet"), submissions.from_scores(scores)))
+  taken = {*known, *leaderboard.ORACLES}
   for name, _ in extra:
-    if name in known:
+    if name in taken:
       raise UserError(f"the board has a detector {name!r} already; give --name")
+    taken.add(name)
   told = [0.0]
 
   def progress(robot, name, done, total, seconds):
     if time.monotonic() - told[0] > 2 or done == total:
       told[0] = time.monotonic()
       say(f"{done}/{total}  {robot}: {name}, {clock(seconds)} gone, {clock(seconds / done * (total - done))} left")
-  board = leaderboard.score(held, entries, args.robot, extra, progress)
+  board = leaderboard.score(held, entries, robots, extra, progress)
   meta = {"command": "mjx-cl " + " ".join(sys.argv[1:]), "seeds": {k: list(v) for k, v in held.suite.seeds.items()}, "arl0_target": held.suite.arl0,
           "streams": held.config.get("command"), "wall_s": round(board.seconds, 1), "stream_steps": board.stream_steps, **store.provenance()}
   files = leaderboard.write(board, args.out, meta)

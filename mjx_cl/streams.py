@@ -181,6 +181,13 @@ class StreamSet:
   def robots(self) -> list[str]:
     return list(dict.fromkeys(self.meta["robot"].tolist()))
 
+  def choose(self, robots=()) -> list[str]:
+    """These robots, each once; all where none is named. UserError for one that the set lacks."""
+    for robot in robots:
+      if robot not in self.robots:
+        raise UserError(f"this set has no robot {robot!r}; choose from: {', '.join(self.robots)}")
+    return list(dict.fromkeys(robots)) or self.robots
+
   def find(self, robot: str, kind: str, split: str | None = None, fault: str | None = None, severity: float | None = None) -> np.ndarray:
     """Stream numbers, in order."""
     m = self.meta
@@ -196,8 +203,20 @@ class StreamSet:
     hit = (m["robot"] == robot) & (m["kind"] == "fault") & (m["split"] == split) & m["full"]
     return list(dict.fromkeys(zip(m["fault"][hit].tolist(), m["severity"][hit].tolist())))
 
+  def extent(self, robot: str) -> tuple[int, int]:
+    """(most control steps, number) of the fault streams that score."""
+    numbers = np.isin(self.meta["stream"], self.find(robot, "fault", "score"))
+    return int(self.meta["steps"][numbers].max()), int(numbers.sum())
+
+  def scored(self, robots=()) -> dict[int, int]:
+    """{stream: control steps} of all that a file of scores must hold: nominal, fault and probe streams; all robots where none is named."""
+    m = self.meta
+    return {int(n): int(steps) for n, steps, kind, full, robot in zip(m["stream"], m["steps"], m["kind"], m["full"], m["robot"])
+            if kind != "past" and full and (not robots or robot in robots)}
+
   def _load(self, robot: str) -> dict:
     if robot not in self._rows:
+      self._rows.clear()  # one robot at a time: a set may be larger than the memory
       rows = store.read_table(self.folder / f"{robot}.parquet")
       latents = store.read_table(self.folder / f"{robot}_latents.parquet")
       starts = lambda t: dict(zip(*np.unique(t["stream"], return_index=True)))

@@ -1,6 +1,6 @@
 """The leaderboard's numbers: one matching of alarms to onsets, and a few lines for each metric over it.
 
-  fault stream    latency_s = steps from the onset to the first alarm in [onset, onset + HORIZON_S); no alarm there: the fault is missed
+  fault stream    latency_s = steps from the onset to the first alarm in [onset, onset + horizon_s); no alarm there: the fault is missed
   healthy stream  false alarms = its alarms from `count_from` on, over its hours from `count_from` on
 
 An alarm of step onset + k is known k + 1 control periods after the fault began to act: "detected within x s" means k + 1 <= x / control_s, and
@@ -24,7 +24,7 @@ import numpy as np
 from mjx_cl.errors import UserError
 from mjx_cl.scoring import alarms, bootstrap, special
 
-HORIZON_S = 20.0                 # a later alarm is no detection [s after onset]
+HORIZON_S = 20.0                 # a later alarm is no detection, unless a suite says otherwise [s after onset]
 HALF_S = 5.0                     # delay after which half of what an immediate alarm saves is lost [s]
 HOURS_PER_FAULT = 0.1            # healthy operation for each fault, six minutes; sets how many false alarms stand against one miss [h]
 WITHIN_S = (0.5, 1.0, 5.0, 20.0)
@@ -44,7 +44,7 @@ class Profile(NamedTuple):
 PROFILES = {"standard": Profile(1.0, 0.1), "few_false": Profile(1.0, 0.2), "few_misses": Profile(2.0, 0.1)}
 
 
-def _steps(seconds: float, control_s: float) -> int:
+def steps_in(seconds: float, control_s: float) -> int:
   """Whole control periods in so many seconds."""
   return int(seconds / control_s + 1e-6)  # 0.3 / 0.1 falls short of 3 in binary
 
@@ -71,7 +71,7 @@ def per_stream(latency: np.ndarray, healthy_alarms: np.ndarray, healthy_steps: i
   missed = ~np.isfinite(latency)
   out = {"miss_probability": missed.astype(float), "false_alarms_per_hour": rate}
   for x in WITHIN_S:
-    out[f"detected_within_{x:g}s"] = (latency < _steps(x, control_s)).astype(float)
+    out[f"detected_within_{x:g}s"] = (latency < steps_in(x, control_s)).astype(float)
   late = 1.0 - 0.5 ** (latency * control_s / HALF_S)
   for name, profile in PROFILES.items():
     cost = np.where(missed, profile.miss, late) + profile.false_alarm * HOURS_PER_FAULT * rate
@@ -111,28 +111,29 @@ def auroc(faulty: list[np.ndarray], healthy: list[np.ndarray], reps: int = REPS)
   return value, bootstrap.ends(drawn[None])[0]
 
 
-def row(alarm, score, onset, nominal_alarm, nominal_score, control_s: float, count_from: int = 0, reps: int = REPS) -> dict:
+def row(alarm, score, onset, nominal_alarm, nominal_score, control_s: float, count_from: int = 0, reps: int = REPS, horizon_s: float = HORIZON_S) -> dict:
   """All metrics of one detector on one fault: stream s of both recordings is seed s.
 
   Args:
     alarm: bool (T, S), fired in that step. score: float (T, S), nan unknown. onset: int (S,) or one for all, first faulty step.
     nominal_alarm, nominal_score: (N, S), the same seeds without a fault. control_s: [s per control step].
     count_from: steps before it count nowhere, the detector's warm-up.
-    reps: bootstrap draws; the same seeds are drawn for every metric.
+    reps: bootstrap draws; the same seeds are drawn for every metric. horizon_s: a later alarm is no detection [s after onset].
   Returns:
     Flat dict, undefined = None. x_ci = [low, high] at 95 %, an end that falls on a censored time is None, the whole None for fewer than two seeds:
     Wilson for shares, exact Poisson where no false alarm came (a bootstrap would have width zero), bootstrap over seeds otherwise.
       streams; latency_median_steps, latency_median_s (None when half or more are missed); miss_probability; false_alarms_per_hour;
-      detected_within_{0.5, 1, 5, 20}s; auroc (scores in [onset, onset + HORIZON_S) against the healthy ones); cost_{standard, few_false, few_misses};
+      detected_within_{0.5, 1, 5, 20}s, None beyond horizon_s; auroc (scores in [onset, onset + horizon_s) against the healthy ones); cost_{standard, few_false, few_misses};
       stream_latency_steps (S,), stream_healthy_alarms (S,), healthy_steps, control_s: what `overall` computes the means and their intervals from.
   """
   alarm, nominal_alarm, score, nominal_score = np.asarray(alarm, bool), np.asarray(nominal_alarm, bool), np.asarray(score), np.asarray(nominal_score)
-  streams, horizon = alarm.shape[1], _steps(HORIZON_S, control_s)
+  streams, horizon = alarm.shape[1], steps_in(horizon_s, control_s)
   onset = np.broadcast_to(np.asarray(onset, int), (streams,))
   _demand(alarm, score, onset, nominal_alarm, nominal_score, horizon, count_from)
   latency, healthy_alarms = latencies(alarm, onset, horizon, count_from), nominal_alarm[count_from:].sum(0)
   healthy_steps = len(nominal_alarm) - count_from
   values = per_stream(latency, healthy_alarms, healthy_steps, control_s)
+  values |= {f"detected_within_{x:g}s": np.full(streams, np.nan) for x in WITHIN_S if x > horizon_s}
   missed = int(values["miss_probability"].sum())
   median = float(bootstrap.censored_median(latency)) if 2 * missed < streams else None
   known = lambda x: x[~np.isnan(x)]
@@ -147,7 +148,7 @@ def row(alarm, score, onset, nominal_alarm, nominal_score, control_s: float, cou
     median_ci, *ends = bootstrap.ends(np.concatenate([medians[None], means]))
     intervals = dict(zip(values, ends))
     for name in SHARES:
-      intervals[name] = bootstrap.wilson(int(round(values[name].sum())), streams)
+      intervals[name] = bootstrap.wilson(int(round(values[name].sum())), streams) if np.isfinite(values[name]).all() else None
     if healthy_steps > 0 and not healthy_alarms.sum():
       hours = streams * healthy_steps * control_s / 3600.0
       intervals["false_alarms_per_hour"] = [x / hours for x in special.poisson_interval(0)]
@@ -170,8 +171,8 @@ def _demand(alarm, score, onset, nominal_alarm, nominal_score, horizon: int, cou
     raise UserError("alarms and scores must be (steps, streams), with one healthy stream for each seed; got "
                     f"{alarm.shape}, {score.shape}, healthy {nominal_alarm.shape}, {nominal_score.shape}")
   if onset.min() < count_from or onset.max() + horizon > len(alarm):
-    raise UserError(f"onsets must lie in [{count_from}, {len(alarm) - horizon}], between warm-up and {HORIZON_S:g} s before the end of the "
-                    f"stream; got {onset.min()} .. {onset.max()}")
+    raise UserError(f"onsets must lie in [{count_from}, {len(alarm) - horizon}], between warm-up and {horizon} steps before the end of the stream; "
+                    f"got {onset.min()} .. {onset.max()}")
   if len(nominal_alarm) < count_from:
     raise UserError(f"the healthy streams end within the warm-up of {count_from} steps; got {len(nominal_alarm)} steps")
 
