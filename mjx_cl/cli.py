@@ -515,17 +515,11 @@ def do_certify(args: Certify) -> None:
 
 
 def do_record(args: Record) -> None:
-  import shutil
-  from mjx_cl import streams
-  from mjx_cl.errors import FileError
-  suite = streams.suite(args.suite)
-  out = streams.pathlib.Path(args.out)
-  if (out / "config.json").exists():
-    if not args.overwrite:
-      raise UserError(f"{out} holds a recorded set; give --overwrite to replace it, or another --out")
-    shutil.rmtree(out)
-  elif out.exists() and (not out.is_dir() or {p.name for p in out.iterdir()} - {"work"} and not list(out.glob("*.parquet"))):
-    raise UserError(f"{out} is no folder of a recording; give another --out")
+  from mjx_cl import recording, streams
+  suite, out = streams.suite(args.suite), args.out
+  if args.overwrite:
+    recording.prepare(suite, args.robot, args.physics, args.agent)  # what is refused must not cost the set that is there
+  recording.claim(suite, out, args.overwrite)
   told = [0.0]
 
   def progress(part, done, steps, lanes):
@@ -533,8 +527,8 @@ def do_record(args: Record) -> None:
     if now - told[0] > 10 or done >= steps:
       told[0] = now
       say(f"{part}: {done:,}/{steps:,} steps of {lanes} robots")
-  result = streams.record(suite, out, args.robot, args.physics, args.agent, "mjx-cl " + " ".join(sys.argv[1:]), progress)
-  shutil.rmtree(out / "work", ignore_errors=True)
+  result = recording.record(suite, out, args.robot, args.physics, args.agent, "mjx-cl " + " ".join(sys.argv[1:]), progress)
+  recording.clear(out)
   if args.json:
     emit(result)
   else:

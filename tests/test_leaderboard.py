@@ -8,7 +8,7 @@ import numpy as np
 import pyarrow.parquet
 import pytest
 
-from mjx_cl import detectors, leaderboard, oracles, store, streams, submissions
+from mjx_cl import detectors, leaderboard, oracles, recording, store, streams, submissions
 from mjx_cl.detectors.host import HostDetector
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.scoring import healthy, limits
@@ -49,12 +49,12 @@ def make_set(folder, suite=SUITE, robots=("walker",)):
     parts = {}
     for split in ("score", "tune"):
       seeds = suite.numbers(split)
-      who = [streams.Lane(s) for s in seeds for _ in range(suite.nominal[split])]
+      who = [recording.Lane(s) for s in seeds for _ in range(suite.nominal[split])]
       parts[split, "nominal"] = (who, np.zeros(len(who), int), part(who, np.zeros(len(who), int), suite.nominal["steps"], 1))
-      who = streams.lanes(suite, robot, split)
+      who = recording.lanes(suite, robot, split)
       onsets = np.asarray([suite.onset_of(lane.seed) for lane in who])
       parts[split, "fault"] = (who, onsets, part(who, onsets, int(onsets.max()) + suite.after(CONTROL_S), 2))
-    details[robot] = streams._write(suite, folder, robot, parts, meta, CONTROL_S, ",".join(f"g{k}" for k in range(8)))
+    details[robot] = recording._write(suite, folder, robot, parts, meta, CONTROL_S, ",".join(f"g{k}" for k in range(8)))
   types = {"stream": np.int32, "seed": np.int32, "severity": float, "steps": np.int32, "full": bool, "control_s": float}
   store.write_table(folder / "streams.parquet", {k: np.asarray(v, types[k]) if k in types else v for k, v in meta.items()})
   store.write_json(folder / "config.json", {"version": streams.VERSION, "suite": dataclasses.asdict(suite), "details": details})

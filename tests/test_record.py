@@ -7,7 +7,7 @@ from test_cli import mjx, refused  # noqa: F401  fixtures
 from test_leaderboard import submission, trailing
 from test_run import saved  # noqa: F401  a fixture
 
-from mjx_cl import leaderboard, store, streams
+from mjx_cl import leaderboard, recording, store, streams
 
 SUITE = """
 name = "mini"
@@ -61,12 +61,12 @@ def test_a_recording_goes_on_where_it_was_cut_off(recorded, saved, tmp_path):
       lived.append(part)
       if part == "walker tune nominal":
         raise KeyboardInterrupt
-    streams.record(suite, tmp_path, physics="native", agent=str(saved), progress=stop)
+    recording.record(suite, tmp_path, physics="native", agent=str(saved), progress=stop)
   assert not list(tmp_path.glob("*.parquet")) and len(list((tmp_path / "work").glob("*.npz"))) == 2
   part = tmp_path / "work" / "walker-score-nominal.npz"
   part.write_bytes(part.read_bytes()[:1000])
   lived.clear()
-  streams.record(suite, tmp_path, physics="native", agent=str(saved), progress=lambda part, *_: lived.append(part))
+  recording.record(suite, tmp_path, physics="native", agent=str(saved), progress=lambda part, *_: lived.append(part))
   assert list(dict.fromkeys(lived)) == ["walker score nominal", "walker tune nominal", "walker tune fault"]
   for name in ("walker.parquet", "walker_latents.parquet", "streams.parquet"):
     assert (tmp_path / name).read_bytes() == (recorded[0] / name).read_bytes()

@@ -63,7 +63,12 @@ def _plugins() -> dict:
   for entry in importlib.metadata.entry_points(group="mjx_cl.detectors"):
     if entry.name in DETECTORS or entry.name in found:
       raise UserError(f"detector {entry.name!r} of {entry.value} is there already; a plug-in must have a name of its own")
-    found[entry.name] = entry.load()
+    try:
+      found[entry.name] = entry.load()
+    except Exception as e:  # whatever a foreign module raises
+      raise UserError(f"detector {entry.name!r} of {entry.value} cannot be loaded: {type(e).__name__}: {' '.join(str(e).split())}") from e
+    if not callable(found[entry.name]):
+      raise UserError(f"detector {entry.name!r} of {entry.value} is no factory: a function of settings that gives a Detector")
   return found
 
 

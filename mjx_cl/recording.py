@@ -1,0 +1,339 @@
+"""Recording of a suite: healthy and faulty robots of all seeds in one batched program per robot and split, written as streams.py describes."""
+from __future__ import annotations
+
+import dataclasses
+import json
+import pathlib
+import zlib
+from typing import NamedTuple
+
+import numpy as np
+
+from mjx_cl import store
+from mjx_cl.errors import FileError, UserError
+from mjx_cl.streams import COLUMNS, LATENT, META, SCHEMA, VERSION, Suite
+
+CHUNK = 64
+
+
+class Lane(NamedTuple):
+  """One robot of a recording. fault None: healthy."""
+  seed: int
+  fault: str | None = None
+  target: str | None = None
+  severity: float = 0.0
+  full: bool = True
+
+
+def lanes(suite_: Suite, robot: str, split: str) -> list[Lane]:
+  """The robots of one fault recording: every seed healthy first, then every fault, severity and seed. The split `tune` repeats the faults that
+  score on seeds that do not, for oracles that must be fitted; of those OPR and RPR alone are kept."""
+  seeds, tables = suite_.numbers(split), suite_.robots[robot]
+  out = [Lane(seed) for seed in seeds]
+  for source in ("score", "tune"):
+    if split == "score" and source == "tune":
+      continue
+    for key, severities in tables.get(source, {}).items():
+      fault, _, target = key.partition(":")
+      out += [Lane(seed, fault, target or None, float(s), source == split) for s in severities for seed in seeds]
+  return out
+
+
+def _record(env, trained, lanes_: list[Lane], keys, onsets, steps: int, watch_from: int, progress) -> dict[str, np.ndarray]:
+  """Lives `steps` control steps of every lane; the monitor looks at healthy lanes all the time, at the others from `watch_from` on.
+
+  Returns:
+    COLUMNS float32 (steps, S), nan where unknown; episode int16, terminated bool (steps, S); latent float16 (steps, S, 16); target (S,) names.
+  """
+  import jax
+  import jax.numpy as jnp
+  from mjx_cl import faults as faults_lib
+  from mjx_cl.monitor import Monitor
+  from mjx_cl.rollout import Rollout, nest, start
+  names = list(dict.fromkeys(lane.fault for lane in lanes_ if lane.fault))
+  faults = tuple(faults_lib.make(n, env) for n in names) or (faults_lib.none(env),)
+  severity, target = np.zeros((len(lanes_), len(faults)), np.float32), np.zeros((len(lanes_), len(faults)), np.int32)
+  drawn: list[str | None] = []
+  for i, lane in enumerate(lanes_):
+    drawn.append(None)
+    if lane.fault:
+      k = names.index(lane.fault)
+      at = faults_lib.target_index(faults[k], lane.target)
+      if at < 0:  # from seed and name alone: a fault more in the suite changes no other's target
+        at = int(np.random.default_rng([lane.seed, zlib.crc32(lane.fault.encode())]).integers(faults[k].drawn))
+      severity[i, k], target[i, k], drawn[-1] = lane.severity, at, faults[k].targets[at]
+  agent = trained.agent
+  rollout, monitor = Rollout(env, agent, faults), Monitor(agent, spec=env.spec)
+  plans = jax.vmap(lambda s, o: faults_lib.plan(s, jnp.broadcast_to(o, s.shape), jnp.full(s.shape, faults_lib.FOREVER)))(
+      jnp.asarray(severity), jnp.asarray(onsets, jnp.int32))
+  begin = lambda k, p, t: start(env, agent, faults, k, target=t, plan=p)
+  state = nest(begin, 0, 0)(keys[None], jax.tree.map(lambda x: x[None], plans), jnp.asarray(target)[None])
+  params = jax.tree.map(lambda x: x[None], trained.train.params)
+  healthy = sum(lane.fault is None for lane in lanes_)
+  watch, remember = jax.jit(monitor.update), jax.jit(monitor.remember)
+  history = monitor.init(1, len(lanes_))
+  out: dict[str, list] = {c: [] for c in COLUMNS + ("episode", "terminated", "latent")}
+  for chunk in range(-(-steps // CHUNK)):
+    state, rows = rollout.chunk(params, state, CHUNK)
+    everyone = (chunk + 1) * CHUNK > watch_from
+    take = (lambda x: x) if everyone else (lambda x: x[:, :, :healthy])
+    _, seen = watch(params, jax.tree.map(take, history), jax.tree.map(take, rows), jax.random.split(jax.random.fold_in(keys[0], chunk), 1))
+    history = remember(history, rows)
+    seen = jax.tree.map(lambda x: np.asarray(x)[:, 0], seen)
+    wide = lambda x: x if everyone else np.concatenate([x, np.full((CHUNK, len(lanes_) - healthy) + x.shape[2:], np.nan, np.float32)], 1)
+    for k, name in enumerate(COLUMNS):
+      out[name].append(wide(seen.groups[..., k - 4] if name.startswith("group_") else getattr(seen, name)))
+    out["latent"].append(wide(seen.latent).astype(np.float16))
+    out["episode"].append(np.asarray(rows.episode)[:, 0].astype(np.int16))
+    out["terminated"].append(np.asarray(rows.terminated)[:, 0])
+    progress(min(steps, (chunk + 1) * CHUNK), steps, len(lanes_))
+  return {k: np.concatenate(v)[:steps] for k, v in out.items()} | {"target": np.asarray([t or "" for t in drawn])}
+
+
+def claim(suite_: Suite, out, overwrite: bool) -> None:
+  """Makes sure that `out` may take a recording of the suite; with `overwrite` the set that it holds is removed, and no other file.
+
+  Raises:
+    UserError for a folder that holds a set, or anything else than parts of one.
+  """
+  out = pathlib.Path(out)
+  foreign = UserError(f"{out} is no folder of a recording; give another --out")
+  if not out.exists():
+    return
+  if not out.is_dir():
+    raise foreign
+  robots, held = set(suite_.robots), (out / "config.json").exists()
+  if held:
+    try:
+      config = json.loads((out / "config.json").read_text())
+      robots |= set(config["suite"]["robots"])
+      is_set = {"meta", "schema", "stream_steps"} <= set(config)
+    except (OSError, ValueError, KeyError, TypeError):
+      is_set = False
+    if not is_set:
+      raise foreign
+    if not overwrite:
+      raise UserError(f"{out} holds a recorded set; give --overwrite to replace it, or another --out")
+  ours = {"config.json", "streams.parquet", *(f"{r}{end}.parquet" for r in robots for end in ("", "_latents"))}
+  if held:
+    for name in sorted(ours):
+      (out / name).unlink(missing_ok=True)
+    clear(out)
+  elif {p.name.removesuffix(".tmp") for p in out.iterdir()} - ours - {"work"} or _others(out / "work"):
+    raise foreign
+
+
+def _others(work: pathlib.Path) -> list[pathlib.Path]:
+  """What is no part of a recording."""
+  return [p for p in work.iterdir() if not p.name.removesuffix(".tmp").endswith(".npz")] if work.is_dir() else []
+
+
+def clear(out) -> None:
+  """Removes the parts of a recording."""
+  work = pathlib.Path(out) / "work"
+  if work.is_dir() and not _others(work):
+    for p in work.iterdir():
+      p.unlink()
+    work.rmdir()
+
+
+def prepare(suite_: Suite, robots, physics: str, agent: str | None) -> dict[str, tuple]:
+  """robot -> (env, agents.Trained) of a recording; all robots of the suite where none is named.
+
+  Raises:
+    UserError, before hours are spent: an unknown robot, fault, target or agent, or an agent that does not act in every control step.
+  """
+  from mjx_cl import agents, envs
+  from mjx_cl import faults as faults_lib
+  out = {}
+  for robot in robots or suite_.robots:
+    if robot not in suite_.robots:
+      raise UserError(f"suite {suite_.name!r} has no robot {robot!r}; choose from: {', '.join(suite_.robots)}")
+    env = envs.make(robot, physics)
+    for key in (k for table in suite_.robots[robot].values() for k in table):
+      fault, _, target = key.partition(":")
+      faults_lib.target_index(faults_lib.make(fault, env), target or None)
+    out[robot] = env, agents.load(agent, robot, len(env.spec.obs), len(env.spec.act))
+    if int(out[robot][1].card.get("repeat", 1)) != 1:
+      raise UserError(f"the agent of {robot!r} holds its actions; streams are recorded with agents that act in every control step")
+  return out
+
+
+def record(suite_: Suite, out, robots=(), physics: str = "auto", agent: str | None = None, command: str = "", progress=lambda part, done, steps, lanes: None) -> dict:
+  """Records a suite into the folder `out`; parts that are finished already are kept, so a recording that was cut off goes on.
+
+  Returns:
+    {robot: stream-steps per second of its parts}, plus the size of the files.
+  """
+  import time
+  from mjx_cl import runtime
+  from mjx_cl.monitor import watched
+  from mjx_cl.record import stream_keys
+  import jax
+  out = pathlib.Path(out)
+  work = out / "work"
+  work.mkdir(parents=True, exist_ok=True)
+  ready = prepare(suite_, robots, physics, agent)
+  meta: dict[str, list] = {k: [] for k in META}
+  steps_of, speed, details = {}, {}, {}
+  for robot, (env, trained) in ready.items():
+    weights = _digest(trained.train.params)
+    parts, seconds, lived = {}, 0.0, 0
+    for split in ("score", "tune"):
+      seeds = suite_.numbers(split)
+      for kind in ("nominal", "fault"):
+        if kind == "nominal":
+          each = suite_.nominal[split]
+          who = [Lane(s) for s in seeds for _ in range(each)]
+          keys = stream_keys(seeds, each + 1)[np.flatnonzero(np.arange(len(seeds) * (each + 1)) % (each + 1))]  # the first belongs to the faults
+          onsets, steps, watch = np.zeros(len(who), int), suite_.nominal["steps"], 0
+        else:
+          who = lanes(suite_, robot, split)
+          keys = jax.numpy.stack([jax.random.key(lane.seed) for lane in who])
+          onsets = np.asarray([suite_.onset_of(lane.seed) for lane in who])
+          steps, watch = int(onsets.max()) + suite_.after(env.spec.control_s), int(onsets.min())
+        path, tag = work / f"{robot}-{split}-{kind}.npz", json.dumps([[list(lane) for lane in who], steps, trained.card.get("updates"), VERSION])
+        of = json.dumps([onsets.tolist(), weights, runtime.default_physics() if physics == "auto" else physics])
+        data = _part(path, tag, of)
+        if data is None:
+          begin = time.monotonic()
+          data = _record(env, trained, who, keys, onsets, steps, watch, lambda *a, part=f"{robot} {split} {kind}": progress(part, *a))
+          seconds, lived = seconds + time.monotonic() - begin, lived + steps * len(who)
+          store.atomic(path, lambda f, data=data, tag=tag, of=of: np.savez(f, tag=np.asarray(tag), of=np.asarray(of), **data))
+        parts[split, kind] = (who, onsets, data)
+    groups = ",".join(name for name, _ in watched(env.spec))
+    details[robot] = _write(suite_, out, robot, parts, meta, env.spec.control_s, groups)
+    steps_of[robot] = int(sum(x[2]["opr"].size for x in parts.values()))
+    speed[robot] = lived / seconds if seconds else None
+  types = {"stream": np.int32, "seed": np.int32, "severity": float, "steps": np.int32, "full": bool, "control_s": float}
+  store.write_table(out / "streams.parquet", {k: np.asarray(v, types[k]) if k in types else v for k, v in meta.items()})
+  plain = {f.name: getattr(suite_, f.name) for f in dataclasses.fields(Suite)} | {"robots": {r: suite_.robots[r] for r in ready}}
+  store.write_json(out / "config.json", {"version": VERSION, "suite": plain, "command": command, "schema": SCHEMA, "meta": META, "details": details,
+                                        "stream_steps": steps_of, **store.provenance()})
+  size = sum(p.stat().st_size for p in out.glob("*.parquet"))
+  return {"stream_steps_per_s": speed, "stream_steps": steps_of, "bytes": size}
+
+
+def _digest(params) -> int:
+  """Tells agents apart."""
+  import jax
+  return zlib.crc32(b"".join(np.asarray(x).tobytes() for x in jax.tree.leaves(params)))
+
+
+def _part(path: pathlib.Path, tag: str, of: str) -> dict | None:
+  """What an earlier recording left, None where it is of something else or broken: tag, lanes and length; of, onsets, agent and physics."""
+  try:
+    with np.load(path, allow_pickle=False) as z:
+      if str(z["tag"]) != tag or "of" in z.files and str(z["of"]) != of:
+        return None
+      return {k: z[k] for k in z.files if k not in ("tag", "of")}
+  except (OSError, ValueError, KeyError, EOFError):
+    return None
+  except Exception as e:  # zipfile's own errors for a truncated file
+    if type(e).__module__ in ("zipfile", "zlib"):
+      return None
+    raise
+
+
+def _write(suite_, out, robot, parts, meta, control_s, groups) -> dict:
+  """Writes ROBOT.parquet and ROBOT_latents.parquet and adds to `meta`. Returns the rounding steps."""
+  grain = _grain(parts["tune", "nominal"][2])
+  rows: dict[str, list] = {k: [] for k in SCHEMA}
+  latents: dict[str, list] = {k: [] for k in ("stream", "step") + tuple(f"z{k}" for k in range(LATENT))}
+  number = int(meta["stream"][-1]) + 1 if meta["stream"] else 0
+
+  def add_meta(**values):
+    for k in META:
+      meta[k].append(values.get(k))
+
+  def add_rows(stream, data, lane, first, last, columns):
+    at = slice(first, last)
+    rows["stream"].append(np.full(last - first, stream, np.int32))
+    rows["step"].append(np.arange(first, last, dtype=np.int32))
+    for k in ("episode", "terminated"):
+      rows[k].append(data[k][at, lane])
+    for k in COLUMNS:
+      rows[k].append(rounded(data[k][at, lane], k, grain) if k in columns else np.full(last - first, np.nan, np.float32))
+
+  def add_latents(stream, data, lane, first, last):
+    latents["stream"].append(np.full(last - first, stream, np.int32))
+    latents["step"].append(np.arange(first, last, dtype=np.int32))
+    for k in range(LATENT):
+      latents[f"z{k}"].append(rounded(data["latent"][first:last, lane, k].astype(np.float32), f"z{k}", grain))
+
+  for split in ("score", "tune"):
+    common = dict(robot=robot, split=split, control_s=control_s, groups=groups)
+    who, _, data = parts[split, "nominal"]
+    for i, lane in enumerate(who):
+      add_meta(stream=number, kind="nominal", seed=lane.seed, severity=0.0, steps=len(data["opr"]), full=True, **common)
+      add_rows(number, data, i, 0, len(data["opr"]), COLUMNS)
+      if i < suite_.latents["nominal"]:
+        add_latents(number, data, i, 0, len(data["opr"]))
+      number += 1
+    who, onsets, data = parts[split, "fault"]
+    after, past, first = suite_.after(control_s), {}, number
+    for i, lane in enumerate(who):
+      end = int(onsets[i]) + after
+      if lane.fault is None:
+        past[lane.seed] = (number, i)
+        add_meta(stream=number, kind="past", seed=lane.seed, severity=0.0, steps=end, full=True, **common)
+        add_rows(number, data, i, 0, end, COLUMNS)
+        add_latents(number, data, i, 0, int(onsets[i]))
+      else:
+        twin, j = past[lane.seed]
+        for k in ("episode", "terminated"):  # the fault's own past, step for step, is that of its healthy twin
+          if not np.array_equal(data[k][:onsets[i], i], data[k][:onsets[i], j]):
+            raise FileError(f"{robot}, {lane.fault}, seed {lane.seed}: its past differs from that of the healthy robot of the same seed")
+        add_meta(stream=number, kind="fault", seed=lane.seed, fault=lane.fault, target=str(data["target"][i]), severity=lane.severity,
+                 onset=int(onsets[i]), steps=end, prefix=twin, full=lane.full, **common)
+        add_rows(number, data, i, int(onsets[i]), end, COLUMNS if lane.full else ("opr", "rpr"))
+        if lane.full:
+          add_latents(number, data, i, int(onsets[i]), min(end, int(onsets[i]) + round(suite_.latents["after_s"] / control_s)))
+      number += 1
+    if split == "score":  # some streams again, cut off somewhere: a score that looks ahead betrays itself there
+      rng = np.random.default_rng(zlib.crc32(robot.encode()))
+      whole = [i for i in range(first, number) if meta["kind"][i] == "fault"]  # streams are numbered in the order of `meta`
+      for source in rng.choice(whole, min(5, len(whole)), replace=False):
+        at = int(source)
+        cut = int(rng.integers(meta["onset"][at], meta["steps"][at]))
+        add_meta(stream=number, kind="probe", seed=meta["seed"][at], severity=0.0, steps=cut, prefix=int(source), full=True, **common)
+        number += 1
+  table = {k: np.concatenate(v) for k, v in rows.items()}
+  store.write_table(out / f"{robot}.parquet", table, level=19, split=COLUMNS)
+  store.write_table(out / f"{robot}_latents.parquet", {k: np.concatenate(v) for k, v in latents.items()}, level=19,
+                    split=tuple(f"z{k}" for k in range(LATENT)))
+  return {"rounding": {k: float(v) for k, v in grain.items()}}
+
+
+def _grain(healthy: dict) -> dict[str, float]:
+  """How each column is rounded, from healthy streams: relative steps (of residuals, groups and surprise) or absolute ones (reward, latents), powers of
+  two near the deviation (of the logarithm; absolute) divided by FINENESS."""
+  grain = {}
+  for name in COLUMNS + tuple(f"z{k}" for k in range(LATENT)):
+    x = healthy["latent"][..., int(name[1:])] if name[0] == "z" else healthy[name]
+    x = x[np.isfinite(x)].astype(np.float64)
+    wide = float(np.std(x if absolute(name) else np.log(np.maximum(x, FLOOR)))) if len(x) else 0.0
+    grain[name] = 2.0 ** min(-1.0 if not absolute(name) else np.inf, np.round(np.log2(max(wide, 1e-9) / FINENESS["latent" if name[0] == "z" else name.split("_")[0]])))
+  return grain
+
+
+FLOOR = 1e-6  # residuals below are taken as this before the logarithm
+FINENESS = {"opr": 4, "rpr": 4, "reward": 4, "surprise": 4, "group": 2, "latent": 2}
+
+
+def absolute(name: str) -> bool:
+  """Whether a column is rounded to absolute steps; the others may not be negative and are rounded to relative ones."""
+  return name == "reward" or name[0] == "z"
+
+
+def rounded(x: np.ndarray, name: str, grain: dict[str, float]) -> np.ndarray:
+  """`x` on the grid of its column, float32 whose low mantissa bits are zero, which is what makes the files small; nan stays nan."""
+  x = x.astype(np.float32)
+  if absolute(name):
+    return (np.round(x.astype(np.float64) / grain[name]) * grain[name]).astype(np.float32)
+  drop = 23 + int(np.log2(grain[name]))
+  x = np.maximum(x, np.float32(FLOOR))
+  if drop < 1:  # a column that hardly varies
+    return x
+  bits = x.view(np.uint32).astype(np.uint64)
+  return np.where(np.isfinite(x), (((bits + (1 << (drop - 1))) >> drop) << drop).astype(np.uint32).view(np.float32), np.nan).astype(np.float32)
