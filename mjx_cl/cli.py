@@ -388,12 +388,14 @@ def summary_text(s: dict, out: str) -> str:
   lines = [f"{s['env']}, {s['fault']} {s['severity']:g} at step {s['onset']:,} of {s['steps']:,}, detector {s['detector']}; {clock(s['wall_s'])} wall ("
            + ", ".join(f"{k} {v:.0%}" for k, v in s["wall_share"].items()) + ")"]
   number = lambda x, form: "-" if x is None else format(x, form)
+  width = max(9, *map(len, s["arms"]))
   for arm, a in s["arms"].items():
-    lines.append(f"  {arm:9s} {a['seeds']} seeds, {a['affected']} affected; false-alarm streams {a['false_alarm_streams']}; alarm within 500 steps "
+    lines.append(f"  {arm:{width}s} {a['seeds']} seeds, {a['affected']} affected; false-alarm streams {a['false_alarm_streams']}; alarm within 500 steps "
                  f"{a['affected_alarmed_within_500']}/{a['affected']}, median {number(a['latency_median_steps'], '.0f')} steps; recovered within 10,000 steps "
                  f"{a['recovered_within_10000']}/{a['affected']}, median {number(a['recovery_median_steps'], '.0f')}; converged {a['converged']}, aborted by rule "
                  f"{a['aborted_by_rule']}, by budget {a['aborted_by_budget']}; reward {number(a['reward_pre'], '.2f')} -> drop {number(a['reward_drop'], '.0%')} -> "
-                 f"{number(a['reward_final'], '.2f')}")
+                 f"{number(a['reward_final'], '.2f')}; a stream: {number(a['updates_mean'], '.0f')} updates in {number(a['adapted_steps_mean'], '.0f')} steps of "
+                 f"adaptation, return lost by it before onset {number(a['return_lost_healthy_mean'], '.0f')}")
   return "\n".join(lines + [f"files in {out}"])
 
 
@@ -684,7 +686,7 @@ def do_list(args: List) -> None:
   first = lambda f: (f.__doc__ or "").strip().split("\n")[0]
   tables = {"envs": {k: first(v) for k, v in envs.ENVS.items()}, "faults": {k: faults.about(k) for k in faults.FAULTS},
             "detectors": {k: first(v) for k, v in detectors.DETECTORS.items()}, "presets": {k: p.about for k, p in PRESETS.items()},
-            "agents": {k: "shipped" for k in agents.shipped()}, "arms": ARMS, "fault-presets": {k: f"{p.about} ({p.source})" for k, p in fault_presets.PRESETS.items()}, "schedules": fault_presets.SCHEDULES,
+            "agents": {k: "shipped" for k in agents.shipped()}, "arms": {k: a.about for k, a in ARMS.items()}, "fault-presets": {k: f"{p.about} ({p.source})" for k, p in fault_presets.PRESETS.items()}, "schedules": fault_presets.SCHEDULES,
             "sizes": memory.table(), "suites": streams.about()}
   chosen = tables if args.what == "all" else {args.what: choose("list", args.what, tables)}
   if args.json:

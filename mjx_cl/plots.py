@@ -40,10 +40,12 @@ def figure(folder, width: int = 500) -> pathlib.Path:
   steps = int(trace["step"].max()) + 1
   control_s = config["control_s"]
   panels = {}
-  for arm in dict.fromkeys(trace["arm"]):
-    mask = trace["arm"] == arm
-    panels[arm] = {c: np.asarray(trace[c][mask], float).reshape(-1, steps) for c, _ in UPPER + LOWER}
-  main = "detector" if "detector" in panels else next(iter(panels))
+  arms = list(dict.fromkeys(trace["arm"]))
+  main = "detector" if "detector" in arms else next((arm for arm in arms if arm != "none"), "none")
+  for arm in arms:
+    if arm in (main, "none"):
+      mask = trace["arm"] == arm
+      panels[arm] = {c: np.asarray(trace[c][mask], float).reshape(-1, steps) for c, _ in UPPER + LOWER}
   fig, axes = plt.subplots(2, 1, figsize=(10, 7.2), sharex=True, constrained_layout=True)
   x = np.arange(steps)
   every = max(1, steps // 2000)

@@ -21,7 +21,8 @@ import numpy as np
 
 from mjx_cl import agents, checkpoint, detectors, envs, faults, memory, store
 from mjx_cl.adapt import phase as phase_lib
-from mjx_cl.adapt.loop import Loop, LoopState
+from mjx_cl.adapt.arms import ARMS, FOREVER, NEVER
+from mjx_cl.adapt.loop import Choices, Loop, LoopState, choices
 from mjx_cl.config import RunConfig, becomes, changes
 from mjx_cl.errors import FileError
 from mjx_cl.interrupt import Interruptible
@@ -31,6 +32,8 @@ from mjx_cl.scoring import alarms as alarm_score, bootstrap, recovery
 from mjx_cl.transfer import Moving, Transfer
 
 CHUNK = 64  # decisions
+# by decision: what a stream has come to
+OUTCOMES = ("nominal", "adapting", "converged", "aborted_by_rule", "aborted_by_rule", "aborted_by_budget", "ended")
 
 
 class State(NamedTuple):
@@ -74,10 +77,10 @@ class Runner:
     monitor = Monitor(agent, n=15, form=config.form, actions=config.actions, spec=spec)
     if self.other is None:
       self.rollout = Rollout(self.env, agent, self.faults, self.repeat, config.deterministic)
-      begin = lambda k: start(self.env, agent, self.faults, k, target=target, plan=plan)
+      begin = lambda k, breaks: start(self.env, agent, self.faults, k, target=target, plan=spared(plan, breaks))
     else:
       self.rollout = Transfer(self.env, self.other, agent, self.faults, self.repeat, config.deterministic)
-      begin = lambda k: self.rollout.start(k, target, plan, config.onset)
+      begin = lambda k, breaks: self.rollout.start(k, target, spared(plan, breaks), jnp.where(breaks, config.onset, FOREVER))
     self.chunk_steps = CHUNK * self.repeat
     self.chunks = -(-config.steps // self.chunk_steps)
     capacity = (self.chunks + 1) * CHUNK + config.steps // min(r.spec.episode_steps for r in self.robots) + CHUNK
@@ -86,10 +89,11 @@ class Runner:
     self.seeds = [config.first_seed + i for i in range(config.seeds)]
     self.labels = [(arm, seed) for arm in config.arms for seed in self.seeds]
     self.groups = len(self.labels)
-    self.acts = jnp.asarray([arm == "detector" for arm, _ in self.labels])
+    self.breaks = np.asarray([ARMS[arm].breaks for arm, _ in self.labels])
     keys = jnp.stack([jax.random.key(seed) for _, seed in self.labels])[:, None]
     self.keys = jax.vmap(lambda k: jax.random.fold_in(k, 7))(keys[:, 0])
-    self.state = State(nest(begin, 0, 0)(keys), self.loop.init(self.trained.train, self.groups))
+    self.state = State(nest(begin, (0, 0), (0, None))(keys, jnp.asarray(self.breaks)), self.loop.init(self.trained.train, self.groups))
+    self.choices = self._choices(self.state.streams)
     self.done_chunks = 0
     self.seconds = {"physics": 0.0, "acting": 0.0, "digest": 0.0, "other": 0.0}
     self.quiet: list[float] = []  # digest time of chunks without an update
@@ -115,7 +119,9 @@ class Runner:
     acted = time.perf_counter()
     physics = self._physics_seconds() - physics
     now = (self.done_chunks + 1) * self.chunk_steps
-    loop, digest = self.loop.digest(self.state.loop, rows, jnp.int32(now), self.acts, self.keys, self._acceptance(streams, now))
+    if self.other is not None:
+      self.choices = self._choices(streams)  # robots have changed in this chunk
+    loop, digest = self.loop.digest(self.state.loop, rows, jnp.int32(now), self.choices, self.keys, self._acceptance(streams, now))
     digest = jax.tree.map(np.asarray, jax.block_until_ready(digest))
     digested = time.perf_counter()
     self.state = State(streams, loop)
@@ -135,7 +141,8 @@ class Runner:
         self.quiet.append(digested - acted)
     else:
       self.seconds["other"] += digested - begin
-    self.stream_seconds += (digested - begin) / self.groups
+    learning = max(0.0, digested - acted - float(np.median(self.quiet))) if self.quiet and updates.sum() else 0.0
+    self.stream_seconds += (digested - begin - learning) / self.groups + learning * updates / max(1, updates.sum())
     self.seconds["other"] += time.perf_counter() - digested
     self._alarms = self._alarms + digest.fired.sum(0)
     return Progress(min(now, self.config.steps), self.config.steps, sum(self.seconds.values()), [a for a, _ in self.labels], [s for _, s in self.labels],
@@ -150,10 +157,17 @@ class Runner:
       return None
     return jnp.where(streams.after.enter[:, 0] < now, jnp.float32(self.other.spec.acceptance), jnp.float32(self.env.spec.acceptance))
 
+  def _choices(self, streams) -> Choices:
+    """The arms, with every true onset of their robots that is known by now."""
+    c = self.config
+    onsets = tuple(c.onset + change.after for change in self.changes if change.fault != "none")
+    moves = [()] * self.groups if self.other is None else [(int(step),) for step in np.asarray(streams.after.enter)[:, 0]]
+    return choices(self.labels, c.adapt, c.steps, [own + onsets for own in moves])
+
   def onsets(self) -> list[int | None]:
-    """Each stream's onset; where the robot becomes another one: as far as it is known, None: not in this run."""
+    """Each stream's onset; where the robot becomes another one: as far as it is known. None: not in this run, or an arm whose robot is spared."""
     if self.other is None:
-      return [self.config.onset] * self.groups
+      return [self.config.onset if breaks else None for breaks in self.breaks]
     return [int(step) if step < self.config.steps else None for step in np.asarray(self.state.streams.after.enter)[:, 0]]
 
   def _log(self, rows, digest) -> None:
@@ -237,6 +251,7 @@ class Runner:
       names = ["+".join(f"{f.name}:{f.targets[t]}" for f, t in zip(self.faults, row)) for row in targets]
     else:
       names = [self.config.fault] * self.groups
+    names = [name if breaks else "none" for name, breaks in zip(names, self.breaks)]
     table = self._trace_table(trace, names)
     events = self._events(trace, names)
     runs = self._runs(trace, events, names)
@@ -271,7 +286,8 @@ class Runner:
     """Every onset, alarm, start, stop, abort and repair, with its reason."""
     c, events = self.config, []
     for g, ((arm, seed), onset) in enumerate(zip(self.labels, self.onsets())):
-      onset = c.steps if onset is None else onset
+      healthy = "on a healthy robot" if onset is None else "before onset"
+      onset, trigger = c.steps if onset is None else onset, ARMS[arm].trigger
 
       def add(step, kind, reason):
         events.append({"stream": g, "arm": arm, "seed": seed, "step": int(step), "kind": kind, "reason": reason, "fault": names[g]})
@@ -279,7 +295,7 @@ class Runner:
         add(onset, "onset", f"becomes {self.other.spec.name}, severity 1")
       for change in self.changes:
         begin = c.onset + change.after
-        if change.fault != "none" and begin < c.steps:
+        if self.breaks[g] and change.fault != "none" and begin < c.steps:
           several = f"{change.fault}, " if len(self.changes) > 1 or self.other is not None else ""
           add(begin, "onset", f"{several}severity {change.severity:g}" + ("" if change.schedule == "abrupt" else f", {change.schedule}"))
           if change.duration and begin + change.duration < c.steps:
@@ -287,18 +303,21 @@ class Runner:
       decisions = trace["decision"][:, g]
       started = {int(trace["since"][i, g]) for i in np.flatnonzero(decisions == phase_lib.START)}
       for step in np.flatnonzero(trace["alarm"][:, g]):
-        if int(step) in started:
-          add(step, "alarm", "acted on" + (", before onset: a false alarm" if step < onset else ""))
+        false = f", {healthy}: a false alarm" if step < onset else ""
+        if trigger.listens and int(step) in started:
+          add(step, "alarm", "acted on" + false)
         else:
           phase = phase_lib.PHASES[trace["phase"][step, g]]
           late = decisions[step // self.chunk_steps] == phase_lib.START  # the phase changes at the end of the chunk
-          why = "arm does not adapt" if arm == "none" else "warm-up" if step < c.adapt.warmup else "an alarm before it was" if late else f"phase {phase}"
-          add(step, "alarm", f"logged, not acted on: {why}" + (", before onset: a false alarm" if step < onset else ""))
+          why = "warm-up" if step < c.adapt.warmup else "an alarm before it was" if late else f"phase {phase}"
+          if not trigger.listens:
+            why = "arm does not adapt" if trigger is NEVER else "arm does not listen"
+          add(step, "alarm", f"logged, not acted on: {why}" + false)
       for i in np.flatnonzero(decisions):
         end = min((i + 1) * self.chunk_steps, c.steps) - 1
         decision = int(decisions[i])
-        kind = {phase_lib.START: "start", phase_lib.STOP: "stop"}.get(decision, "abort")
-        add(end, kind, phase_lib.REASONS[decision] if decision != phase_lib.START else f"alarm at step {int(trace['since'][i, g])}")
+        kind = {phase_lib.START: "start", phase_lib.STOP: "stop", phase_lib.END: "stop"}.get(decision, "abort")
+        add(end, kind, phase_lib.REASONS[decision] if decision != phase_lib.START else f"{trigger.why} at step {int(trace['since'][i, g])}")
     return sorted(events, key=lambda e: (e["stream"], e["step"]))
 
   def _runs(self, trace, events, names) -> list[dict]:
@@ -306,13 +325,17 @@ class Runner:
     c, rows = self.config, []
     control_s = self.env.spec.control_s
     onsets = [c.steps if onset is None else onset for onset in self.onsets()]
-    pre, drop = {}, {}
+    pre, drop, begun = {}, {}, {}
     for g, ((arm, seed), onset) in enumerate(zip(self.labels, onsets)):
       reward = trace["reward"][:, g].astype(float)
       acted = [int(s) for s, d in zip(trace["since"][:, g], trace["decision"][:, g]) if d == phase_lib.START]
-      pre[g] = recovery.reward_pre(reward, onset, c.adapt.warmup, acted[0] if acted else None)
+      begun[g] = acted[0] if acted else None
+      pre[g] = recovery.reward_pre(reward, onset, c.adapt.warmup, begun[g])
       if arm == "none":
         drop[seed] = recovery.reward_drop(reward, onset, pre[g]) if c.fault != "none" and onset < c.steps else None
+    for g, (arm, seed) in enumerate(self.labels):  # no alarm ends the window of an arm that does not listen: the same life goes on in arm `none`
+      if not ARMS[arm].trigger.listens and ("none", seed) in self.labels:
+        pre[g] = pre[self.labels.index(("none", seed))]
     for g, ((arm, seed), onset) in enumerate(zip(self.labels, onsets)):
       reward = trace["reward"][:, g].astype(float)
       own = [e for e in events if e["stream"] == g]
@@ -322,9 +345,10 @@ class Runner:
       outcome = "nominal" if not starts else "adapting"
       if starts and ends and ends[-1]["step"] > starts[-1]:
         reason = ends[-1]["reason"]
-        outcome = "converged" if ends[-1]["kind"] == "stop" else "aborted_by_budget" if reason == phase_lib.REASONS[phase_lib.ABORT_BUDGET] else "aborted_by_rule"
-      never = self.other is not None and onset == c.steps
-      affected = None if drop.get(seed) is None or never else bool(drop[seed] >= 0.1)
+        outcome = OUTCOMES[phase_lib.REASONS.index(reason)]
+      never = self.onsets()[g] is None
+      lost = None if never else drop.get(seed)
+      affected = None if lost is None else bool(lost >= 0.1)
       back = recovery.recovery_step(reward, onset, pre[g])
       rows.append({
           "stream": g, "arm": arm, "seed": seed, "fault": names[g], "onset": None if never else onset,
@@ -332,8 +356,10 @@ class Runner:
           "latency_s": None if score.latency_steps is None else score.latency_steps * control_s, "false_alarms": score.false_alarms,
           "adapt_start": starts[0] if starts else None, "adapt_stop": ends[-1]["step"] if ends else None, "outcome": outcome,
           "reason": ends[-1]["reason"] if ends else None, "affected": affected, "recovery_step": back if affected else None,
-          "reward_pre": pre[g], "reward_drop": drop.get(seed), "reward_final": float(np.mean(reward[-recovery.FINAL:])),
-          "return_lost": recovery.return_lost(reward, onset, pre[g]), "terminations": int(trace["terminated"][:, g].sum()),
+          "reward_pre": pre[g], "reward_drop": lost, "reward_final": float(np.mean(reward[-recovery.FINAL:])),
+          "return_lost": None if never else recovery.return_lost(reward, onset, pre[g]),
+          "return_lost_healthy": recovery.return_lost_healthy(reward, onset, pre[g], begun[g]), "terminations": int(trace["terminated"][:, g].sum()),
+          "adapted_steps": int(np.sum(trace["phase"][:, g] == phase_lib.ADAPTING)),
           "updates": int(self._updates[g]), "wall_s": float(self.stream_seconds[g])})
     return rows
 
@@ -358,10 +384,15 @@ class Runner:
     return out
 
 
+def spared(plan: faults.Plan, breaks) -> faults.Plan:
+  """`plan` for a robot that breaks, bool (); without any severity for one that does not."""
+  return plan._replace(severity=jnp.where(breaks, plan.severity, 0.0))
+
+
 def summarise(rows: list[dict], config: RunConfig, control_s: float) -> dict:
   """Aggregates of one arm. Recovery counts affected streams alone; times are censored medians; means are IQM with bootstrap intervals."""
-  affected = [r for r in rows if r["affected"]]
-  latency = [np.inf if r["latency_steps"] is None else r["latency_steps"] for r in rows]
+  affected, met = [r for r in rows if r["affected"]], [r for r in rows if r["onset"] is not None]
+  latency = [np.inf if r["latency_steps"] is None else r["latency_steps"] for r in met]
   back = [np.inf if r["recovery_step"] is None else r["recovery_step"] - r["onset"] for r in affected]
   out: dict = {"seeds": len(rows), "affected": len(affected)}
 
@@ -371,16 +402,16 @@ def summarise(rows: list[dict], config: RunConfig, control_s: float) -> dict:
   def count(name, hits, n):
     p = bootstrap.wilson(hits, n)
     put(name, hits, None if p is None else [p[0] * n, p[1] * n])
-  count("alarms", sum(np.isfinite(x) for x in latency), len(rows))
+  count("alarms", sum(np.isfinite(x) for x in latency), len(met))
   count("false_alarm_streams", sum(r["false_alarms"] > 0 for r in rows), len(rows))
   hours = sum(config.steps if r["onset"] is None else min(r["onset"], config.steps) for r in rows) * control_s / 3600
   out["false_alarms_per_hour"] = sum(r["false_alarms"] for r in rows) / hours if hours else None
   median = lambda x: bootstrap.finite(bootstrap.censored_median(x)) if len(x) else None
   put("latency_median_steps", median(latency), bootstrap.interval(latency, bootstrap.censored_median) if latency else None)
-  put("miss_probability", float(np.mean(~np.isfinite(latency))), bootstrap.wilson(int(np.sum(~np.isfinite(latency))), len(latency)))
+  put("miss_probability", float(np.mean(~np.isfinite(latency))) if met else None, bootstrap.wilson(int(np.sum(~np.isfinite(latency))), len(latency)))
   hit = [r["latency_steps"] is not None and r["latency_steps"] <= 500 for r in affected]
   count("affected_alarmed_within_500", sum(hit), len(affected))
-  for outcome in ("converged", "aborted_by_rule", "aborted_by_budget", "adapting"):
+  for outcome in dict.fromkeys((*OUTCOMES[phase_lib.STOP:], "adapting")):
     count(outcome, sum(r["outcome"] == outcome for r in rows), len(rows))
   count("recovered", sum(np.isfinite(x) for x in back), len(affected))
   count("recovered_within_10000", sum(x <= 10_000 for x in back), len(affected))
@@ -388,6 +419,9 @@ def summarise(rows: list[dict], config: RunConfig, control_s: float) -> dict:
   for name in ("reward_pre", "reward_drop", "reward_final", "return_lost"):
     values = [r[name] for r in rows if r[name] is not None]
     put(name, float(bootstrap.iqm(values)) if values else None, bootstrap.interval(values) if values else None)
+  for name in ("return_lost_healthy", "adapted_steps", "updates", "terminations", "wall_s"):  # a ledger: what is rare must count
+    values = [r[name] for r in rows if r[name] is not None]
+    put(f"{name}_mean", float(np.mean(values)) if values else None, bootstrap.interval(values, np.mean) if values else None)
   values = [r["reward_final"] for r in affected]
   put("reward_final_affected", float(bootstrap.iqm(values)) if values else None, bootstrap.interval(values) if values else None)
   return out

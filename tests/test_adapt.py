@@ -10,7 +10,7 @@ import pytest
 
 from mjx_cl.adapt import phase as phase_lib
 from mjx_cl.adapt.convergence import SIGNALS, settled
-from mjx_cl.adapt.loop import Loop
+from mjx_cl.adapt.loop import Loop, choices
 from mjx_cl.adapt.phase import ABORT_BELOW, ABORT_BUDGET, ABORT_HOPELESS, ABORTED, ADAPTING, CONVERGED, NOMINAL, START, STOP
 from mjx_cl.config import PRESETS, AdaptConfig
 from mjx_cl.detectors import Alarm, Detector
@@ -258,7 +258,7 @@ RESETS = (45, 130)
 EAGER = AdaptConfig(ratio=3.0, start_windows=20, patience=4, trend=1e9, fluctuation=1e9, fresh_moments=False, least=1, acceptance=-9.0,
                     give_up=9999, budget=9999, warmup=20, refit=REFIT)
 ALARMS = np.array([[37, -1], [37, -1], [17, 100]])  # 17 lies before the end of the warm-up, in a chunk that outlasts it
-ACTS = np.array([True, False, True])
+ARMS = [("detector", 0), ("none", 1), ("detector", 2)]
 
 
 class Script(NamedTuple):
@@ -321,11 +321,11 @@ def tell(kind, config=EAGER, used=0):
   params = jax.tree.map(lambda x: x + 0.01 * jax.random.normal(jax.random.key(x.size), x.shape), train.params)
   state = loop.init(train._replace(params=params, opt=jax.tree.map(lambda x: x + used, train.opt)), 3)
   state = state._replace(detector=state.detector._replace(at=jnp.asarray(ALARMS)))
-  keys = jax.random.split(jax.random.key(1), 3)
+  keys, chosen = jax.random.split(jax.random.key(1), 3), choices(ARMS, config, CHUNKS * STEPS)
   copy = lambda tree: jax.tree.map(lambda x: np.array(x), tree)
   begin, told = copy(state), []
   for c in range(CHUNKS):
-    state, digest = loop.digest(state, hand_rows(c * STEPS), jnp.int32((c + 1) * STEPS), jnp.asarray(ACTS), keys)
+    state, digest = loop.digest(state, hand_rows(c * STEPS), jnp.int32((c + 1) * STEPS), chosen, keys)
     told.append(Told(copy(state), copy(digest)))
   return begin, told
 

@@ -117,7 +117,7 @@ RUN = {
     "detector setting": (["run", "walker", "--set", "windows=5"], ["windows"]),
     "detector setting out of range": (["run", "walker", "--set", "window=1"], ["window"]),
     "setting without a value": (["run", "walker", "--set", "window"], ["name=value"]),
-    "arm": (["run", "walker", "--arm", "detektor"], ["detektor", "detector, none"]),
+    "arm": (["run", "walker", "--arm", "detektor"], ["detektor", "always, detector, no-fault, none, oracle"]),
     "arm twice": (["run", "walker", "--arm", "none", "none"], ["once"]),
     "physics": (["run", "walker", "--physics", "warp"], ["warp", "native"]),
     "form": (["run", "walker", "--form", "papers"], ["papers", "streaming"]),

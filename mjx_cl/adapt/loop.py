@@ -4,18 +4,22 @@ Streams are groups of one member: each has its own parameters. A stream that is 
 """
 from __future__ import annotations
 
-import functools
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from mjx_cl import replay as replay_lib
-from mjx_cl.adapt import phase as phase_lib
+from mjx_cl.adapt import arms as arms_lib, phase as phase_lib
 from mjx_cl.config import AdaptConfig
 from mjx_cl.dreamer.agent import Agent, Batch, TrainState
+from mjx_cl.errors import choose
 from mjx_cl.monitor import History, Monitor, unknown
 from mjx_cl.rollout import records
+
+
+BEHAVIOUR = {"pol", "val", "slow", "range"}  # of a TrainState: what is no world model, moments under the same names
+FRESH = 0  # what a stream's key folds in for new parameters; chunks fold in the control step after them, which is above 0
 
 
 class LoopState(NamedTuple):
@@ -58,6 +62,42 @@ class Digest(NamedTuple):
   skipped: jax.Array
 
 
+class Choices(NamedTuple):
+  """The arms of a run as arrays, leading (groups,); see arms.Arm.
+
+  Attributes:
+    listens: bool, alarms are acted on. at: int32 (groups, K), control steps at which adaptation is due, FOREVER: none.
+    rule: bool, stop and abort rules are in force. limit: int32, most control steps of one adaptation.
+    world_only: bool, actor and critic keep what they are. fresh: bool, every start draws new parameters.
+  """
+  listens: jax.Array
+  at: jax.Array
+  rule: jax.Array
+  limit: jax.Array
+  world_only: jax.Array
+  fresh: jax.Array
+
+
+def choices(labels, config: AdaptConfig, steps: int, onsets=None) -> Choices:
+  """Choices of streams.
+
+  Args:
+    labels: (arm, seed) of each. steps: of the run.
+    onsets: true onsets of each robot, unless its arm spares it, as control steps, FOREVER: not known yet; None: no faults.
+  Raises:
+    UserError where an arm's schedule does not fit into the run.
+  """
+  arms = [choose("arm", arm, arms_lib.ARMS) for arm, _ in labels]
+  onsets = [()] * len(arms) if onsets is None else onsets
+  at = [arm.trigger.steps(config, own if arm.breaks else (), steps, seed) for arm, own, (_, seed) in zip(arms, onsets, labels)]
+  width = max(1, max(map(len, at)))
+  at = [[step if step < steps else arms_lib.FOREVER for step in row] + [arms_lib.FOREVER] * (width - len(row)) for row in at]
+  flags = lambda get: jnp.asarray([get(arm) for arm in arms], bool)
+  return Choices(flags(lambda a: a.trigger.listens), jnp.asarray(at, jnp.int32), flags(lambda a: a.end.rule),
+                 jnp.asarray([a.end.limit(config) for a in arms], jnp.int32), flags(lambda a: a.world_only),
+                 flags(lambda a: a.fresh))
+
+
 class Loop:
   """Monitor, detector, phase machine and learner of a run.
 
@@ -84,11 +124,11 @@ class Loop:
     return LoopState(spread(train), spread(train.params), spread(empty), self.monitor.init(groups, 1), spread(self.detector.init()), spread(phase_lib.init(self.config)),
                      past, jnp.zeros(groups), jnp.zeros(groups, jnp.int32))
 
-  def _digest(self, state: LoopState, rows, now, acts, keys, acceptance=None):
+  def _digest(self, state: LoopState, rows, now, choices: Choices, keys, acceptance=None):
     """One chunk.
 
     Args:
-      rows: rollout.Row, leading (T, groups, 1). now: int32 (), control steps done after the chunk. acts: bool (groups,).
+      rows: rollout.Row, leading (T, groups, 1). now: int32 (), control steps done after the chunk. choices: of the streams.
       keys: (groups,), each stream's own, so that what a stream draws does not depend on its neighbours.
       acceptance: float32 (groups,), of the robot that each stream has by now, where robots change; None: that of `spec`.
     Returns:
@@ -113,12 +153,19 @@ class Loop:
     acted = alarms.fired & (known >= self.config.warmup)[:, None]
     first = jnp.argmax(acted, 0)
     alarm_step = known[first]
+    # a start that is due at step s is known before the step is taken, so that replay begins with its row
+    opened = now - length * self.repeat
+    falls = (choices.at >= jnp.maximum(opened, self.config.warmup)) & (choices.at < now)
+    due, at = jnp.any(falls, 1), jnp.min(jnp.where(falls, choices.at, now), 1)
+    first = jnp.where(due, -((opened - at) // self.repeat) - 1, first)
+    alarm_step = jnp.where(due, at, alarm_step)
     if acceptance is None or self.config.acceptance is not None:
       acceptance = self.spec.acceptance if self.config.acceptance is None else self.config.acceptance
-    step = functools.partial(phase_lib.update, config=self.config)
+    step = lambda *x: phase_lib.update(*x[:-3], self.config, *x[-3:])
     was = state.phase.phase
-    phase, decision, ok = jax.vmap(step, (0, 0, 0, 0, 0, None, 0, 0 if jnp.ndim(acceptance) else None, None))(
-        state.phase, signals, posture, jnp.any(acted, 0), alarm_step, now, acts, acceptance, least_posture)
+    phase, decision, ok = jax.vmap(step, (0, 0, 0, 0, 0, None, 0, 0 if jnp.ndim(acceptance) else None, None, 0, 0, 0))(
+        state.phase, signals, posture, jnp.any(acted, 0), alarm_step, now, choices.listens, acceptance, least_posture,
+        due, choices.rule, choices.limit)
 
     # replay holds what came after the alarm and nothing else
     begins = decision == phase_lib.START
@@ -133,24 +180,25 @@ class Loop:
     due = (phase.phase == phase_lib.ADAPTING) & (windows >= self.config.start_windows)
     owed = jnp.where(due, state.owed + length * self.config.ratio / (c.batch * c.length), 0.0)
     number = jnp.floor(owed + 1e-6).astype(jnp.int32)
-    train = state.train
+    train, acting = self._renew(state.train, state.acting, keys, begins & choices.fresh)
     if self.config.fresh_moments:
       fresh = jax.vmap(self.agent.optimizer.init)(train.params)
       reset = lambda new, old: jnp.where(begins.reshape((-1,) + (1,) * (old.ndim - 1)), new, old)
       train = train._replace(opt=jax.lax.cond(jnp.any(begins), lambda o: jax.tree.map(reset, fresh, o), lambda o: o, train.opt))
     counted = train.updates
-    train, replay = self._learn(train, replay, key_update, number)
+    train, replay = self._learn(train, replay, key_update, number, choices.world_only)
     taken = train.updates - counted
 
     # the robot acts by a moving average of what it learns, and keeps it when it is done
     rate = jnp.where(number > 0, self.config.average, 0.0)
     ended = (was == phase_lib.ADAPTING) & (phase.phase != phase_lib.ADAPTING)
     wide = lambda x, like: x.reshape((-1,) + (1,) * (like.ndim - 1))
-    acting = jax.tree.map(lambda a, p: a + wide(rate, a) * (p - a), state.acting, train.params)
+    acting = jax.tree.map(lambda a, p: a + wide(rate, a) * (p - a), acting, train.params)
     train = train._replace(params=jax.tree.map(lambda a, p: jnp.where(wide(ended, a), a, p), acting, train.params))
 
-    # a stream that has converged watches again, its reference refitted on the latest rows
-    detector = jax.lax.cond(jnp.any(decision == phase_lib.STOP), self._refit, lambda d, p, s: d, detector, past, decision == phase_lib.STOP)
+    # a stream that is done watches again, its reference refitted on the latest rows
+    over = (decision == phase_lib.STOP) | (decision == phase_lib.END)
+    detector = jax.lax.cond(jnp.any(over), self._refit, lambda d, p, s: d, detector, past, over)
     state = LoopState(train, acting, replay, history, detector, phase, past, owed - number, state.executed + taken)
     return state, Digest(residual, alarms.score, alarms.fired, signals, ok, phase.phase, decision, phase.since, state.executed, number - taken)
 
@@ -177,20 +225,29 @@ class Loop:
       return metrics["loss/dyn"], metrics["adv_mag"], metrics["loss/value"]
     return jax.vmap(one)(train, batch, keys)
 
-  def _learn(self, train: TrainState, replay, keys, number):
+  def _renew(self, train: TrainState, acting, keys, fresh):
+    """New parameters, moments and counters where `fresh` (groups,). Loops for the reason given in `_learn`."""
+    def stream(g, state):
+      def renew(_, state):
+        train, acting = state
+        new = self.agent.init(jax.random.fold_in(keys[g], FRESH))
+        return put(train, g, new), put(acting, g, new.params)
+      return jax.lax.fori_loop(0, fresh[g].astype(jnp.int32), renew, state)
+    return jax.lax.fori_loop(0, fresh.shape[0], stream, (train, acting))
+
+  def _learn(self, train: TrainState, replay, keys, number, world_only):
     """`number` (groups,) updates for each stream. Nested loops with their own trip counts: the carry is changed in place, so a stream
     without an update costs neither arithmetic nor a copy (`vmap` would compute all, `lax.map` would copy all)."""
     c = self.agent.config
-    take = lambda tree, g: jax.tree.map(lambda x: jax.lax.dynamic_index_in_dim(x, g, keepdims=False), tree)
-    put = lambda tree, g, value: jax.tree.map(lambda x, v: jax.lax.dynamic_update_index_in_dim(x, v, g, 0), tree, value)
 
     def stream(g, state):
       def update(i, state):
         train, replay = state
         key_sample, key_update = jax.random.split(jax.random.fold_in(keys[g], i))
         own, data, address = replay_lib.sample(take(replay, g), key_sample, c.batch, c.length + 1)
-        learnt, _, latents = self.agent.update(take(train, g), data, key_update)
-        return put(train, g, learnt), put(replay, g, replay_lib.refresh(own, address, latents))
+        before = take(train, g)
+        learnt, _, latents = self.agent.update(before, data, key_update)
+        return put(train, g, keep_behaviour(world_only[g], before, learnt)), put(replay, g, replay_lib.refresh(own, address, latents))
       return jax.lax.fori_loop(0, number[g], update, state)
     return jax.lax.fori_loop(0, number.shape[0], stream, (train, replay))
 
@@ -198,3 +255,24 @@ class Loop:
     fresh = jax.tree.map(lambda x: jnp.broadcast_to(x, (stop.shape[0],) + x.shape), self.detector.init())
     fresh, _ = jax.lax.scan(jax.vmap(self.detector.update), fresh, past)
     return jax.tree.map(lambda a, b: jnp.where(stop.reshape((-1,) + (1,) * (a.ndim - 1)), a, b), fresh, detector)
+
+
+def take(tree, g):
+  """Entry g of every leaf."""
+  return jax.tree.map(lambda x: jax.lax.dynamic_index_in_dim(x, g, keepdims=False), tree)
+
+
+def put(tree, g, value):
+  """`tree` with `value` as entry g of every leaf."""
+  return jax.tree.map(lambda x, v: jax.lax.dynamic_update_index_in_dim(x, v, g, 0), tree, value)
+
+
+def keep_behaviour(keep, before: TrainState, after: TrainState) -> TrainState:
+  """`after`, where `keep` (): with actor, critic, slow critic, range of the returns, and the moments of actor and critic as `before`.
+
+  Zero gradients alone would not do: momentum moves what has none. The value loss on replay still shapes the features, as in every arm.
+  """
+  def one(path, old, new):
+    names = {getattr(part, "key", getattr(part, "name", None)) for part in path}
+    return jnp.where(keep, old, new) if names & BEHAVIOUR else new
+  return jax.tree_util.tree_map_with_path(one, before, after)

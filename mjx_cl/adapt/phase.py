@@ -1,4 +1,5 @@
-"""The phase of one stream: nominal --alarm--> adapting --> converged | aborted. One call per chunk, every decision has a reason."""
+"""The phase of one stream: nominal --alarm or schedule--> adapting --> converged | aborted | ended. One call per chunk, every decision has a
+reason."""
 from __future__ import annotations
 
 from typing import NamedTuple
@@ -9,16 +10,17 @@ import jax.numpy as jnp
 from mjx_cl.adapt.convergence import SIGNALS, settled
 from mjx_cl.config import AdaptConfig
 
-NOMINAL, ADAPTING, CONVERGED, ABORTED = range(4)
-PHASES = ("nominal", "adapting", "converged", "aborted")
+NOMINAL, ADAPTING, CONVERGED, ABORTED, ENDED = range(5)
+PHASES = ("nominal", "adapting", "converged", "aborted", "ended")
 # decisions of a chunk
-NOTHING, START, STOP, ABORT_BELOW, ABORT_HOPELESS, ABORT_BUDGET = range(6)
-REASONS = ("", "alarm", "all six signals settled, task acceptable", "settled below acceptance", "no settling in sight", "budget spent")
+NOTHING, START, STOP, ABORT_BELOW, ABORT_HOPELESS, ABORT_BUDGET, END = range(7)
+REASONS = ("", "alarm", "all six signals settled, task acceptable", "settled below acceptance", "no settling in sight", "budget spent",
+           "fixed number of steps over")
 
 
 class PhaseState(NamedTuple):
   """Attributes:
-    phase: int32 (). since: int32 (), control step of the alarm. ring (patience, 6), count (): chunk signals since the alarm.
+    phase: int32 (). since: int32 (), control step of the alarm or of the schedule. ring (patience, 6), count (): chunk signals since the alarm.
     best, best_at: float32 (), int32 (): highest reward over a patience since the alarm, and when it was reached.
     mean, square, number: running moments of the nominal signals, (6,), (6,), (6,).
     posture (patience,): mean posture per chunk.
@@ -48,21 +50,26 @@ def nominal_std(state: PhaseState) -> jax.Array:
   return jnp.sqrt(jnp.maximum(0.0, state.square / jnp.maximum(1.0, state.number - 1.0)))
 
 
-def update(state: PhaseState, signals, posture, alarm, alarm_step, now, acts, acceptance, least_posture, config: AdaptConfig):
+def update(state: PhaseState, signals, posture, alarm, alarm_step, now, acts, acceptance, least_posture, config: AdaptConfig, due=False, rule=True,
+           limit=None):
   """One chunk.
 
   Args:
     signals: float32 (6,), means over the chunk in the order of SIGNALS, nan where unknown.
     posture: float32 (), mean posture over the chunk.
-    alarm, alarm_step: bool (), an alarm fell in this chunk, at which control step.
+    alarm: bool (), an alarm fell in this chunk. alarm_step: int32 (), control step of the alarm, or of what was due.
     now: int32 (), control steps done after this chunk.
     acts: bool (), the stream's arm acts on alarms.
     acceptance, least_posture: float32 (), levels of the task.
+    due: bool (), a start of the arm's schedule fell in this chunk.
+    rule: bool (), the stop and abort rules are in force; without them adaptation ends after `limit` alone, as `ended`.
+    limit: int32 (), most control steps of adaptation, None: config.budget.
   Returns:
     (state', decision int32 (), settled bool (6,)).
   """
-  watching = (state.phase == NOMINAL) | (state.phase == CONVERGED)
-  begins = watching & alarm & acts & (now > config.warmup)
+  limit = config.budget if limit is None else limit
+  watching = (state.phase == NOMINAL) | (state.phase == CONVERGED) | (state.phase == ENDED)
+  begins = watching & ((alarm & acts) | due) & (now > config.warmup)
   adapting = state.phase == ADAPTING
 
   # nominal levels: Welford, until the first adaptation
@@ -87,14 +94,15 @@ def update(state: PhaseState, signals, posture, alarm, alarm_step, now, acts, ac
   better = full & (reward > state.best + 0.05 * acceptance)
   best = jnp.where(better, reward, state.best)
   best_at = jnp.where(better, now, state.best_at)
-  stuck = full & (age >= config.give_up) & (now - best_at >= config.give_up // 3) & (~accepted | (age >= 5 * config.give_up // 4))
+  stuck = full & (age >= config.give_up) & (now - best_at >= config.give_up // 3) & (~accepted | (age >= 5 * config.give_up // 4)) & rule
 
-  stop = full & jnp.all(ok) & accepted
+  stop = full & jnp.all(ok) & accepted & rule
   below = jnp.all(ok) & ~accepted & stuck
   hopeless = stuck & ~below & ~stop
-  spent = adapting & (age >= config.budget) & ~stop & ~stuck
-  decision = jnp.select([begins, stop, below, hopeless, spent], [START, STOP, ABORT_BELOW, ABORT_HOPELESS, ABORT_BUDGET], NOTHING)
-  phase = jnp.select([begins, stop, below | hopeless | spent], [ADAPTING, CONVERGED, ABORTED], state.phase)
+  spent = adapting & (age >= limit) & ~stop & ~stuck
+  end = spent & ~rule
+  decision = jnp.select([begins, stop, below, hopeless, end, spent], [START, STOP, ABORT_BELOW, ABORT_HOPELESS, END, ABORT_BUDGET], NOTHING)
+  phase = jnp.select([begins, stop, end, below | hopeless | spent], [ADAPTING, CONVERGED, ENDED, ABORTED], state.phase)
   state = state._replace(
       phase=phase.astype(jnp.int32), since=jnp.where(begins, alarm_step, state.since).astype(jnp.int32), best=jnp.where(begins, -jnp.inf, best),
       best_at=jnp.where(begins, now, best_at).astype(jnp.int32), count=jnp.where(begins, 0, state.count).astype(jnp.int32),

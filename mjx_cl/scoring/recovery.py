@@ -51,3 +51,16 @@ def recovery_step(reward: np.ndarray, onset: int, pre: float | None) -> int | No
 def return_lost(reward: np.ndarray, onset: int, pre: float | None) -> float | None:
   """Sum of (reward_pre - reward) from onset on."""
   return None if pre is None else float(np.sum(pre - reward[onset:]))
+
+
+def return_lost_healthy(reward: np.ndarray, onset: int, pre: float | None, start: int | None) -> float | None:
+  """What adapting a healthy robot cost: sum of (reward_pre - reward) from the first start of adaptation to the onset.
+
+  Args:
+    onset: the number of steps for a robot that never breaks. start: control step of the alarm, or of whatever else started adaptation; None: nothing.
+  Returns:
+    0 where nothing started before onset; None where there is no reward_pre to compare with.
+  """
+  if start is None or start >= onset:
+    return 0.0
+  return None if pre is None else float(np.sum(pre - reward[start:onset]))

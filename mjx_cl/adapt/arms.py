@@ -1,0 +1,96 @@
+"""What is compared: arms of a run. `ARMS` is the one table; a new arm is a line in it.
+
+An arm is a set of choices and holds no code of its own: what starts adaptation, what ends it, what learns, which weights it starts from, and whether
+the robot breaks at all. `loop.choices` turns the arms of a run into arrays over its streams, so that one compiled program serves any mix of
+them. Free of JAX, as config.py.
+"""
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from mjx_cl.errors import UserError
+
+FOREVER = 2**31 - 1  # steps that no run outlasts
+
+
+@dataclass(frozen=True)
+class Trigger:
+  """What starts adaptation.
+
+  Attributes:
+    why: the words that events.parquet says, with the step.
+    steps: (AdaptConfig, onsets of the robot, steps of the run, seed) -> control steps at which adaptation is due. One that falls into an
+      adaptation or into the warm-up starts nothing.
+    listens: alarms of the detector are acted on, after the warm-up.
+  """
+  why: str
+  steps: Callable[..., tuple[int, ...]] = lambda adapt, onsets, steps, seed: ()
+  listens: bool = False
+
+
+@dataclass(frozen=True)
+class End:
+  """What ends adaptation.
+
+  Attributes:
+    rule: stop and abort rules of the phase machine are in force. limit: AdaptConfig -> most control steps of one adaptation.
+  """
+  rule: bool
+  limit: Callable[..., int]
+
+
+@dataclass(frozen=True)
+class Arm:
+  """Attributes:
+    about: one line for `mjx-cl list arms`.
+    trigger, end: when it adapts.
+    world_only: the world model learns; actor, critic and all that belongs to them stay as they are.
+    fresh: parameters, moments and counters are drawn anew from the stream's seed at every start. The latent that the robot carries runs on.
+    breaks: the robot gets the run's faults; False: their severity is 0.
+  """
+  about: str
+  trigger: Trigger
+  end: End
+  world_only: bool = False
+  fresh: bool = False
+  breaks: bool = True
+
+
+def _random(adapt, onsets, steps, seed):
+  """One step, uniform over those from which a whole adaptation fits into the run."""
+  import numpy as np
+  last = steps - adapt.random_steps
+  if last < adapt.warmup:
+    raise UserError(f"arm 'random' needs warmup + random_steps = {adapt.warmup + adapt.random_steps} steps; the run has {steps}")
+  return (int(np.random.default_rng([seed, 8]).integers(adapt.warmup, last + 1)),)
+
+
+NEVER = Trigger("")
+ALARM = Trigger("alarm", listens=True)
+ONSET = Trigger("true onset", lambda adapt, onsets, steps, seed: tuple(max(onset, adapt.warmup) for onset in onsets))
+PERIOD = Trigger("schedule", lambda adapt, onsets, steps, seed: tuple(range(adapt.period, steps, adapt.period)))
+RANDOM = Trigger("random time", _random)
+AT_ONCE = Trigger("end of the warm-up", lambda adapt, onsets, steps, seed: (adapt.warmup,))
+
+RULE = End(True, lambda adapt: adapt.budget)
+BUDGET = End(False, lambda adapt: adapt.budget)
+PERIOD_STEPS = End(False, lambda adapt: adapt.period_steps)
+RANDOM_STEPS = End(False, lambda adapt: adapt.random_steps)
+NO_END = End(False, lambda adapt: FOREVER)
+
+ARMS: dict[str, Arm] = {
+    "detector": Arm("finetuning starts on the detector's alarm", ALARM, RULE),
+    "none": Arm("no adaptation; alarms are logged", NEVER, NO_END),
+    "always": Arm("finetuning from the end of the warm-up on, without an end", AT_ONCE, NO_END),
+    "periodic": Arm("finetuning every --adapt.period steps, for --adapt.period-steps; over 25,000 steps about the updates of one detected fault",
+                    PERIOD, PERIOD_STEPS),
+    "random": Arm("finetuning once, at a time drawn from the seed, for --adapt.random-steps; about the updates of one detected fault",
+                  RANDOM, RANDOM_STEPS),
+    "oracle": Arm("finetuning starts at the true onset, ends by the stop rule", ONSET, RULE),
+    "oracle-budget": Arm("finetuning starts at the true onset, ends after --adapt.budget steps whatever the signals say: the run from which the best "
+                         "stop is chosen afterwards", ONSET, BUDGET),
+    "scratch": Arm("at the true onset all parameters are drawn anew; ends by the stop rule", ONSET, RULE, fresh=True),
+    "world-model": Arm("as detector, but the world model alone learns; actor and critic stay", ALARM, RULE, world_only=True),
+    "no-fault": Arm("as detector, on a robot that never breaks: what false alarms cost", ALARM, RULE, breaks=False),
+}
