@@ -96,7 +96,7 @@ def entry(name: str, settings: dict) -> Entry:
   parameters = inspect.signature(factory).parameters
   calibrated = "threshold" in parameters or any(p.kind is p.VAR_KEYWORD for p in parameters.values())
   about = (inspect.getdoc(factory) or "").split("\n")[0]
-  build = (lambda threshold: detectors_lib.make(use, threshold=threshold, **settings)) if calibrated else (lambda threshold: detectors_lib.make(use, **settings))
+  build = lambda threshold: detectors_lib.make(use, **settings, **({"threshold": threshold} if calibrated else {}))
   return Entry(name, build, calibrated, bool(getattr(factory, "reference", False)), about)
 
 
@@ -188,7 +188,8 @@ def examine(one: Entry, data: Data, nominal, faults, run=None) -> Found:
   fault_fired, fault_score = (np.asarray(x)[:, :steps, :streams] for x in out)
   alarms = dict(tried)
   pairs = [(alarms[t], f) for t, f in zip(levels, fault_fired) if t in alarms]
-  return found(data, float(np.float32(threshold)) if one.calibrated else None, fired, score, fault_fired[0], fault_score[0], us, curve(pairs, data, counted))
+  points = curve(pairs, data, counted)
+  return found(data, float(np.float32(threshold)) if one.calibrated else None, fired, score, fault_fired[0], fault_score[0], us, points)
 
 
 def curve(pairs, data: Data, counted: float) -> list[dict]:
@@ -240,11 +241,11 @@ def _row(name, reference, data, key, alarms, oracle, threshold=None, arl0=None, 
   known = {k: oracle.limits[k] for k in ("information_nats_per_step", "information_nats_per_step_ci", "optimal_delay_steps")}
   tells = name == ORACLES[1 if oracle.run else 0]  # the row that says why a limit is unknown
   notes = [n for n in (share["note"], oracle.limits["note"] if tells else None) if n]
-  arl0, episode = arl0 or {"arl0": None, "arl0_ci": None, "alarms": None, "few": False}, episode or {}
+  arl0 = arl0 or {"arl0": None, "arl0_ci": None, "alarms": None, "few": False}
   return {"detector": name, "reference": reference, "robot": data.robot, "fault": key[0], "severity": key[1],
           "threshold": threshold if threshold is None or math.isfinite(threshold) else None,
           "arl0": arl0["arl0"], "arl0_ci": arl0["arl0_ci"], "arl0_alarms": arl0["alarms"], "arl0_few": arl0["few"],
-          "episode_alarm_probability": episode.get("episode_alarm_probability"), "episode_alarm_probability_ci": episode.get("episode_alarm_probability_ci"),
+          **{k: (episode or {}).get(k) for k in ("episode_alarm_probability", "episode_alarm_probability_ci")},
           **row, "us_per_sample": us, **known, "oracle_delay_steps": share["oracle_delay_steps"], "delay_steps": share["delay_steps"],
           "efficiency": share["efficiency"], "efficiency_ci": share["efficiency_ci"], "note": "; ".join(notes) or None}
 
@@ -316,10 +317,10 @@ def _guarded(one: Entry, data: Data, nominal, faults, run) -> Found:
   except UserError:
     raise
   except jax.errors.ConcretizationTypeError as e:
-    raise UserError(f"detector {one.name!r} cannot be calibrated: its threshold is traced, several run side by side, so no Python `if` may look at it or at a "
-                    "sample (jnp.where does)") from e
+    raise UserError(f"detector {one.name!r} cannot be calibrated: its threshold is traced, several run side by side, so no Python `if` may look at it "
+                    "or at a sample (jnp.where does)") from e
   except Exception as e:
-    raise UserError(f"detector {one.name!r} failed: {type(e).__name__}: {str(e).strip().splitlines()[0] if str(e).strip() else 'without a message'}") from e
+    raise UserError(f"detector {one.name!r} failed: {type(e).__name__}: {(str(e).strip() or 'without a message').splitlines()[0]}") from e
 
 
 def _pages(data: Data, oracle: dict, alarms: dict) -> list[dict]:
@@ -354,8 +355,11 @@ def write(board: Board, out, meta: dict) -> list[str]:
     flat = [_flat(r) for r in rows]
     store.write_table(out / f"{name}.parquet", {k: [r.get(k) for r in flat] for k in dict.fromkeys(k for r in flat for k in r)})
   hidden = ("stream_latency_steps", "stream_healthy_alarms", "healthy_steps")
-  meta = meta | {"references": sorted({r["detector"] for r in board.rows if r["reference"]}), "critical_difference": board.overall.critical_difference, "friedman_p": board.overall.friedman_p, "blocks": board.overall.blocks}
-  page.write(out / "leaderboard.html", [{k: v for k, v in r.items() if k not in hidden} for r in board.rows], board.overall.rows, board.curves, board.faults, meta)
+  overall = board.overall
+  meta = meta | {"references": sorted({r["detector"] for r in board.rows if r["reference"]}), "critical_difference": overall.critical_difference,
+                 "friedman_p": overall.friedman_p, "blocks": overall.blocks}
+  shown = [{k: v for k, v in r.items() if k not in hidden} for r in board.rows]
+  page.write(out / "leaderboard.html", shown, overall.rows, board.curves, board.faults, meta)
   store.write_json(out / "leaderboard.json", meta)
   return [str(out / f) for f in ("leaderboard.parquet", "leaderboard_overall.parquet", "leaderboard.html", "leaderboard.json")]
 

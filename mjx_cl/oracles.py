@@ -65,8 +65,8 @@ def _known(normal: np.ndarray, after: np.ndarray, arl0: float) -> tuple[limits.P
   fit, no_fit = _attempt(lambda: limits.fit(normal, after, ORDER))
   information, no_information = _attempt(lambda: limits.information(normal, after, ORDER))
   form, no_form = _attempt(lambda: limits.closed_form(normal[..., 0], after[..., 0], arl0, ORDER))
-  unknown = {"information_nats_per_step": None, "information_nats_per_step_ci": None, "optimal_delay_steps": None, "note": no_fit or no_information or no_form}
-  return fit, unknown | (information or {}) | (form or {})
+  unknown = dict.fromkeys(("information_nats_per_step", "information_nats_per_step_ci", "optimal_delay_steps"))
+  return fit, unknown | {"note": no_fit or no_information or no_form} | (information or {}) | (form or {})
 
 
 def _thresholds(ratio: np.ndarray, lanes: int, count_from: int, most: float) -> np.ndarray:

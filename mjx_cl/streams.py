@@ -72,14 +72,16 @@ class Suite:
     need(self.nominal["steps"] > self.count_from, "nominal steps must exceed count_from")
     need(min(self.nominal["score"], self.nominal["tune"]) >= 1, "[nominal] needs one or more streams per seed of either split")
     (a, b), (c, d) = (self.seeds[s] for s in ("score", "tune"))
-    need(min(a, c) >= 0 and a <= b and c <= d and (b < c or d < a), "the seeds that score and the seeds that tune must be two ranges without a common seed")
+    apart = min(a, c) >= 0 and a <= b and c <= d and (b < c or d < a)
+    need(apart, "the seeds that score and the seeds that tune must be two ranges without a common seed")
     need(bool(self.robots), "no [robots.NAME]")
     for robot, splits in self.robots.items():
       need(set(splits) <= {"score", "tune"} and splits.get("score"), f"robot {robot!r} needs a table `score`, and may have `tune`")
       both = {k.split(":")[0] for k in splits["score"]} & {k.split(":")[0] for k in splits.get("tune", {})}
       need(not both, f"robot {robot!r}: {', '.join(sorted(both))} is to tune and to score; take different faults")
       for key, severities in ((k, v) for s in splits.values() for k, v in s.items()):
-        need(bool(severities) and all(isinstance(x, (int, float)) and 0 < x <= 1 for x in severities), f"robot {robot!r}, {key}: severities in (0, 1]")
+        sound = bool(severities) and all(isinstance(x, (int, float)) and 0 < x <= 1 for x in severities)
+        need(sound, f"robot {robot!r}, {key}: severities in (0, 1]")
       for table in splits.values():
         named = [(key.split(":")[0], float(x)) for key, severities in table.items() for x in severities]
         twice = sorted({f"{fault} {x:g}" for fault, x in named if named.count((fault, x)) > 1})
@@ -274,7 +276,8 @@ class StreamSet:
       self._fill(robot, int(number), int(m["steps"][at[column]]), out, z, column)
     groups = np.stack([out[f"group_{k}"] for k in range(GROUPS)], -1)
     valid = np.isfinite(out["opr"])
-    residual = Residual(out["opr"], out["rpr"], np.zeros(shape + (0,), np.float32), valid, groups, out["reward"], out["terminated"], out["surprise"], z)
+    none = np.zeros(shape + (0,), np.float32)
+    residual = Residual(out["opr"], out["rpr"], none, valid, groups, out["reward"], out["terminated"], out["surprise"], z)
     onset = np.where(m["kind"][at] == "fault", np.nan_to_num(m["onset"][at].astype(float), nan=steps), steps).astype(int)
     return Streams(residual, out["episode"], m["stream"][at].astype(int), m["seed"][at].astype(int), onset, m["fault"][at].tolist(),
                    m["target"][at].tolist(), m["severity"][at].astype(float), float(m["control_s"][at[0]]))

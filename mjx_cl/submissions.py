@@ -1,4 +1,4 @@
-"""Other ways onto the leaderboard than a registered detector: a plain Python class, a file of scores; and the streams as plain files for the latter."""
+"""Other ways onto the leaderboard than a registered detector: a plain Python class, a file of scores, and for the latter the streams as plain files."""
 from __future__ import annotations
 
 import math
@@ -103,7 +103,8 @@ def read_submission(path, streams: StreamSet, robots=()) -> dict[int, np.ndarray
   for n, whole in ((int(n), int(p)) for n, k, p in zip(m["stream"], m["kind"], m["prefix"]) if k == "probe" and int(n) in want):
     first = _differ(out[whole][:want[n]], out[n])
     if first is not None:
-      raise FileError(f"{path}: the score looks ahead: stream {n} is stream {whole} cut off after {want[n]} steps, yet their scores differ from step {first} on")
+      raise FileError(f"{path}: the score looks ahead: stream {n} is stream {whole} cut off after {want[n]} steps, "
+                      f"yet their scores differ from step {first} on")
   return out
 
 
@@ -176,8 +177,8 @@ def export(streams: StreamSet, folder, robots=()) -> list[str]:
     for n, steps in streams.scored((robot,)).items():
       one = streams.get(robot, [n])
       r = one.residual
-      values = {"stream": np.full(steps, n, np.int32), "step": np.arange(steps, dtype=np.int32), "episode": one.episode[:, 0], "terminated": r.terminated[:, 0],
-                **{c: (r.groups[:, 0, int(c[6:])] if c.startswith("group_") else getattr(r, c)[:, 0]) for c in COLUMNS}}
+      values = {"stream": np.full(steps, n, np.int32), "step": np.arange(steps, dtype=np.int32), "episode": one.episode[:, 0],
+                "terminated": r.terminated[:, 0], **{c: (r.groups[:, 0, int(c[6:])] if c.startswith("group_") else getattr(r, c)[:, 0]) for c in COLUMNS}}
       for k, v in values.items():
         table[k].append(v)
     store.write_table(folder / f"{robot}.parquet", {k: np.concatenate(v) for k, v in table.items()}, level=9)
