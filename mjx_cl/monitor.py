@@ -124,6 +124,12 @@ class Monitor:
     residual = Residual(opr, rpr, variables, valid, variables @ self._groups, rows.reward, rows.terminated, surprise, latent)
     return self._last(history, seq), residual
 
+  def update_each(self, params, history: History, rows, keys: jax.Array):
+    """`update` with a key for each member, (groups, members): no member's residuals depend on which others there are, but for the last digit."""
+    alone = lambda tree: jax.tree.map(lambda x: x[:, :, None], tree)
+    each = lambda h, r, k: self.update(params, alone(h), alone(r), k)
+    return jax.tree.map(lambda x: x[:, :, :, 0], jax.vmap(each, (2, 2, 1), 2)(history, rows, keys))
+
   def remember(self, history: History, rows) -> History:
     """The history after a chunk, as `update` gives it, without looking."""
     return self._last(history, self._join(history, rows))

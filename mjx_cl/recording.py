@@ -14,6 +14,7 @@ from mjx_cl.errors import FileError, UserError
 from mjx_cl.streams import COLUMNS, LATENT, META, SCHEMA, VERSION, Suite
 
 CHUNK = 64
+WATCH = 2_000  # what is folded into a lane's key for the monitor's draws
 
 
 class Lane(NamedTuple):
@@ -27,7 +28,8 @@ class Lane(NamedTuple):
 
 def lanes(suite_: Suite, robot: str, split: str) -> list[Lane]:
   """The robots of one fault recording: every seed healthy first, then every fault, severity and seed. The split `tune` repeats the faults that
-  score on seeds that do not, for oracles that must be fitted; of those OPR and RPR alone are kept."""
+  score on seeds that do not, for oracles that must be fitted; of those OPR and RPR alone are kept. A fault's own noise is drawn by its place in the
+  suite: new faults belong behind the others, which then live as before."""
   seeds, tables = suite_.numbers(split), suite_.robots[robot]
   out = [Lane(seed) for seed in seeds]
   for source in ("score", "tune"):
@@ -70,14 +72,16 @@ def _record(env, trained, lanes_: list[Lane], keys, onsets, steps: int, watch_fr
   state = nest(begin, 0, 0)(keys[None], jax.tree.map(lambda x: x[None], plans), jnp.asarray(target)[None])
   params = jax.tree.map(lambda x: x[None], trained.train.params)
   healthy = sum(lane.fault is None for lane in lanes_)
-  watch, remember = jax.jit(monitor.update), jax.jit(monitor.remember)
+  watch, remember = jax.jit(monitor.update_each), jax.jit(monitor.remember)
+  draws = jax.vmap(lambda key, chunk: jax.random.fold_in(jax.random.fold_in(key, WATCH), chunk), (0, None))
   history = monitor.init(1, len(lanes_))
   out: dict[str, list] = {c: [] for c in COLUMNS + ("episode", "terminated", "latent")}
   for chunk in range(-(-steps // CHUNK)):
     state, rows = rollout.chunk(params, state, CHUNK)
     everyone = (chunk + 1) * CHUNK > watch_from
     take = (lambda x: x) if everyone else (lambda x: x[:, :, :healthy])
-    _, seen = watch(params, jax.tree.map(take, history), jax.tree.map(take, rows), jax.random.split(jax.random.fold_in(keys[0], chunk), 1))
+    own = draws(keys if everyone else keys[:healthy], chunk)[None]
+    _, seen = watch(params, jax.tree.map(take, history), jax.tree.map(take, rows), own)
     history = remember(history, rows)
     seen = jax.tree.map(lambda x: np.asarray(x)[:, 0], seen)
     wide = lambda x: x if everyone else np.concatenate([x, np.full((CHUNK, len(lanes_) - healthy) + x.shape[2:], np.nan, np.float32)], 1)
@@ -159,7 +163,8 @@ def prepare(suite_: Suite, robots, physics: str, agent: str | None) -> dict[str,
   return out
 
 
-def record(suite_: Suite, out, robots=(), physics: str = "auto", agent: str | None = None, command: str = "", progress=lambda part, done, steps, lanes: None) -> dict:
+def record(suite_: Suite, out, robots=(), physics: str = "auto", agent: str | None = None, command: str = "",
+           progress=lambda part, done, steps, lanes: None) -> dict:
   """Records a suite into the folder `out`; parts that are finished already are kept, so a recording that was cut off goes on.
 
   Returns:
@@ -313,7 +318,8 @@ def _grain(healthy: dict) -> dict[str, float]:
     x = healthy["latent"][..., int(name[1:])] if name[0] == "z" else healthy[name]
     x = x[np.isfinite(x)].astype(np.float64)
     wide = float(np.std(x if absolute(name) else np.log(np.maximum(x, FLOOR)))) if len(x) else 0.0
-    grain[name] = 2.0 ** min(-1.0 if not absolute(name) else np.inf, np.round(np.log2(max(wide, 1e-9) / FINENESS["latent" if name[0] == "z" else name.split("_")[0]])))
+    fineness = FINENESS["latent" if name[0] == "z" else name.split("_")[0]]
+    grain[name] = 2.0 ** min(-1.0 if not absolute(name) else np.inf, np.round(np.log2(max(wide, 1e-9) / fineness)))
   return grain
 
 

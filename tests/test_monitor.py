@@ -206,6 +206,26 @@ def test_with_a_real_agent(tiny, tiny_params):
       np.testing.assert_allclose(residual.rpr[t, g, 0], np.abs(reward[:, t] - rows.reward[own, g, 0]).mean(), rtol=1e-4)
 
 
+def test_a_member_is_watched_as_if_alone(tiny, tiny_params):
+  """With a key for each member: the same residuals whoever else is there, which are those of `update` on it alone."""
+  rows = make_rows(20, agent=tiny)
+  one = lambda x: jax.tree.map(lambda a: a[:, :1], x)
+  params = jax.tree.map(lambda x: x[:1], tiny_params)
+  monitor = Monitor(tiny)
+  keys = jax.random.split(jax.random.key(5), (1, MEMBERS))
+  part = lambda x, n: jax.tree.map(lambda a: a[:, :, :n], x)
+  history, rows = monitor.init(1, MEMBERS), one(rows)
+  watch = jax.jit(monitor.update_each)
+  all_history, everyone = watch(params, history, rows, keys)
+  n = MEMBERS - 1
+  # the products of few members and of many are summed in another order; another draw would show as a large error
+  close = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5)
+  jax.tree.map(close, watch(params, part(history, n), part(rows, n), keys[:, :n]), (part(all_history, n), part(everyone, n)))
+  alone = jax.jit(monitor.update)(params, part(history, 1), part(rows, 1), keys[:, 0])
+  jax.tree.map(close, alone, (part(all_history, 1), part(everyone, 1)))
+  assert np.isfinite(everyone.opr).sum() > 5
+
+
 def test_what_detectors_see_beside_the_residuals():
   """Groups, reward, surprise and latent against sums in NumPy."""
   rows = make_rows(8)
