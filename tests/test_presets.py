@@ -68,8 +68,6 @@ def test_run_takes_a_preset_and_refuses_what_contradicts_it():
                     ({"duration": 3_000_000_000}, "duration must be below"), ({"period": 2**31}, "period must be below"), ({"period": 0}, "period"), ({"share": 1.5}, "share")):
     with pytest.raises(UserError, match=words):
       RunConfig("walker", **kw)
-  with pytest.raises(UserError, match="turns the robot into 'car_real'"):
-    RunConfig("car", fault="car/sim-to-real")
 
 
 def test_names_are_found_for_the_robot_that_asks():

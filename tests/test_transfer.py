@@ -146,11 +146,14 @@ def test_where_the_chunk_ends_does_not_matter(lived, transfer, params, keys):
   assert equal(rows, jax.tree.map(lambda x: x[:2 * length], lived[1]))
 
 
-def test_streams_have_onsets_of_their_own(lived, transfer, params, keys):
-  """Onsets are data: a late one, one that never comes; the others' lives stay what they are."""
+def test_streams_have_onsets_of_their_own(lived, transfer, params, keys, same):
+  """Onsets are data: a late one, one that never comes, whose second robot rests; the others' lives stay what they are."""
   both, begin = transfer
   due = [ONSET, faults.FOREVER, ONSET, 130, ONSET]
-  streams, rows = live(both, params, begin(keys, due=due))
+  begun = begin(keys, due=due)
+  streams, rows = live(both, params, begun)
+  rests = lambda moving: jax.tree.map(lambda x: x[1], moving.after.env)
+  assert same(rests(begun), rests(streams))
   enter = np.asarray(streams.after.enter)[:, 0]
   assert enter[1] == faults.FOREVER and not rows.severity[:, 1].any()
   assert [enter[g] for g in (0, 2, 3, 4)] == [first_step(rows, g, due[g]) for g in (0, 2, 3, 4)]
@@ -433,3 +436,16 @@ def test_an_onset_after_the_last_step_never_comes(whole, short, saved, tmp_path)
   assert rows["false_alarms"] == late["alarm"].sum(1).tolist() and sum(rows["false_alarms"]) and not events_of(tmp_path, 0, "onset")
   arms = json.loads((tmp_path / "summary.json").read_text())["arms"]
   assert arms["none"]["false_alarms_per_hour"] == pytest.approx(sum(rows["false_alarms"][2:]) / (2 * STEPS * 0.05 / 3600))
+
+
+def test_a_robot_that_is_spared_stays_what_it_is(whole, short, saved, tmp_path):
+  """Arm `no-fault` beside others: no change, no onset, no second fault; until its first start the life of a car alone."""
+  run.execute(asked(saved, arms=("no-fault", "none")), tmp_path)
+  trace, rows, before = by_stream(tmp_path), table(tmp_path, "runs"), by_stream(whole[0])
+  for g in (0, 1):
+    assert not trace["severity"][g].any() and not trace["fault_active"][g].any() and set(trace["fault"][g]) == {"none"}
+    assert rows["onset"][g] is None and not events_of(tmp_path, g, "onset")
+    at = min([entered(trace, g + 2)] + [s + 1 for s, _ in events_of(tmp_path, g, "start")])
+    assert trace["reward"][g, :at].tobytes() == trace["reward"][g + 2, :at].tobytes() == before["reward"][g, :at].tobytes()
+    np.testing.assert_array_equal(trace["severity"][g + 2], np.arange(STEPS) >= entered(trace, g + 2))
+    assert rows["onset"][g + 2] == entered(trace, g + 2)
