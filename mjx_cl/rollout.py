@@ -181,7 +181,7 @@ class Rollout:
       injection, obs = faults_lib.sense(self.fault, stream.injection, stream.t, jax.random.fold_in(now, 5), self.model, obs, True)
       new = stream._replace(env=env_state, agent=self.agent.carry(), obs=obs, reward=jnp.float32(0), first=jnp.bool_(True),
                             episode=stream.episode + 1, injection=injection)
-      return jax.tree.map(lambda a, b: a if jnp.issubdtype(a.dtype, jax.dtypes.prng_key) else jnp.where(done, a, b), new, stream)
+      return jax.tree.map(lambda a, b: jnp.where(done, a, b), new, stream)
     return nest(one, (0, 0), (0, 0))(streams, done)
 
 

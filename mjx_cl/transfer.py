@@ -60,11 +60,6 @@ class Arriving(Rollout):
     out = out._replace(terminated=out.terminated & ~waits, truncated=jnp.where(waits, later.t == stream.enter, out.truncated))
     return later._replace(env=env), out, jnp.where(waits, 0.0, 1.0)  # to be another robot is severity 1, whatever else befalls it
 
-  def _reset(self, streams: Arrival, done):
-    """As Rollout's, and the noise of a robot goes on where its neighbours begin anew."""
-    new = super()._reset(streams, done)
-    return new._replace(env=jax.tree.map(lambda fresh, kept: jnp.where(expand(done, fresh), fresh, kept), new.env, streams.env))
-
 
 class Transfer:
   """Rollout of streams that begin as one robot and become another; `chunk` as that of Rollout.

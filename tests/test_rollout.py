@@ -245,3 +245,21 @@ def test_records_of_a_rollout(plain):
   assert not kept.terminal.any() and not kept.action[12].any()
   np.testing.assert_array_equal(kept.obs[12], np.asarray(rows.final_obs)[11, 1, 2])
   np.testing.assert_array_equal(kept.reward[1:13], np.asarray(rows.reward)[:12, 1, 2])  # every reward is in the record of arriving
+
+
+def test_a_neighbours_reset_leaves_a_robots_noise_alone():
+  """A car's lidar noise comes from a key in its state: the same life alone and beside a car that crashes."""
+  from mjx_cl import adapters, envs
+  env = envs.make("car")
+  agent, none = adapters.Puppet(2, 1.0), faults.none(env)
+  rollout = Rollout(env, agent, none)
+  keys = jax.vmap(jax.random.key)(jnp.arange(16))
+  live = lambda keys: rollout.chunk({"p": jnp.zeros(1)}, nest(lambda k: start(env, agent, none, k), 0, 0)(keys[None]), 200)[1]
+  rows = live(keys)
+  done = np.asarray(rows.terminated)[:, 0]
+  ends = np.where(done.any(0), done.argmax(0), 200)
+  last = int(ends.argmax())
+  assert ends.min() + 10 < ends[last]  # a neighbour crashed well before
+  alone = live(keys[last:last + 1])
+  # another batch size sums in another order (1e-5); the lidar's noise is 1e-3 of its range
+  np.testing.assert_allclose(np.asarray(rows.final_obs)[:ends[last], 0, last], np.asarray(alone.final_obs)[:ends[last], 0, 0], atol=1e-4)
