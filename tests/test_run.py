@@ -406,7 +406,7 @@ def test_load_overrides_how_it_goes_on(saved):
   assert (config.lr, config.last_starts, config.warmup) == (1e-5, 4, 0)
 
 
-@pytest.mark.parametrize("name, obs, act", [("walker", 24, 6), ("car", 67, 2)])
+@pytest.mark.parametrize("name, obs, act", [("walker", 24, 6), ("car", 67, 2), ("quadruped", 48, 12)])
 def test_the_shipped_agents_load(name, obs, act):
   assert name in agents.shipped()
   trained = agents.load(None, name, obs, act)
