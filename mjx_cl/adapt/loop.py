@@ -68,14 +68,15 @@ class Choices(NamedTuple):
   Attributes:
     listens: bool, alarms are acted on. at: int32 (groups, K), control steps at which adaptation is due, FOREVER: none.
     rule: bool, stop and abort rules are in force. limit: int32, most control steps of one adaptation.
-    world_only: bool, actor and critic keep what they are. fresh: bool, every start draws new parameters.
+    world_only: bool, actor and critic keep what they are. fresh: bool, every start draws new parameters; None: no arm of the run does, and the
+      program goes without the drawing, a quarter of what there is to compile.
   """
   listens: jax.Array
   at: jax.Array
   rule: jax.Array
   limit: jax.Array
   world_only: jax.Array
-  fresh: jax.Array
+  fresh: jax.Array | None
 
 
 def choices(labels, config: AdaptConfig, steps: int, onsets=None) -> Choices:
@@ -95,7 +96,7 @@ def choices(labels, config: AdaptConfig, steps: int, onsets=None) -> Choices:
   flags = lambda get: jnp.asarray([get(arm) for arm in arms], bool)
   return Choices(flags(lambda a: a.trigger.listens), jnp.asarray(at, jnp.int32), flags(lambda a: a.end.rule),
                  jnp.asarray([a.end.limit(config) for a in arms], jnp.int32), flags(lambda a: a.world_only),
-                 flags(lambda a: a.fresh))
+                 flags(lambda a: a.fresh) if any(arm.fresh for arm in arms) else None)
 
 
 class Loop:
@@ -120,7 +121,7 @@ class Loop:
     spread = lambda tree: jax.tree.map(lambda x: jnp.broadcast_to(x, (groups,) + x.shape).copy(), tree)
     empty = replay_lib.init(1, self.capacity, a.obs_size, a.act_size, a.size.deter, a.size.stoch)
     rows = max(1, self.config.refit // self.repeat)
-    past = unknown((rows, groups), a.obs_size)
+    past = jax.tree.map(lambda x: jnp.asarray(x, x.dtype), unknown((rows, groups), a.obs_size))  # a weak type would be a second trace
     return LoopState(spread(train), spread(train.params), spread(empty), self.monitor.init(groups, 1), spread(self.detector.init()), spread(phase_lib.init(self.config)),
                      past, jnp.zeros(groups), jnp.zeros(groups, jnp.int32))
 
@@ -180,7 +181,9 @@ class Loop:
     due = (phase.phase == phase_lib.ADAPTING) & (windows >= self.config.start_windows)
     owed = jnp.where(due, state.owed + length * self.config.ratio / (c.batch * c.length), 0.0)
     number = jnp.floor(owed + 1e-6).astype(jnp.int32)
-    train, acting = self._renew(state.train, state.acting, keys, begins & choices.fresh)
+    train, acting = state.train, state.acting
+    if choices.fresh is not None:
+      train, acting = self._renew(train, acting, keys, begins & choices.fresh)
     if self.config.fresh_moments:
       fresh = jax.vmap(self.agent.optimizer.init)(train.params)
       reset = lambda new, old: jnp.where(begins.reshape((-1,) + (1,) * (old.ndim - 1)), new, old)

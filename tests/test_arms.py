@@ -1,0 +1,411 @@
+"""Arms: the table, the phase machine without rules, ten arms side by side in one compiled loop on hand-made rows, and a run of all of them."""
+import dataclasses
+import functools
+import json
+import types
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pyarrow.parquet
+import pytest
+
+from mjx_cl import agents, envs, run
+from mjx_cl.adapt import phase as phase_lib
+from mjx_cl.adapt.arms import ARMS, FOREVER
+from mjx_cl.adapt.loop import FRESH, Loop, choices
+from mjx_cl.adapt.phase import ABORT_BUDGET, ENDED, END, START, STOP
+from mjx_cl.config import PRESETS, AdaptConfig, RunConfig
+from mjx_cl.detectors import Alarm, Detector
+from mjx_cl.dreamer.agent import Agent
+from mjx_cl.envs.walker import Walker
+from mjx_cl.errors import UserError
+from mjx_cl.monitor import Monitor
+from mjx_cl.rollout import Row
+from mjx_cl.scoring import recovery
+
+FOUR = ("detector", "none", "oracle", "no-fault")  # as many streams as are computed alike to the last bit, see run.Runner
+NAMES = ("detector", "none", "always", "periodic", "random", "oracle", "oracle-budget", "scratch", "world-model", "no-fault")
+
+
+# ---- table ---------------------------------------------------------------------------------------------------------------------------
+
+def test_the_table_is_what_is_tested_here():
+  assert tuple(ARMS) == NAMES
+
+
+def test_choices_of_all_arms():
+  c = AdaptConfig(warmup=1000, budget=777, period=400, period_steps=30, random_steps=60)
+  x = choices([(name, 5) for name in NAMES], c, 1500, [(700, 1200, FOREVER)] * len(NAMES))
+  rows = {name: jax.tree.map(lambda a: np.asarray(a)[i], x) for i, name in enumerate(NAMES)}
+  at = {name: sorted(int(s) for s in row.at if s < FOREVER) for name, row in rows.items()}
+  drawn = at.pop("random")
+  assert at == {"detector": [], "none": [], "always": [1000], "periodic": [400, 800, 1200], "oracle": [1000, 1200],  # the warm-up comes first
+                "oracle-budget": [1000, 1200], "scratch": [1000, 1200], "world-model": [], "no-fault": []}
+  assert len(drawn) == 1 and 1000 <= drawn[0] <= 1440
+  on = lambda field: {name for name, row in rows.items() if getattr(row, field)}
+  assert on("listens") == {"detector", "world-model", "no-fault"} and on("world_only") == {"world-model"} and on("fresh") == {"scratch"}
+  assert choices([("detector", 0), ("none", 0)], c, 1500).fresh is None
+  assert on("rule") == {"detector", "oracle", "scratch", "world-model", "no-fault"}
+  assert {name: int(row.limit) for name, row in rows.items()} == dict.fromkeys(NAMES, 777) | {
+      "none": FOREVER, "always": FOREVER, "periodic": 30, "random": 60}
+  assert [name for name, arm in ARMS.items() if not arm.breaks] == ["no-fault"]
+
+
+def test_a_random_time_comes_from_the_seed_and_leaves_room():
+  c = AdaptConfig(warmup=100, random_steps=50)
+  at = np.asarray(choices([("random", seed) for seed in range(2000)], c, 160).at)[:, 0]
+  assert set(at) == set(range(100, 111)) and np.bincount(at)[100:].min() > 120  # 11 values, 182 expected of each, deviation 13
+  assert (np.asarray(choices([("random", seed) for seed in range(1999, -1, -1)], c, 160).at)[::-1, 0] == at).all()
+  with pytest.raises(UserError, match="needs warmup .* 150 steps; the run has 149"):
+    choices([("random", 0)], c, 149)
+
+
+def test_bad_settings_are_refused():
+  with pytest.raises(UserError, match="period_steps must be below period=50; got 50"):
+    AdaptConfig(period=50, period_steps=50)
+  for name in ("period", "period_steps", "random_steps"):
+    with pytest.raises(UserError, match=name):
+      AdaptConfig(**{name: 0})
+  with pytest.raises(UserError, match="unknown arm 'orcale'; choose from: always, detector, no-fault, none, oracle, oracle-budget, periodic"):
+    RunConfig("walker", arms=("orcale",))
+
+
+# ---- phase machine -------------------------------------------------------------------------------------------------------------------
+
+def live(reward, due, rule, limit, chunks=30):
+  """{chunk: decision} and phases of a stream with flat signals and this reward (acceptance 0.6), chunks of 64, no alarms."""
+  config = AdaptConfig(patience=4, least=1, give_up=8 * 64, budget=12 * 64, warmup=64)
+  signals = jnp.tile(jnp.array([1.0, 0.1, reward, 2.0, 0.5, 3.0]), (chunks, 1))
+
+  def step(state, x):
+    signals, c = x
+    now = (c + 1) * 64
+    state, decision, _ = phase_lib.update(state, signals, 1.0, False, now - 64, now, False, 0.6, 0.9, config, jnp.isin(c, jnp.array(due)), rule, limit)
+    return state, (state.phase, decision)
+  _, (phases, decisions) = jax.lax.scan(step, phase_lib.init(config), (signals, jnp.arange(chunks)))
+  return {int(i): int(decisions[i]) for i in np.flatnonzero(decisions)}, np.asarray(phases)
+
+
+def test_without_rules_nothing_but_the_limit_ends_adaptation():
+  """What is due starts it, no alarm and no listening needed. The start is 64 before the end of its chunk: age 64 (k + 1) after chunk 5 + k."""
+  for reward in (0.3, 0.8):  # settled below acceptance, settled and accepted: neither counts
+    decisions, phases = live(reward, [5], False, 20 * 64)
+    assert decisions == {5: START, 24: END} and (phases[24:] == ENDED).all() and (phases[5:24] == phase_lib.ADAPTING).all()
+    assert live(reward, [5], False, FOREVER)[0] == {5: START}
+  assert live(0.8, [5], True, 20 * 64)[0] == {5: START, 9: STOP}
+  assert live(0.3, [5], True, 7 * 64)[0] == {5: START, 11: ABORT_BUDGET}  # as a limit that comes before the rules do
+
+
+def test_what_is_due_while_adapting_or_in_the_warm_up_starts_nothing_and_later_it_starts_again():
+  assert live(0.8, [0, 5, 6, 9], False, 4 * 64)[0] == {5: START, 8: END, 9: START, 12: END}
+
+
+# ---- all arms in one loop ------------------------------------------------------------------------------------------------------------
+
+STEPS, CHUNKS, ONSET = 16, 16, 60   # rows of a chunk; chunks; true onset
+RESETS = (45, 130)
+# settled as soon as the patience is full, always acceptable; 1.5 updates a chunk once 20 windows of 9 records are there
+EAGER = AdaptConfig(ratio=3.0, start_windows=20, patience=4, trend=1e9, fluctuation=1e9, least=1, acceptance=-9.0, give_up=9999, budget=100, warmup=20,
+                    refit=24, period=80, period_steps=40, random_steps=50)
+ALARMS = (10, 37, 150)              # of every stream's detector: in the warm-up, after it, and once more unless it has been refitted
+
+
+class Script(NamedTuple):
+  """State of a detector that fires at given rows: at (3,), count of rows."""
+  at: jax.Array
+  count: jax.Array
+
+
+def scripted():
+  """A detector that never fires unless its state is told to."""
+  update = lambda state, residual: (Script(state.at, state.count + 1), Alarm(jnp.any(state.at == state.count), jnp.float32(0)))
+  return Detector(lambda: Script(jnp.full(3, -1, jnp.int32), jnp.int32(0)), update)
+
+
+def hand_rows(start, groups):
+  """Rows start .. start + STEPS, the same for every stream; obs[0] is the number of the row, final_obs[0] that number and a half."""
+  rng = np.random.default_rng(start)
+  normal = lambda *more: jnp.broadcast_to(jnp.asarray(rng.normal(size=(STEPS, 1, 1) + more), jnp.float32), (STEPS, groups, 1) + more)
+  shape = (STEPS, groups, 1)
+  number = jnp.broadcast_to(start + jnp.arange(STEPS, dtype=jnp.float32)[:, None, None], shape)
+  mark = lambda x, n: x.at[..., 0].set(n)
+  done, reward = jnp.isin(number, jnp.array(RESETS)), normal()
+  stoch = jnp.broadcast_to(jnp.asarray(rng.integers(0, 8, (STEPS, 1, 1, 8))), shape + (8,))
+  return Row(mark(normal(24), number), jnp.isin(number - 1, jnp.array(RESETS)) | (number == 0), normal(), normal(6), normal(128), stoch, reward,
+             reward[..., None], mark(normal(24), number + 0.5), jnp.zeros(shape, bool), done, None, None, jnp.zeros(shape + (6,)),
+             jnp.zeros(shape, bool))
+
+
+class Story(NamedTuple):
+  """A life of all arms: the start, [state of each chunk], [digest of each chunk], choices, keys, the loop."""
+  begin: object
+  states: list
+  digests: list
+  chosen: object
+  keys: object
+  loop: Loop
+
+
+@pytest.fixture(scope="module")
+def story():
+  agent = Agent(dataclasses.replace(PRESETS["tiny"].dreamer, batch=4, length=8, imagine=4), 24, 6)
+  loop = Loop(agent, Monitor(agent, n=4, least=2), scripted(), types.SimpleNamespace(acceptance=0.6, posture=None), EAGER, capacity=512)
+  train = jax.jit(agent.init)(jax.random.key(0))
+  # fresh heads say exactly 0, and a signal whose median is 0 has no scale to be settled on; slow critic and moments get values of their own
+  shake = lambda tree, seed: jax.tree.map(lambda x: x + (0.01 * jax.random.normal(jax.random.key(x.size + seed), x.shape)).astype(x.dtype), tree)
+  moments = jax.tree.map(lambda x: x + jnp.abs(0.01 * jax.random.normal(jax.random.key(x.size), x.shape)).astype(x.dtype) if x.ndim else x, train.opt)
+  train = train._replace(params=shake(train.params, 1), slow=shake(train.slow, 2), opt=moments, range=jnp.array([-0.5, 0.5]), updates=jnp.int32(100))
+  labels = [(name, i) for i, name in enumerate(NAMES)]
+  keys = jax.vmap(jax.random.key)(jnp.arange(len(NAMES)))
+
+  def begin():
+    state = loop.init(train, len(NAMES))
+    return state._replace(detector=state.detector._replace(at=jnp.tile(jnp.array(ALARMS), (len(NAMES), 1))))
+  copy = lambda tree: jax.tree.map(lambda x: np.array(x), tree)
+  state, states, digests = begin(), [], []
+  chosen = choices(labels, EAGER, STEPS * CHUNKS, [(ONSET,)] * len(NAMES))
+  first = copy(state)
+  for c in range(CHUNKS):
+    state, digest = loop.digest(state, hand_rows(c * STEPS, len(NAMES)), jnp.int32((c + 1) * STEPS), chosen, keys)
+    states.append(copy(state))
+    digests.append(copy(digest))
+  other = choices(labels[::-1], EAGER, STEPS * CHUNKS, [(ONSET,)] * len(NAMES))
+  loop.digest(begin(), hand_rows(0, len(NAMES)), jnp.int32(STEPS), other, keys)
+  return Story(first, states, digests, chosen, keys, loop)
+
+
+def of(tree, name):
+  return jax.tree.map(lambda x: x[NAMES.index(name)], tree)
+
+
+def spans(story):
+  """By hand, arm -> [(control step of the start, chunk of the start, chunk of the end or None, decision of the end)]."""
+  drawn = int(np.asarray(story.chosen.at)[NAMES.index("random")].min())
+  over = next(c for c in range(CHUNKS) if (c + 1) * STEPS - drawn >= 50)
+  heard, true = [(37, 2, 6, STOP)], [(60, 3, 7, STOP)]  # the patience of 4 is full after four more chunks
+  return {"detector": heard, "none": [], "always": [(20, 1, None, None)], "periodic": [(80, 5, 7, END), (160, 10, 12, END), (240, 15, None, None)],
+          "random": [(drawn, drawn // STEPS, over, END)], "oracle": true, "oracle-budget": [(60, 3, 9, END)],
+          "scratch": [(60, 3, 8, STOP)],  # first update in chunk 5, at learning rate 0 of its warm-up: fresh heads say 0 in 4, 5 and 6
+          "world-model": heard, "no-fault": heard}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_when_an_arm_starts_and_ends(story, name):
+  want = {}
+  for since, start, end, decision in spans(story)[name]:
+    want |= {start: START} | ({} if end is None else {end: decision})
+    assert of(story.digests[start].since, name) == since
+  decisions = np.array([of(d.decision, name) for d in story.digests])
+  assert {int(c): int(decisions[c]) for c in np.flatnonzero(decisions)} == want
+
+
+def test_detectors_hear_the_same_until_they_are_refitted(story):
+  fired = np.concatenate([d.fired for d in story.digests])
+  for g, name in enumerate(NAMES):
+    end = [c for _, _, c, _ in spans(story)[name] if c is not None]
+    assert list(np.flatnonzero(fired[:, g])) == [a for a in ALARMS if not end or a < (end[0] + 1) * STEPS], name
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_replay_and_updates(story, name):
+  """Rows after the alarm, or from what was due on, and the final observation of episodes that ended; updates by a loop over chunks."""
+  first, owed, total, records = None, 0.0, 0, []
+  active = {c: since for since, start, end, _ in spans(story)[name] for c in range(start, CHUNKS if end is None else end)}
+  kept = {c: since for since, start, end, _ in spans(story)[name] for c in range(start, CHUNKS if end is None else end + 1)}
+  for c in range(CHUNKS):
+    if c in kept:
+      if kept[c] != first:
+        first, records = kept[c], []
+      rows = [r for r in range(c * STEPS, (c + 1) * STEPS) if (r > first if ARMS[name].trigger.listens else r >= first)]
+      records += sorted(rows + [r + 0.5 for r in RESETS if r in rows])
+    owed = owed + 1.5 if c in active and len(records) >= 28 else 0.0
+    total, owed = total + int(owed), owed - int(owed)
+    replay = of(story.states[c].replay, name)
+    assert replay.count[0] == len(records), c
+    np.testing.assert_array_equal(replay.data.obs[0, :len(records), 0], records)
+    assert of(story.digests[c].updates, name) == total, c
+  assert (total > 0) == (name != "none")
+
+
+def test_the_world_model_alone_learns(story, same):
+  begin, end = of(story.begin.train, "world-model"), of(story.states[6].train, "world-model")
+  assert of(story.digests[6].updates, "world-model") > 0
+  for part in ("pol", "val"):
+    assert same(begin.params[part], end.params[part]) and same(begin.params[part], of(story.states[6].acting, "world-model")[part])
+  assert same(begin.slow, end.slow) and same(begin.range, end.range)
+  for part in ("enc", "dyn", "dec", "rew", "con"):
+    assert not same(begin.params[part], end.params[part]), part
+  everything = of(story.states[6].train, "detector")  # the same alarm, the same number of updates
+  assert not any(same(begin.params[part], everything.params[part]) for part in begin.params)
+  assert not same(begin.slow, everything.slow) and not same(begin.range, everything.range)
+  moved = lambda new: {path for (path, a), (_, b) in zip(named(begin.opt), named(new.opt)) if not same(a, b)}
+  behaviour = lambda paths: {p for p in paths if "'pol'" in p or "'val'" in p}
+  assert behaviour(moved(everything)) and moved(end) == moved(everything) - behaviour(moved(everything))
+
+
+def named(tree):
+  return [(jax.tree_util.keystr(path), leaf) for path, leaf in jax.tree_util.tree_leaves_with_path(tree)]
+
+
+def test_scratch_starts_from_fresh_parameters(story, same):
+  """Drawn from the stream's own key in the chunk of the trigger, in which no update is due yet; the shipped ones until then."""
+  begin, init = of(story.begin.train, "scratch"), jax.jit(story.loop.agent.init)
+  assert same(of(story.states[2].train, "scratch"), begin)
+  new = of(story.states[3].train, "scratch")
+  want = init(jax.random.fold_in(story.keys[NAMES.index("scratch")], FRESH))
+  jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-7), new, want)  # float32 of two programs
+  assert same(new.params, of(story.states[3].acting, "scratch")) and new.updates == 0 and begin.updates == 100
+  other = init(jax.random.fold_in(story.keys[0], FRESH))
+  kernel = lambda state: max(jax.tree.leaves(state.params["enc"]), key=np.size)
+  assert not np.allclose(kernel(new), kernel(other), atol=0.01) and not np.allclose(kernel(new), kernel(begin), atol=0.01)
+  assert same(of(story.states[3].train, "oracle"), of(story.begin.train, "oracle"))  # beside it nobody else's are
+
+
+def test_one_trace_serves_all_arms(story):
+  assert story.loop.digest._cache_size() == 1
+
+
+# ---- a run of all arms ---------------------------------------------------------------------------------------------------------------
+
+LIFE, FAULT, WARMUP, SEED = 700, 300, 100, 3
+CONFIG = dict(env="walker", onset=FAULT, steps=LIFE, seeds=1, first_seed=SEED, detector="rolling_sigma_plain", settings=dict(window=100, warmup=30),
+              physics="native",
+              adapt=AdaptConfig(warmup=WARMUP, start_windows=40, patience=4, least=64, trend=1e9, fluctuation=1e9, refit=100, budget=256, period=250,
+                                period_steps=128, random_steps=200))
+
+
+class Easy(Walker):
+  """A walker with short episodes whose task counts as done whatever the robot does: random weights can converge."""
+
+  def __init__(self, physics="auto"):
+    super().__init__(physics)
+    self.spec = self.spec._replace(episode_steps=150, posture=None, acceptance=0.0)
+
+
+@pytest.fixture(scope="module")
+def lived(tiny, tmp_path_factory):
+  """lived(name, arms): a finished run, its folder."""
+  patch = pytest.MonkeyPatch()
+  patch.setitem(envs.ENVS, "walker", Easy)
+  agent = tmp_path_factory.mktemp("arms") / "agent"
+  agents.save(agent, jax.jit(tiny.init)(jax.random.key(0)), {"env": "walker", "preset": "tiny", "repeat": 1, "dreamer": dataclasses.asdict(tiny.config)})
+
+  @functools.cache
+  def make(arms, cut=None):
+    out, config = tmp_path_factory.mktemp("arms") / "out", RunConfig(**CONFIG, arms=arms, agent=str(agent))
+    if cut is not None:  # cut off after `cut` chunks
+      runner = run.Runner(config, out)
+      out.mkdir(exist_ok=True)
+      runner.open()
+      run.store.write_json(out / "config.json", runner.config_dict())
+      for _ in range(cut):
+        runner.step()
+      runner.save()
+      runner.checkpoints.close()
+    run.execute(config, out, resume=cut is not None)
+    return out
+  yield make
+  patch.undo()
+
+
+def columns(folder, name, arm=None):
+  """{column: list} of a result file, of one arm."""
+  table = pyarrow.parquet.read_table(folder / f"{name}.parquet").to_pydict()
+  keep = [i for i, a in enumerate(table["arm"]) if arm in (None, a)]
+  return {k: [v[i] for i in keep] for k, v in table.items()}
+
+
+def events(folder, arm, *kinds):
+  e = columns(folder, "events", arm)
+  return [(s, r) for s, k, r in zip(e["step"], e["kind"], e["reason"]) if k in kinds]
+
+
+def test_events_say_what_started_and_ended_each_arm(lived):
+  out = lived(NAMES)
+  drawn = int(choices([("random", SEED)], CONFIG["adapt"], LIFE).at.min())
+  want = {"always": ["end of the warm-up at step 100"], "periodic": ["schedule at step 250", "schedule at step 500"], "random": [f"random time at step {drawn}"],
+          "oracle": ["true onset at step 300"], "oracle-budget": ["true onset at step 300"], "scratch": ["true onset at step 300"], "none": []}
+  for name, reasons in want.items():
+    assert [r for _, r in events(out, name, "start")] == reasons, name
+  for name in ("detector", "world-model", "no-fault"):
+    acted = [s for s, r in events(out, name, "alarm") if r.startswith("acted on")]
+    assert acted and [r for _, r in events(out, name, "start")] == [f"alarm at step {s}" for s in acted], name
+  over = "fixed number of steps over"
+  assert {name: [r for _, r in events(out, name, "stop", "abort")] for name in ("always", "periodic", "random", "oracle", "oracle-budget")} == {
+      "always": [], "periodic": [over, over], "random": [over], "oracle": ["all six signals settled, task acceptable"], "oracle-budget": [over]}
+  outcome = dict(zip(*(columns(out, "runs")[k] for k in ("arm", "outcome"))))
+  assert {name: outcome[name] for name in ("none", "always", "periodic", "random", "oracle", "oracle-budget")} == {
+      "none": "nominal", "always": "adapting", "periodic": "ended", "random": "ended", "oracle": "converged", "oracle-budget": "ended"}
+  for name in ("always", "periodic", "random", "oracle", "oracle-budget", "scratch"):
+    assert events(out, name, "alarm") and all("arm does not listen" in r for _, r in events(out, name, "alarm")), name
+
+
+def test_the_robot_of_arm_no_fault_never_breaks(lived):
+  out = lived(NAMES)
+  for name in NAMES:
+    trace, severity = columns(out, "trace", name), 0.0 if name == "no-fault" else 0.5
+    np.testing.assert_array_equal(trace["severity"], np.where(np.arange(LIFE) >= FAULT, severity, 0.0))
+    assert trace["fault_active"] == [s > 0 for s in trace["severity"]]
+    assert len(events(out, name, "onset")) == (name != "no-fault")
+  row = {k: v[0] for k, v in columns(out, "runs", "no-fault").items()}
+  alarms = events(out, "no-fault", "alarm")
+  assert all(r.endswith(", on a healthy robot: a false alarm") for _, r in alarms) and any(s >= FAULT for s, _ in alarms)
+  assert row["false_alarms"] == len(alarms) and row["fault"] == "none"
+  assert all(row[k] is None for k in ("onset", "alarm_step", "latency_steps", "affected", "recovery_step", "reward_drop", "return_lost"))
+  healthy, broken = columns(lived(FOUR), "trace", "no-fault"), columns(lived(FOUR), "trace", "detector")
+  assert healthy["reward"][:FAULT] == broken["reward"][:FAULT] and healthy["reward"][FAULT:] != broken["reward"][FAULT:]
+  summary = json.loads((out / "summary.json").read_text())["arms"]["no-fault"]
+  assert summary["miss_probability"] is None and summary["alarms"] == 0 and summary["false_alarm_streams"] == 1
+  assert summary["false_alarms_per_hour"] == pytest.approx(len(alarms) / (LIFE * 0.025 / 3600))
+
+
+def test_what_false_alarms_cost(lived):
+  """From the first start to the onset, to the end for a robot that never breaks: reward_pre less the reward."""
+  out = lived(NAMES)
+  for name in NAMES:
+    reward = np.array(columns(out, "trace", name)["reward"])
+    begun = [int(r.split()[-1]) for _, r in events(out, name, "start")]
+    row = {k: v[0] for k, v in columns(out, "runs", name).items()}
+    end = LIFE if name == "no-fault" else FAULT
+    window = min([end] + begun) if ARMS[name].trigger.listens else FAULT  # arms that do not listen have arm none's
+    source = reward if ARMS[name].trigger.listens else np.array(columns(out, "trace", "none")["reward"])
+    assert row["reward_pre"] == pytest.approx(source[WARMUP:window].mean()), name
+    want = (row["reward_pre"] - reward[begun[0]:end]).sum() if begun and begun[0] < end else 0.0
+    assert row["return_lost_healthy"] == pytest.approx(want), name
+  assert recovery.return_lost_healthy(np.array([1.0, 2.0, 3.0, 4.0]), 3, 2.5, 1) == 0.5 + -0.5
+  assert recovery.return_lost_healthy(np.ones(4), 3, 2.0, 3) == recovery.return_lost_healthy(np.ones(4), 3, 2.0, None) == 0.0
+  assert recovery.return_lost_healthy(np.ones(4), 3, None, 1) is None
+
+
+def test_the_ledger_of_each_arm(lived):
+  out = lived(NAMES)
+  summary = json.loads((out / "summary.json").read_text())
+  assert tuple(summary["arms"]) == NAMES and all(summary[k] == v for k, v in summary["arms"]["detector"].items())
+  for name in NAMES:
+    trace, row, arm = columns(out, "trace", name), {k: v[0] for k, v in columns(out, "runs", name).items()}, summary["arms"][name]
+    assert row["adapted_steps"] == trace["phase"].count("adapting") and row["updates"] >= max(trace["updates"]) and row["updates"] % 1 == 0
+    assert (row["updates"] > 0) == (name != "none")
+    for key in ("updates", "adapted_steps", "terminations", "return_lost_healthy", "wall_s"):
+      assert arm[f"{key}_mean"] == row[key] and arm[f"{key}_mean_ci"] is None  # one stream has no interval
+  wall = {name: columns(out, "runs", name)["wall_s"][0] for name in NAMES}
+  assert wall["always"] == max(wall.values()) and wall["none"] == min(wall.values())  # updates are paid by those who take them
+
+
+def test_detector_and_none_are_the_same_alone_and_beside_the_others(lived):
+  out, pair = lived(FOUR), lived(FOUR[:2])
+  for name in ("trace", "events", "runs"):
+    for arm in ("detector", "none"):
+      a, b = columns(out, name, arm), columns(pair, name, arm)
+      assert list(a) == list(b) and a["arm"]
+      for column in set(a) - {"stream", "wall_s"}:
+        assert repr(a[column]) == repr(b[column]), (name, arm, column)
+
+
+def test_a_run_of_all_arms_resumes_to_the_same_files(lived):
+  out, cut = lived(NAMES), lived(NAMES, cut=6)  # fresh parameters, fixed ends and schedules are on their way then
+  for name in ("trace", "events", "runs"):
+    a, b = columns(out, name), columns(cut, name)
+    for column in set(a) - {"wall_s"}:
+      assert repr(a[column]) == repr(b[column]), (name, column)
