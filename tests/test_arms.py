@@ -355,8 +355,8 @@ def test_the_robot_of_arm_no_fault_never_breaks(lived):
   assert row["false_alarms"] == len(alarms) and row["fault"] == "none"
   assert all(row[k] is None for k in ("onset", "alarm_step", "latency_steps", "affected", "recovery_step", "reward_drop", "return_lost"))
   healthy, broken = columns(lived(FOUR), "trace", "no-fault"), columns(lived(FOUR), "trace", "detector")
-  # rows of one batch may be summed in another order, which a hundred steps of a walker let grow
-  np.testing.assert_allclose(healthy["reward"][:FAULT], broken["reward"][:FAULT], atol=0.02)
+  # rows of one batch may be summed in another order, which hundreds of steps of a walker let grow
+  np.testing.assert_allclose(healthy["reward"][:50], broken["reward"][:50], atol=1e-3)
   assert np.abs(np.subtract(healthy["reward"][FAULT:], broken["reward"][FAULT:])).max() > 0.02
   summary = json.loads((out / "summary.json").read_text())["arms"]["no-fault"]
   assert summary["miss_probability"] is None and summary["alarms"] == 0 and summary["false_alarm_streams"] == 1
