@@ -381,6 +381,7 @@ class Runner:
     shares = {"physics": self.seconds["physics"], "acting": self.seconds["acting"], "monitor": monitor, "updates": self.seconds["digest"] - monitor,
               "other": self.seconds["other"]}
     out["wall_s"] = wall
+    out["wall_s_arms"] = {arm: float(sum(r["wall_s"] for r in runs if r["arm"] == arm)) for arm in arms}
     out["wall_share"] = {k: v / wall for k, v in shares.items()}
     return out
 
@@ -420,7 +421,7 @@ def summarise(rows: list[dict], config: RunConfig, control_s: float) -> dict:
   for name in ("reward_pre", "reward_drop", "reward_final", "return_lost"):
     values = [r[name] for r in rows if r[name] is not None]
     put(name, float(bootstrap.iqm(values)) if values else None, bootstrap.interval(values) if values else None)
-  for name in ("return_lost_healthy", "adapted_steps", "updates", "terminations", "wall_s"):  # a ledger: what is rare must count
+  for name in ("return_lost_healthy", "adapted_steps", "updates", "terminations"):  # a ledger: what is rare must count
     values = [r[name] for r in rows if r[name] is not None]
     put(f"{name}_mean", float(np.mean(values)) if values else None, bootstrap.interval(values, np.mean) if values else None)
   values = [r["reward_final"] for r in affected]

@@ -389,9 +389,10 @@ def test_the_ledger_of_each_arm(lived):
     trace, row, arm = columns(out, "trace", name), {k: v[0] for k, v in columns(out, "runs", name).items()}, summary["arms"][name]
     assert row["adapted_steps"] == trace["phase"].count("adapting") and row["updates"] >= max(trace["updates"]) and row["updates"] % 1 == 0
     assert (row["updates"] > 0) == (name != "none")
-    for key in ("updates", "adapted_steps", "terminations", "return_lost_healthy", "wall_s"):
+    for key in ("updates", "adapted_steps", "terminations", "return_lost_healthy"):
       assert arm[f"{key}_mean"] == row[key] and arm[f"{key}_mean_ci"] is None  # one stream has no interval
   wall = {name: columns(out, "runs", name)["wall_s"][0] for name in NAMES}
+  assert summary["wall_s_arms"] == wall
   assert wall["always"] == max(wall.values()) and wall["none"] == min(wall.values())  # updates are paid by those who take them
 
 
