@@ -113,7 +113,7 @@ RUN = {
     "fault": (["run", "walker", "--fault", "geer"], ["geer", "gear, joint_damping"]),
     "target": (["run", "walker", "--target", "left_elbow"], ["left_elbow", "left_knee", "random"]),
     "target of no fault": (["run", "walker", "--fault", "none", "--target", "left_knee"], ["left_knee"]),
-    "detector": (["run", "walker", "--detector", "cusum"], ["cusum", "rolling_sigma, rolling_sigma_plain"]),
+    "detector": (["run", "walker", "--detector", "cusums"], ["cusums", "cusum", "rolling_sigma, rolling_sigma_plain"]),
     "detector setting": (["run", "walker", "--set", "windows=5"], ["windows"]),
     "detector setting out of range": (["run", "walker", "--set", "window=1"], ["window"]),
     "setting without a value": (["run", "walker", "--set", "window"], ["name=value"]),
@@ -135,7 +135,7 @@ RUN = {
     "zero steps": (["run", "walker", "--steps", "0"], ["steps"]),
     "zero duration": (["run", "walker", "--duration", "0"], ["duration"]),
     "adaptation out of range": (["run", "walker", "--adapt.patience", "0"], ["patience"]),
-    "agent that is not there": (["run", "walker", "--agent", "wlaker"], ["wlaker", "shipped: car, walker"]),
+    "agent that is not there": (["run", "walker", "--agent", "wlaker"], ["wlaker", "shipped: car, quadruped, walker"]),
 }
 OTHER = {
     "command": (["rnu"], ["rnu"]),
@@ -269,7 +269,7 @@ def test_overwrite_replaces_a_run_and_nothing_else(mjx, begun):
   assert sorted(os.listdir(out)) == ["config.json", "notes.txt", "work"]
 
 
-@pytest.mark.parametrize("wrong", [["--fault", "geer"], ["--detector", "cusum"], ["--target", "elbow"], ["--agent", "wlaker"],
+@pytest.mark.parametrize("wrong", [["--fault", "geer"], ["--detector", "cusums"], ["--target", "elbow"], ["--agent", "wlaker"],
                                    ["--severity", "2"], ["--set", "a=1"]])
 def test_a_mistake_beside_overwrite_loses_nothing(refused, begun, wrong):
   argv, out = begun
@@ -293,7 +293,7 @@ def full(*_, **__):
 
 
 def test_a_full_disk_at_the_start_is_one_line(refused, saved, tmp_path, monkeypatch):  # noqa: F811
-  monkeypatch.setattr(pathlib.Path, "write_text", full)
+  monkeypatch.setattr(store, "open", full, raising=False)
   assert "No space left" in refused(1, "run", "walker", "--agent", saved, "--seeds", "1", "--out", tmp_path / "out")
   assert content(tmp_path / "out") == {}
 
