@@ -276,6 +276,18 @@ class Query:
 
 
 @dataclass(frozen=True)
+class Report:
+  """Writes the README's numbers anew from the files in results/: what lies between `<!-- report:NAME -->` and `<!-- /report -->`, nothing else."""
+  results: str = "results"
+  """Folder of the results."""
+  readme: str = "README.md"
+  """Text with marked blocks."""
+  check: bool = False
+  """Write nothing; exit code 1 and the names of the blocks where text and results disagree."""
+  json: bool = False
+
+
+@dataclass(frozen=True)
 class List:
   """Names that other commands take."""
   what: Positional[str] = "all"
@@ -291,6 +303,7 @@ class Doctor:
 
 Command = (Annotated[Run, tyro.conf.subcommand("run")] | Annotated[Train, tyro.conf.subcommand("train")] | Annotated[Eval, tyro.conf.subcommand("eval")]
            | Annotated[Certify, tyro.conf.subcommand("certify")] | Annotated[Record, tyro.conf.subcommand("record")] | Annotated[Leaderboard, tyro.conf.subcommand("leaderboard")] | Annotated[Plot, tyro.conf.subcommand("plot")] | Annotated[Render, tyro.conf.subcommand("render")] | Annotated[Query, tyro.conf.subcommand("query")] | Annotated[Detect, tyro.conf.subcommand("detect")]
+           | Annotated[Report, tyro.conf.subcommand("report")]
            | Annotated[List, tyro.conf.subcommand("list")] | Annotated[Doctor, tyro.conf.subcommand("doctor")])
 
 
@@ -681,6 +694,20 @@ def do_query(args: Query) -> None:
   Console().print(table)
 
 
+def do_report(args: Report) -> None:
+  from mjx_cl import report
+  blocks = report.report(args.results, args.readme, args.check)
+  names = list(dict.fromkeys(b["name"] for b in blocks if not b["agrees"]))
+  if args.json:
+    emit(blocks)
+  elif not blocks:
+    print(f"{args.readme}: no marked block")
+  elif not (names and args.check):
+    print(f"{args.readme}: " + (f"written anew: {', '.join(names)}" if names else f"all {len(blocks)} blocks agree with {args.results}"))
+  if names and args.check:
+    raise FileError(f"{args.readme} disagrees with {args.results} in: {', '.join(names)}; mjx-cl report writes them anew")
+
+
 def do_list(args: List) -> None:
   from mjx_cl import agents, detectors, envs, fault_presets, faults, memory, streams
   first = lambda f: (f.__doc__ or "").strip().split("\n")[0]
@@ -708,7 +735,7 @@ def do_doctor(args: Doctor) -> None:
       print(f"{name:16s} {value if not isinstance(value, dict) else ', '.join(f'{k} {v}' for k, v in value.items())}")
 
 
-DO = {Run: do_run, Train: do_train, Eval: do_eval, Certify: do_certify, Record: do_record, Leaderboard: do_leaderboard, Plot: do_plot, Render: do_render, Query: do_query, Detect: do_detect, List: do_list, Doctor: do_doctor}
+DO = {Run: do_run, Train: do_train, Eval: do_eval, Certify: do_certify, Record: do_record, Leaderboard: do_leaderboard, Plot: do_plot, Render: do_render, Query: do_query, Report: do_report, Detect: do_detect, List: do_list, Doctor: do_doctor}
 
 
 def parse(argv: list[str] | None):
@@ -734,7 +761,7 @@ def main(argv: list[str] | None = None) -> int:
   signal.signal(signal.SIGTERM, stop)
   try:
     command = parse(argv)
-    if not isinstance(command, (Plot, Query)):
+    if not isinstance(command, (Plot, Query, Report)):
       from mjx_cl import runtime
       runtime.setup()
     DO[type(command)](command)

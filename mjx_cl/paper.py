@@ -1,0 +1,181 @@
+"""The paper's four experiments beside runs of mjx_cl: what it reports, what was measured, how the two set-ups differ.
+
+The paper: F. Domberg and G. Schildbach, arXiv 2603.04029. Each statement carries the section or caption it stands in.
+"""
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from mjx_cl.config import AdaptConfig, DreamerConfig
+from mjx_cl.errors import FileError
+from mjx_cl.scoring import bootstrap
+
+
+class Statement(NamedTuple):
+  """One line of the paper's results.
+
+  Attributes:
+    what: in words. text: what the paper says, short. source: where. measure: key of MEASURES. value: the paper's figure in the unit of the measure,
+    None where it gives words alone.
+  """
+  what: str
+  text: str
+  source: str
+  measure: str
+  value: float | None = None
+
+
+class Experiment(NamedTuple):
+  """One experiment: `folder` under results/paper, `change` = which row of a stream in runs.parquet, `onset` of the paper's first change."""
+  folder: str
+  change: int
+  onset: int
+  protocol: str
+  runs: str
+  robot: str | None
+  statements: tuple[Statement, ...]
+
+
+EXPERIMENTS: dict[str, Experiment] = {
+    "paper/walker": Experiment("walker", 0, 5000, "one random joint's gear halved", "10 runs", None, (
+        Statement("alarm after onset", "\"rapidly\"", "IV-A", "latency"),
+        Statement("recovery after onset", "most metrics near their old values in less than 10,000 steps", "IV-A", "recovery", 10_000),
+        Statement("reward at the end / before", "\"slightly less\"", "IV-A", "kept"),
+    )),
+    "paper/quadruped": Experiment("quadruped", 0, 9000, "right hind leg's velocity limits to a third", "9 runs and a failed one", "MuJoCo in place of Isaac Lab", (
+        Statement("alarm after onset", "\"quickly\"", "IV-B", "latency"),
+        Statement("recovery after onset", "walking stable after 5,000 steps on average", "IV-B", "recovery", 5000),
+        Statement("last finetuning stops at step", "26,000", "IV-B", "last_stop", 26_000),
+        Statement("how finetuning ends", "9 converged, 1 aborted", "IV-B, caption", "outcomes"),
+    )),
+    "paper/car-transfer": Experiment("car", 0, 10_000, "simulator to car", "1 run", "a simulated four-wheel car in place of the real one", (
+        Statement("alarm after transfer", "\"quickly\"", "IV-C", "latency"),
+        Statement("recovery after transfer", "40,000 steps (driving stable after 10,000)", "IV-C, V-C", "recovery", 40_000),
+        Statement("finetuning ends after", "shortly after step 50,000, that is 40,000 steps", "IV-C", "stop", 40_000),
+    )),
+    "paper/car-socks": Experiment("car", 1, 10_000, "rear friction cut, as by socks", "1 run", "friction under a sock is a guess", (
+        Statement("reward lost at first", "20 %", "IV-C", "drop", 0.2),
+        Statement("alarm after the socks", "OPR nearly blind", "IV-C", "latency"),
+        Statement("recovery after the socks", "10,000 steps", "V-C", "recovery", 10_000),
+        Statement("reward at the end / before", "\"slightly lower\"", "IV-C", "kept"),
+    )),
+}
+
+
+class Measured(NamedTuple):
+  """A figure with its unit, interval and n; `value` None: the median stream never gets there, or nothing was measured."""
+  value: float | None
+  text: str
+  unit: str = "steps"
+
+
+def number(x: float | None, digits: int = 0) -> str:
+  """1,234.5; `-` for None, no negative zero."""
+  if x is None:
+    return "-"
+  text = f"{x:,.{digits}f}"
+  return text.lstrip("-") if not float(text.replace(",", "")) else text
+
+
+def span(ci, digits: int = 0) -> str:
+  """[low, high], `-` for an end that is censored; empty where there is no interval."""
+  return f"[{', '.join(number(x, digits) for x in ci)}]" if ci else ""
+
+
+def times(values: list[float], n: str) -> Measured:
+  """Censored median of times in control steps (inf: never), with its bootstrap interval."""
+  if not values:
+    return Measured(None, f"none of {n}")
+  median = bootstrap.finite(bootstrap.censored_median(values))
+  ci = bootstrap.interval(values, bootstrap.censored_median)
+  return Measured(median, f"{number(median)} {span(ci)} steps, {int(np.sum(np.isfinite(values)))} of {len(values)} {n}".replace("  ", " "))
+
+
+def shares(values: list[float], n: str) -> Measured:
+  """IQM of shares with its bootstrap interval, in per cent."""
+  if not values:
+    return Measured(None, f"none of {n}", "%")
+  ci, value = bootstrap.interval(values), float(bootstrap.iqm(values))
+  return Measured(value, f"{number(100 * value)} {span(ci and [None if x is None else 100 * x for x in ci])} %, {len(values)} {n}".replace("  ", " "), "%")
+
+
+def latency(rows: list[dict]) -> Measured:
+  met = [r for r in rows if r["onset"] is not None]
+  return times([np.inf if r["latency_steps"] is None else r["latency_steps"] for r in met], "streams")
+
+
+def recovery(rows: list[dict]) -> Measured:
+  return times([np.inf if r["recovery_step"] is None else r["recovery_step"] - r["onset"] for r in rows if r["affected"]], "affected streams")
+
+
+def stop(rows: list[dict]) -> Measured:
+  """Steps from the change to the end of a finetuning that converged; whatever else happened is censored."""
+  met = [r for r in rows if r["onset"] is not None]
+  return times([r["adapt_stop"] - r["onset"] if r["outcome"] == "converged" and r["adapt_stop"] >= r["onset"] else np.inf for r in met], "streams")
+
+
+def last_stop(rows: list[dict]) -> Measured:
+  """Absolute step of the last stop or abort; None while a stream is still adapting. A maximum has no bootstrap interval."""
+  ends, still = [r["adapt_stop"] for r in rows if r["adapt_stop"] is not None], sum(r["outcome"] == "adapting" for r in rows)
+  last = max(ends) if ends and not still else None
+  return Measured(last, f"{number(last)}, {len(ends)} streams that ended one" + (f", {still} still adapting" if still else "") + ", a maximum has no interval")
+
+
+def outcomes(rows: list[dict]) -> Measured:
+  count = lambda *names: sum(r["outcome"] in names for r in rows)
+  n, good = len(rows), count("converged")
+  ci = bootstrap.wilson(good, n)
+  return Measured(None, f"converged {good} of {n} {span(ci and [x * n for x in ci], 1)}, aborted {sum(r['outcome'].startswith('aborted') for r in rows)}, "
+                  f"still adapting {count('adapting')}, never alarmed {count('nominal')}", "")
+
+
+def kept(rows: list[dict]) -> Measured:
+  return shares([r["reward_final"] / r["reward_pre"] for r in rows if r["affected"] and r["reward_pre"]], "affected streams")
+
+
+def drop(rows: list[dict]) -> Measured:
+  return shares([r["reward_drop"] for r in rows if r["reward_drop"] is not None], "streams")
+
+
+MEASURES = {"latency": latency, "recovery": recovery, "stop": stop, "last_stop": last_stop, "outcomes": outcomes, "kept": kept, "drop": drop}
+
+
+def difference(paper: float | None, own: Measured) -> str:
+  """mjx_cl minus paper, in words where one of the two has no figure."""
+  if paper is None:
+    return "the paper gives no figure"
+  if own.value is None:
+    return "not reached"
+  scale, unit = (100, "points") if own.unit == "%" else (1, own.unit)
+  gap = scale * (own.value - paper)
+  return f"{'+' if gap > 0 else ''}{number(gap)} {unit}"
+
+
+def setup(experiment: Experiment, config: dict) -> str:
+  """What differs from the paper's set-up: the settings that config.json holds against the authors' defaults, then what the robot differs in."""
+  card, adapt, author = config["agent_card"], config["adapt"], DreamerConfig()
+  own = lambda name: adapt[name] if adapt[name] is not None else card["dreamer"][name]
+  pairs = [(card["dreamer"]["size"], author.size, "{} in place of {}"), (own("batch"), author.batch, "{} sequences an update in place of {}"),
+           (own("lr"), author.lr, "learning rate {:g} in place of {:g}"), (adapt["ratio"], AdaptConfig().ratio, "train ratio {:g} in place of {:g}"),
+           (config["onset"], experiment.onset, "onset {:,} in place of {:,}")]
+  words = [text.format(ours, theirs) for ours, theirs, text in pairs if ours != theirs]
+  if config["detector"] != "rolling_sigma_plain":
+    words.append(f"detector `{config['detector']}` in place of three deviations of single residuals")
+  if card.get("demonstrator"):
+    words.append("agent pretrained with a demonstrator")
+  return "; ".join(words + ([experiment.robot] if experiment.robot else []))
+
+
+def compare(name: str, config: dict, runs: list[dict]) -> list[tuple[str, str, str, str]]:
+  """Rows (what, paper, mjx_cl, difference) of one experiment, arm `detector` alone."""
+  experiment = EXPERIMENTS[name]
+  rows = [r for r in runs if r["arm"] == "detector" and r.get("change", 0) == experiment.change]
+  if not rows:
+    raise FileError(f"{name}: runs.parquet holds no row of arm `detector` with change {experiment.change}")
+  out = []
+  for s in experiment.statements:
+    own = MEASURES[s.measure](rows)
+    out.append((s.what, f"{s.text} ({s.source})", own.text, difference(s.value, own)))
+  return out

@@ -1,0 +1,364 @@
+"""README's numbers from the files of results/: what lies between `<!-- report:NAME -->` and `<!-- /report -->` is written by BLOCKS[NAME].
+
+Both markers stand alone on their lines. A block is a function of the results folder that returns Markdown; a new one is one function and one line of
+the table. No JAX is needed here.
+"""
+from __future__ import annotations
+
+import json
+import pathlib
+import re
+import statistics
+import textwrap
+from collections import Counter
+from typing import NamedTuple
+
+from mjx_cl import paper, store
+from mjx_cl.errors import FileError, UserError
+from mjx_cl.paper import number, span
+
+WIDTH = 150
+
+
+# ---- reading and wording ---------------------------------------------------------------------------------------------------------
+
+def load(path: pathlib.Path):
+  """Value of a JSON file."""
+  try:
+    return json.loads(path.read_text())
+  except FileNotFoundError:
+    raise FileError(f"{path} is missing") from None
+  except (OSError, ValueError) as e:
+    raise FileError(f"cannot read {path}: {str(e).splitlines()[0]}") from None
+
+
+def table(path: pathlib.Path, columns: list[str] | None = None) -> list[dict]:
+  """Rows of a Parquet file, undefined is None."""
+  import pyarrow
+  import pyarrow.parquet
+  if not path.exists():
+    raise FileError(f"{path} is missing")
+  try:
+    return pyarrow.parquet.read_table(path, columns=columns).to_pylist()
+  except (OSError, pyarrow.ArrowException) as e:
+    raise FileError(f"cannot read {path}: {str(e).splitlines()[0]}") from None
+
+
+class Bench:
+  """Rows {name, value, unit, goal, holds} of a speed script, by name, and what the file says of the measurement."""
+
+  def __init__(self, path: pathlib.Path):
+    value = load(path)
+    self.path, self.about = path, {} if isinstance(value, list) else value
+    self.rows = {r["name"]: r for r in (value if isinstance(value, list) else value["rows"])}
+
+  def row(self, name: str) -> dict:
+    if name not in self.rows:
+      raise FileError(f"{self.path} has no row {name!r}")
+    return self.rows[name]
+
+  def value(self, name: str, digits: int = 0, scale: float = 1.0) -> str:
+    value = self.row(name)["value"]
+    return number(None if value is None else scale * value, digits)
+
+  def goals(self, *names: str) -> str:
+    """The goals of some rows, each with `missed` where it is."""
+    rows = [self.row(name) for name in names]
+    return " / ".join(verdict(r) for r in rows) if any(r["goal"] for r in rows) else ""
+
+
+def verdict(row: dict) -> str:
+  """`0.45, missed`, `0.60`, or `-` without a goal."""
+  return "-" if row["goal"] is None else row["goal"].split()[-1] + ("" if row["holds"] or row["holds"] is None else ", missed")
+
+
+def missed(row: dict) -> str:
+  """` (goal 1.15, missed)` where a goal is missed, else nothing."""
+  return f" (goal {verdict(row)})" if row["holds"] is False else ""
+
+
+def percent(x: float | None, digits: int = 0) -> str:
+  return number(None if x is None else 100 * x, digits)
+
+
+def percents(ci, digits: int = 0) -> str:
+  return span(ci and [None if x is None else 100 * x for x in ci], digits)
+
+
+def fill(*sentences: str) -> str:
+  """One paragraph."""
+  return textwrap.fill(" ".join(sentences), WIDTH, break_long_words=False, break_on_hyphens=False)
+
+
+def grid(head, rows) -> str:
+  """A Markdown table."""
+  line = lambda cells: "|" + "|".join(f" {c} " if c else " " for c in cells) + "|"
+  return "\n".join([line(head), "|" + "---|" * len(head), *(line(r) for r in rows)])
+
+
+def joined(words: list[str]) -> str:
+  return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
+
+
+# ---- blocks ----------------------------------------------------------------------------------------------------------------------
+
+def run_walker(results: pathlib.Path) -> str:
+  """The run that the first command of the README makes."""
+  folder = results / "walker_gear"
+  config, summary = load(folder / "config.json"), load(folder / "summary.json")
+  runs = [r for r in table(folder / "runs.parquet") if r["arm"] == "detector" and not r.get("change")]
+  main, none, share = summary["arms"]["detector"], summary["arms"]["none"], summary["wall_share"]
+  n, hit, first = main["seeds"], main["affected"], config["first_seed"]
+  after = summary["steps"] - summary["onset"]
+  part = lambda r: r["fault"].split(":")[-1]
+  spared = [r for r in runs if r["affected"] is False]
+  parts = joined([f"{name} {count}" for name, count in sorted(Counter(map(part, spared)).items())]) if spared else ""
+  text = fill(
+      f"Seeds {first} to {first + n - 1}, one shipped agent, shares and counts with 95 % Wilson intervals, rewards as interquartile mean with 95 % bootstrap "
+      f"intervals over the {n} streams (conditional on that one agent), {config['machine']['cores']} cores ({config['machine']['cpu']}), "
+      f"{number(summary['wall_s'] / 60, 1)} minutes wall (shared machine; {', '.join(f'{k} {percent(v)} %' for k, v in share.items())}).",
+      f"Affected: {hit} of {n}" + (f"; the others ({parts}) lose at most {percent(max(r['reward_drop'] for r in spared), 1)} % of their reward." if spared else "."))
+  ends = {}
+  for r in runs:
+    if r["affected"]:
+      ends.setdefault(part(r), []).append(r["reward_final"] / r["reward_pre"])
+  count = lambda arm, name, of: f"{arm[name]} of {of} {span(arm[name + '_ci'], 1)}"
+  mean = lambda arm, name: f"{number(arm[name], 2)} {span(arm[name + '_ci'], 2)}"
+  ended = " / ".join(str(main[k]) for k in ("converged", "aborted_by_rule", "aborted_by_budget", "adapting"))
+  rows = [
+      (f"streams with a false alarm in {number(summary['onset'])} nominal steps", count(main, "false_alarm_streams", n), f"{none['false_alarm_streams']} of {n}"),
+      ("affected streams that alarm within 500 steps of onset", count(main, "affected_alarmed_within_500", hit), ""),
+      ("median latency, all streams, misses counted as infinite [steps]", f"{number(main['latency_median_steps'])} {span(main['latency_median_steps_ci'])}", ""),
+      ("miss probability, all streams", mean(main, "miss_probability"), ""),
+      ("affected streams recovered within 10,000 steps", f"{count(main, 'recovered_within_10000', hit)} ({main['recovered']} within {number(after)})",
+       f"{none['recovered_within_10000']} of {none['affected']}"),
+      ("recovery, median over the affected [steps after onset]", f"{number(main['recovery_median_steps'])} {span(main['recovery_median_steps_ci'])}",
+       number(none["recovery_median_steps"])),
+      ("converged / aborted by rule / by budget / still adapting", f"{ended} ({sum(r['outcome'] == 'nominal' for r in runs)} never alarmed)", ""),
+      ("reward per step before onset", mean(main, "reward_pre"), mean(none, "reward_pre")),
+      ("share of it lost over 2,000 steps after onset, without adaptation", "", mean(none, "reward_drop")),
+      ("reward over the last 2,000 steps, affected streams", mean(main, "reward_final_affected"), mean(none, "reward_final_affected")),
+      ("the same over reward before onset, by joint (streams)", ", ".join(
+          f"{name} {percent(statistics.fmean(x))} % ({len(x)})" for name, x in sorted(ends.items())), ""),
+  ]
+  return text + "\n\n" + grid(("", "arm `detector`", "arm `none`"), rows)
+
+
+def arl0(results: pathlib.Path) -> str:
+  """How often the default detector alarms on a healthy walker."""
+  value = load(results / "arl0.json")
+  chosen, plain, (low, high) = value["chosen"], value["plain"], value["seeds"]
+  what = "logarithms" if chosen["log"] else "residuals"
+  return fill(
+      f"Detector and stop rule were chosen on seeds {low} to {high} ([results/arl0.json](results/arl0.json), [results/walker_gear_tuning](results/walker_gear_tuning)).",
+      f"The detector `rolling_sigma` is the paper's rule on the trailing mean of {chosen['smooth']} {what} against a reference that lags by {chosen['lag']}, threshold "
+      f"{chosen['threshold']:g}: ARL0 {number(chosen['arl0'])} steps {span(chosen['arl0_ci'])} from {'only ' if chosen['few'] else ''}{chosen['alarms']} alarms in "
+      f"{number(value['nominal_steps'])} nominal steps, and {percent(chosen['within_500'])} % of {value['fault_affected']} affected tuning streams found within 500 steps.",
+      f"The rule as written (`rolling_sigma_plain`: single samples, {plain['threshold']:g} deviations) alarms every {number(plain['arl0'])} steps "
+      f"{span(plain['arl0_ci'])} on a healthy walker, because a gait makes residuals swing.")
+
+
+def leaderboard(results: pathlib.Path) -> str:
+  """Detectors on the recorded streams: those that beat never alarming, and their own plain form, as a table, the others in a sentence."""
+  meta = load(results / "leaderboard.json")
+  overall = sorted(table(results / "leaderboard_overall.parquet"), key=lambda r: (-r["cost_standard"], r["detector"]))
+  rows = table(results / "leaderboard.parquet", ["detector", "reference", "robot", "fault", "severity", "arl0_alarms"])
+  robots = sorted({r["robot"] for r in rows})
+  faults = len({(r["robot"], r["fault"], r["severity"]) for r in rows})
+  alarms = statistics.mode(r["arl0_alarms"] for r in rows if not r["reference"])
+  low, high = meta["seeds"]["score"]
+  minutes = meta["wall_s"] / 60
+  text = fill(
+      f"Every detector sees the same recorded streams of frozen agents: {joined(robots)}, {faults} fault settings (fault x severity), {high - low + 1} scoring seeds each; "
+      f"thresholds at ARL0 = {number(meta['arl0_target'])} control steps, calibrated on other seeds' healthy streams ({alarms} alarms for most"
+      + (", so every rate is an order of magnitude and marked so" if alarms < 50 else "") + "). Score: 0 for never alarming, 100 for alarming at the onset and at no other time; "
+      f"intervals over seeds. `mjx-cl leaderboard` ({len(overall)} detectors; {number(meta['stream_steps'] / 1e6, 1)} million stream-steps, {number(minutes, 1)} minutes on "
+      f"{meta['machine']['cores']} shared cores; goal 3 minutes{', missed' if minutes > 3 else ''}).",
+      "The page: [results/leaderboard.html](results/leaderboard.html), one file, sortable, a page per fault.")
+  whole = lambda x: f"{percent(x)}%"
+  score = {r["detector"]: r["cost_standard"] for r in overall}
+  plain = lambda name: re.split("[@ ]", name)[0] if "(oracle)" not in name else name  # cusum@opr and cusum white are variants of cusum
+  kind = lambda name: "worse" if not score[name] > 0 else "variant" if score[name] < score.get(plain(name), score[name]) else "shown"
+  shown = [(r["detector"], f"{number(r['cost_standard'])} {span((r['cost_standard_low'], r['cost_standard_high']))}", whole(r["detected_within_1s"]),
+            whole(r["detected_within_5s"]), whole(r["miss_probability"]), number(r["false_alarms_per_hour"], 1), number(r["mean_rank"], 1))
+           for r in overall if kind(r["detector"]) == "shown"]
+  board = grid(("detector", "score [95 %]", "within 1 s", "within 5 s", "missed", "false alarms/h", "mean rank"), shown)
+  left = {k: ", ".join(f"{name} {number(x)}" for name, x in score.items() if kind(name) == k) for k in ("variant", "worse")}
+  rest = [f"{words}: {left[k]}." for k, words in (("variant", "Variants that score less than the plain form"), ("worse", "No better than never alarming")) if left[k]]
+  return "\n\n".join([text, "![leaderboard](results/leaderboard.png)", board, *([fill(*rest)] if rest else [])])
+
+
+def physics(results: pathlib.Path) -> str:
+  """Speed of physics and fault layer."""
+  bench = Bench(results / "physics.json")
+  against = lambda robot: f"{robot}: native against MJX, batch 256"
+  native = lambda robot, digits: bench.value(against(robot), digits) + missed(bench.row(against(robot)))
+  cost = "walker: all faults traced, one active per stream, against none"
+  rollout, lidar = "walker: jitted rollout of 160 streams against bare mjbatch", "car: 160 streams with lidar"
+  return fill(
+      f"Speed ({bench.about['machine']}; `{bench.about['command']}`, medians, [results/physics.json](results/physics.json)): a jitted rollout of 160 walkers runs at "
+      f"{bench.value(rollout, 2)} of bare mjbatch stepping of the same work{missed(bench.row(rollout))}; native against MJX on the same cores, batch 256: walker {native('walker', 0)} "
+      f"(as it is, with MuJoCo's default solver iterations), quadruped {native('quadruped', 1)}, `car_real` {native('car_real', 1)}; `car` with lidar "
+      f"{number(round(bench.row(lidar)['value'], -3))} control steps/s{missed(bench.row(lidar))}; all faults of the walker traced and one "
+      f"active on every stream cost {bench.value(cost, 3)} times none{missed(bench.row(cost))}.")
+
+
+def dreamer(results: pathlib.Path) -> str:
+  """Speed of the learner."""
+  bench = Bench(results / "dreamer_update.json")
+  v, goals = bench.value, bench.goals
+  act, watch = "acting, 40 streams, {}, per control step", "monitor, 40 streams, {}, share of the matrix rate"
+  each = [act.format(x) for x in ("one agent", "an agent each")], [watch.format(x) for x in ("one agent", "an agent each")]
+  size, large, seeds = "update size1m, share of the matrix rate", "update size12m, share of the matrix rate", "ten seeds in one program (lax.map), per seed / one seed alone"
+  rows = [
+      ("update size1m, 16 x 64, 15 imagined from 1,024 states", f"{v('update size1m, 1,024 starts')} ms, share {v(size, 2)}", goals(size)),
+      ("the same, 256 starts (preset `cpu`)", f"{v('update size1m, 256 starts (preset cpu)')} ms", ""),
+      ("update size12m", f"{v('update size12m')} ms, share {v(large, 2)}", goals(large)),
+      ("ten seeds in one program, per seed, against one alone", v(seeds, 2), goals(seeds)),
+      ("acting, 40 streams of one agent / with an agent each, per control step", f"{v(each[0][0], 2)} / {v(each[0][1], 1)} ms", goals(*each[0])),
+      ("monitor, 40 streams of one agent / with an agent each, share", f"{v(each[1][0], 2)} / {v(each[1][1], 2)}", goals(*each[1])),
+  ]
+  for name, note in (("update", ""), ("monitor", ""), ("rollout", " (holds a callback, never cached)")):
+    both = f"compile {name}, cold", f"compile {name}, cached"
+    digits = 0 if (bench.row(both[0])["value"] or 0) >= 10 else 1
+    rows.append((f"compile {name}, cold / cached{note}", f"{v(both[0], digits)} / {v(both[1], 1)} s", goals(*both)))
+  text = fill(f"**Speed and memory** (`{bench.about['command']}`, [results/dreamer_update.json](results/dreamer_update.json); {bench.about['machine']}; medians). The share is floating-point "
+              "operations / time / the rate of a 2,048 x 2,048 float32 product in the same process, the figure that carries over between machines.")
+  return text + "\n\n" + grid(("", "measured", "goal"), rows)
+
+
+GOALS = {"velocity_error_m_s": 0.25, "falls": 5}  # shipped quadruped: m/s off the command, falls in 100 episodes
+
+
+def agents(results: pathlib.Path) -> str:
+  """The shipped agents: what training cost, and what evaluation gave."""
+  def trained(name):
+    last = table(results / f"{name}_agent" / "curve.parquet", ["updates", "records", "seconds"])[-1]
+    return f"{number(round(last['updates'], -2))} updates, {number(last['records'] / 1e6, 1)} M records, {number(last['seconds'] / 60)} minutes"
+
+  def score(e):
+    return f"{number(e['return_mean'])}; {number(e['return_iqm'])} {span(e['return_ci'])}"
+
+  def driving(e):
+    said = f"{percent(e['collision_rate'])} % {percents(e['collision_rate_ci'], 1)} collide; {number(e['mean_speed_m_s'], 2)} m/s {span(e['mean_speed_m_s_ci'], 2)} along the track"
+    return said + (f"; reference driver, same starts: {number(e['reference_speed_m_s'], 2)} m/s, return {number(e['reference_return'])}, {e['reference_collisions']} collide")
+
+  walker, car, real, dog = (load(results / f) for f in ("walker_agent/eval.json", "car_agent/eval.json", "car_agent/eval_car_real.json", "quadruped_agent/eval.json"))
+  error, falls = dog["velocity_error_m_s"], 100 * dog["fall_rate"]
+  walking = (f"{number(error, 3)} m/s {span(dog['velocity_error_m_s_ci'], 3)} off the commanded planar velocity (goal {GOALS['velocity_error_m_s']:g}"
+             f"{', missed' if error > GOALS['velocity_error_m_s'] else ''}); {number(falls)} % {percents(dog['fall_rate_ci'])} fall (goal {GOALS['falls']}"
+             f"{', missed' if falls > GOALS['falls'] else ''})")
+  rows = [("`walker`", trained("walker"), str(walker["episodes"]), score(walker), f"{walker['terminations']} terminations"),
+          ("`car`", trained("car"), str(car["episodes"]), score(car), driving(car)),
+          ("the same in `car_real`, unchanged", "", str(real["episodes"]), score(real), driving(real)),
+          ("`quadruped`", trained("quadruped"), str(dog["episodes"]), score(dog), walking)]
+  return grid(("agent", "training", "episodes", "return: mean; IQM [95 %]", "the task's own figures"), rows)
+
+
+def detectors(results: pathlib.Path) -> str:
+  """Speed of the detectors."""
+  bench = Bench(results / "detectors.json")
+  value = lambda r: "-" if r["value"] is None else f"{r['value']:,.3g}" if abs(r["value"]) < 1000 else number(r["value"])
+  return grid(("", "measured", "goal"), [(name, f"{value(r)} {r['unit']}".strip(), bench.goals(name)) for name, r in bench.rows.items()])
+
+
+def experiments(results: pathlib.Path, names=tuple(paper.EXPERIMENTS)) -> str:
+  """The paper's figures, those of mjx_cl and the difference; see paper.py."""
+  rows = []
+  for name in names:
+    experiment = paper.EXPERIMENTS[name]
+    folder = results / "paper" / experiment.folder
+    config, summary, runs = load(folder / "config.json"), load(folder / "summary.json"), table(folder / "runs.parquet")
+    head = f"`{name}`: {experiment.protocol}; paper {experiment.runs}, here {summary['arms']['detector']['seeds']} seeds"
+    differs = paper.setup(experiment, config)
+    for k, line in enumerate(paper.compare(name, config, runs)):
+      rows.append((head if not k else "", *line, differs if not k else ""))
+  text = fill("Arm `detector`. Times are medians in control steps in which a stream that never gets there counts as infinite, shares interquartile means; 95 % intervals are "
+              "bootstrapped over streams, of counts Wilson's, all conditional on the one agent that the streams of an experiment share. In brackets: the paper's section.")
+  return text + "\n\n" + grid(("experiment", "what", "paper", "mjx_cl", "difference", "set-up other than the paper's"), rows)
+
+
+BLOCKS = {"run-walker": run_walker, "arl0": arl0, "leaderboard": leaderboard, "physics": physics, "dreamer": dreamer, "agents": agents, "detectors": detectors,
+          "paper": experiments}
+
+
+# ---- README ----------------------------------------------------------------------------------------------------------------------
+
+class Block(NamedTuple):
+  """A marked block: `first` and `last` are the lines of its markers, counted from 0."""
+  name: str
+  first: int
+  last: int
+
+
+def find(lines: list[str], where: str) -> list[Block]:
+  """Marked blocks of a text in their order.
+
+  Raises:
+    FileError for a marker that is malformed, unclosed or left over, and for an unknown name.
+  """
+  blocks, opened = [], None
+  for k, line in enumerate(lines):
+    if not re.search(r"<!--\s*/?\s*report\b", line):
+      continue
+    here = f"{where}:{k + 1}"
+    match = re.fullmatch(r"<!-- (?:report:(\S+)|/report) -->", line.rstrip("\r\n"))
+    if not match:
+      raise FileError(f"{here}: {line.strip()!r} is no marker; write <!-- report:NAME --> or <!-- /report -->, alone on its line")
+    name = match[1]
+    if name is None:
+      if opened is None:
+        raise FileError(f"{here}: <!-- /report --> closes nothing")
+      blocks.append(Block(opened[0], opened[1], k))
+      opened = None
+      continue
+    if opened is not None:
+      break
+    if name not in BLOCKS:
+      raise FileError(f"{here}: unknown block {name!r}; choose from: {', '.join(sorted(BLOCKS))}")
+    opened = name, k
+  if opened is not None:
+    raise FileError(f"{where}:{opened[1] + 1}: block {opened[0]!r} is not closed by <!-- /report -->")
+  return blocks
+
+
+def render(name: str, results: pathlib.Path) -> str:
+  """Text of a block; a file that is missing or holds something else gives one line with the block's name."""
+  try:
+    return BLOCKS[name](results)
+  except FileError as e:
+    raise FileError(f"block {name!r}: {e}") from None
+  except (KeyError, IndexError, TypeError, ValueError, AttributeError, ArithmeticError, statistics.StatisticsError) as e:
+    raise FileError(f"block {name!r}: its files in {results} do not hold what it shows ({type(e).__name__}: {e})") from None
+
+
+def report(results="results", readme="README.md", check: bool = False) -> list[dict]:
+  """Writes the marked blocks of `readme` anew; nothing else in it changes, and nothing at all where all agree.
+
+  Args:
+    check: only compare.
+  Returns:
+    Per block, in order: name, line of its opening marker (from 1, of the file as it was), agrees (before writing).
+  """
+  results, readme = pathlib.Path(results), pathlib.Path(readme)
+  if not results.is_dir():
+    raise UserError(f"no folder {results}")
+  try:
+    old = readme.read_bytes().decode()
+  except FileNotFoundError:
+    raise UserError(f"no file {readme}") from None
+  except UnicodeDecodeError:
+    raise FileError(f"{readme} is no UTF-8 text") from None
+  lines = re.findall(r"[^\n]*\n|[^\n]+", old)
+  out, rows, at, texts = [], [], 0, {}
+  for block in find(lines, str(readme)):
+    texts[block.name] = texts.get(block.name) or render(block.name, results)
+    end = "\r\n" if lines[block.first].endswith("\r\n") else "\n"
+    new = "".join(line + end for line in texts[block.name].split("\n"))
+    rows.append({"name": block.name, "line": block.first + 1, "agrees": "".join(lines[block.first + 1:block.last]) == new})
+    out += [*lines[at:block.first + 1], new]
+    at = block.last
+  text = "".join(out + lines[at:])
+  if not check and text != old:
+    store.atomic(readme, lambda file: file.write(text.encode()))
+  return rows
