@@ -9,6 +9,7 @@ import dataclasses
 import io
 import json
 import os
+import pathlib
 import re
 import signal
 import sys
@@ -72,6 +73,8 @@ class Run:
   """Actions of the monitor's predictions, recorded or policy."""
   deterministic: bool = False
   """Act by the policy's mean instead of a sample."""
+  snapshots: int = 0
+  """Control steps of adaptation between two snapshots of arm oracle-budget, which the stop rule is scored against; 0: none."""
   adapt: AdaptConfig = AdaptConfig()
   json: bool = False
   """One JSON value on standard output, nothing else there."""
@@ -189,6 +192,38 @@ class Leaderboard:
 
 
 @dataclass(frozen=True)
+class Bench:
+  """Runs a suite: runs over robots, faults and settings, each in a folder of its own; prints its plan first.
+
+  The same command goes on where it was cut off; finished parts are never run again. Writes OUT/PART/ as `mjx-cl run` does, OUT/bench.parquet, OUT/bench.json.
+  """
+  suite: Positional[str] = "quick"
+  """paper, quick, full, study or a .toml file, see `mjx-cl list benches`."""
+  out: str | None = None
+  """Result folder; default: runs/bench/SUITE."""
+  only: tuple[str, ...] = ()
+  """Only these parts, or those below these names."""
+  seeds: int | None = None
+  """In place of the suite's."""
+  first_seed: int | None = None
+  """In place of the suite's."""
+  arm: tuple[str, ...] = ()
+  """In place of the suite's."""
+  physics: str = "auto"
+  plan: bool = False
+  """Only print the plan."""
+  shard: str = "0/1"
+  """K/N: this machine runs every N-th part from the K-th on."""
+  merge: tuple[str, ...] = ()
+  """Folders of the same suite from other machines; their finished parts are copied here and not run."""
+  publish: str | None = None
+  """Copy finished parts' tables and figures, without the traces, to this folder."""
+  json: bool = False
+  resume: bool = False
+  """Said for completeness: a suite always goes on."""
+
+
+@dataclass(frozen=True)
 class Plot:
   """Draws figure.png of a run anew."""
   folder: Positional[str]
@@ -291,7 +326,7 @@ class Report:
 class List:
   """Names that other commands take."""
   what: Positional[str] = "all"
-  """envs, faults, fault-presets, schedules, detectors, presets, agents, arms, sizes, suites or all."""
+  """envs, faults, fault-presets, schedules, detectors, presets, agents, arms, sizes, suites, benches or all."""
   json: bool = False
 
 
@@ -302,7 +337,7 @@ class Doctor:
 
 
 Command = (Annotated[Run, tyro.conf.subcommand("run")] | Annotated[Train, tyro.conf.subcommand("train")] | Annotated[Eval, tyro.conf.subcommand("eval")]
-           | Annotated[Certify, tyro.conf.subcommand("certify")] | Annotated[Record, tyro.conf.subcommand("record")] | Annotated[Leaderboard, tyro.conf.subcommand("leaderboard")] | Annotated[Plot, tyro.conf.subcommand("plot")] | Annotated[Render, tyro.conf.subcommand("render")] | Annotated[Query, tyro.conf.subcommand("query")] | Annotated[Detect, tyro.conf.subcommand("detect")]
+           | Annotated[Certify, tyro.conf.subcommand("certify")] | Annotated[Record, tyro.conf.subcommand("record")] | Annotated[Leaderboard, tyro.conf.subcommand("leaderboard")] | Annotated[Bench, tyro.conf.subcommand("bench")] | Annotated[Plot, tyro.conf.subcommand("plot")] | Annotated[Render, tyro.conf.subcommand("render")] | Annotated[Query, tyro.conf.subcommand("query")] | Annotated[Detect, tyro.conf.subcommand("detect")]
            | Annotated[Report, tyro.conf.subcommand("report")]
            | Annotated[List, tyro.conf.subcommand("list")] | Annotated[Doctor, tyro.conf.subcommand("doctor")])
 
@@ -386,7 +421,8 @@ def do_run(args: Run) -> None:
   config = RunConfig(
       env=args.env, fault=args.fault, target=None if args.target == "random" else args.target, severity=args.severity, onset=args.onset,
       duration=args.duration, schedule=args.schedule, period=args.period, share=args.share, steps=args.steps, seeds=args.seeds, first_seed=args.first_seed, detector=args.detector, settings=settings(args.set),
-      arms=args.arm, agent=args.agent, physics=args.physics, form=args.form, actions=args.actions, deterministic=args.deterministic, adapt=args.adapt)
+      arms=args.arm, agent=args.agent, physics=args.physics, form=args.form, actions=args.actions, deterministic=args.deterministic, adapt=args.adapt,
+      snapshots=args.snapshots)
   from mjx_cl import run
   with RunDisplay() as display:
     summary = run.execute(config, args.out, args.resume, args.overwrite, display)
@@ -410,6 +446,65 @@ def summary_text(s: dict, out: str) -> str:
                  f"{number(a['reward_final'], '.2f')}; a stream: {number(a['updates_mean'], '.0f')} updates in {number(a['adapted_steps_mean'], '.0f')} steps of "
                  f"adaptation, return lost by it before onset {number(a['return_lost_healthy_mean'], '.0f')}")
   return "\n".join(lines + [f"files in {out}"])
+
+
+def do_bench(args: Bench) -> None:
+  from mjx_cl import bench, memory
+  change = {k: v for k, v in (("seeds", args.seeds), ("first_seed", args.first_seed), ("arms", list(args.arm) or None),
+                              ("physics", None if args.physics == "auto" else args.physics)) if v is not None}
+  suite = bench.suite(args.suite, change)
+  k, sign, n = args.shard.partition("/")
+  if not (sign and k.isdigit() and n.isdigit()):
+    raise UserError(f"--shard takes K/N, such as 0/2; got {args.shard!r}")
+  parts = bench.pick(suite.parts, args.only, (int(k), int(n)))
+  out = pathlib.Path(args.out or f"runs/bench/{suite.name}")
+  done = {p.name for p in parts if bench.finished(out, p)}
+  estimates = bench.estimates(parts)
+  if args.plan:
+    if args.json:
+      emit([{"part": p.name, "finished": p.name in done, **estimates[p.name]._asdict()} for p in parts])
+    else:
+      print("\n".join(plan_lines(suite, parts, done, estimates)))
+    return
+  for part in parts:  # whatever can be refused is refused before the first part runs
+    if part.name not in done:
+      bench.check(part)
+  for folder in args.merge:
+    if not os.path.isdir(folder):
+      raise UserError(f"--merge: no folder {folder}")
+  need, space = max((e.bytes for e in estimates.values()), default=0), int(memory.MARGIN * memory.free())
+  if need > space:
+    raise UserError(f"a part needs {need / 2**30:.1f} GiB, {space / 2**30:.1f} GiB may be used; fewer --seeds would fit")
+  try:
+    out.mkdir(parents=True, exist_ok=True)
+  except OSError as e:
+    raise FileError(f"cannot make {out}: {e.strerror}") from None
+  for line in plan_lines(suite, parts, done, estimates):
+    say(line)
+  for name in bench.take(out, parts, args.merge):
+    say(f"{name}: taken over")
+  value = bench.execute(suite, out, parts, estimates, say, RunDisplay)
+  if args.publish:
+    bench.publish(out, suite.parts, args.publish)
+  if args.json:
+    emit(value)
+    return
+  for name, summary in value["entries"].items():
+    print(f"{name}: {summary_text(summary, str(out / name))}")
+  print(f"{value['finished']} of {value['parts']} parts finished; files in {out}")
+
+
+def plan_lines(suite, parts, done, estimates) -> list[str]:
+  """The plan of a suite for a reader."""
+  lines = [f"{suite.name}: {suite.about}"]
+  width = max([4, *(len(p.name) for p in parts)])
+  lines.append(f"  {'part':{width}s}  streams  stream-steps   updates  minutes    GiB")
+  for p in parts:
+    e = estimates[p.name]
+    minutes = "finished" if p.name in done else f"{e.seconds / 60:.0f}"
+    lines.append(f"  {p.name:{width}s}  {e.streams:7,d}  {e.stream_steps:12,d}  {e.updates:8,.0f}  {minutes:>7s}  {e.bytes / 2**30:5.1f}")
+  left = sum(estimates[p.name].seconds for p in parts if p.name not in done)
+  return lines + [f"  {len(done)} of {len(parts)} parts finished; about {clock(left)} left, by a one-second measurement of this machine's matrix product"]
 
 
 def do_train(args: Train) -> None:
@@ -709,12 +804,12 @@ def do_report(args: Report) -> None:
 
 
 def do_list(args: List) -> None:
-  from mjx_cl import agents, detectors, envs, fault_presets, faults, memory, streams
+  from mjx_cl import agents, bench, detectors, envs, fault_presets, faults, memory, streams
   first = lambda f: (f.__doc__ or "").strip().split("\n")[0]
   tables = {"envs": {k: first(v) for k, v in envs.ENVS.items()}, "faults": {k: faults.about(k) for k in faults.FAULTS},
             "detectors": {k: first(v) for k, v in detectors.DETECTORS.items()}, "presets": {k: p.about for k, p in PRESETS.items()},
             "agents": {k: "shipped" for k in agents.shipped()}, "arms": {k: a.about for k, a in ARMS.items()}, "fault-presets": {k: f"{p.about} ({p.source})" for k, p in fault_presets.PRESETS.items()}, "schedules": fault_presets.SCHEDULES,
-            "sizes": memory.table(), "suites": streams.about()}
+            "sizes": memory.table(), "suites": streams.about(), "benches": bench.shipped()}
   chosen = tables if args.what == "all" else {args.what: choose("list", args.what, tables)}
   if args.json:
     emit(chosen)
@@ -735,7 +830,7 @@ def do_doctor(args: Doctor) -> None:
       print(f"{name:16s} {value if not isinstance(value, dict) else ', '.join(f'{k} {v}' for k, v in value.items())}")
 
 
-DO = {Run: do_run, Train: do_train, Eval: do_eval, Certify: do_certify, Record: do_record, Leaderboard: do_leaderboard, Plot: do_plot, Render: do_render, Query: do_query, Report: do_report, Detect: do_detect, List: do_list, Doctor: do_doctor}
+DO = {Run: do_run, Bench: do_bench, Train: do_train, Eval: do_eval, Certify: do_certify, Record: do_record, Leaderboard: do_leaderboard, Plot: do_plot, Render: do_render, Query: do_query, Report: do_report, Detect: do_detect, List: do_list, Doctor: do_doctor}
 
 
 def parse(argv: list[str] | None):

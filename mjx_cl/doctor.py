@@ -9,23 +9,14 @@ import psutil
 def report() -> dict:
   """Versions, devices, backend, memory, cache folder, and a speed check of about two seconds."""
   import jax
-  import jax.numpy as jnp
   import numpy as np
-  from mjx_cl import __version__, envs, runtime, store
+  from mjx_cl import __version__, bench, envs, runtime, store
   rows = {"mjx_cl": __version__, **{k: v for k, v in store.provenance().items() if k in ("versions", "python", "machine")}}
   rows["devices"] = ", ".join(str(d) for d in jax.devices())
   rows["physics"] = runtime.default_physics()
   rows["free_memory_gib"] = round(psutil.virtual_memory().available / 2**30, 1)
   rows["compile_cache"] = str(runtime.cache_dir())
-  x = jnp.ones((2048, 2048), jnp.float32)
-  dot = jax.jit(jnp.dot)
-  dot(x, x).block_until_ready()
-  best, end = float("inf"), time.perf_counter() + 1.0
-  while time.perf_counter() < end:
-    begin = time.perf_counter()
-    dot(x, x).block_until_ready()
-    best = min(best, time.perf_counter() - begin)
-  rows["matmul_gflop_s"] = round(2 * 2048**3 / best / 1e9)
+  rows["matmul_gflop_s"] = round(bench.matmul_rate() / 1e9)
   env = envs.make("walker")
   if env.physics.name == "native":
     num = 256

@@ -73,6 +73,16 @@ def read_table(path) -> dict:
   return {name: table[name].to_numpy() for name in table.column_names}
 
 
+def read_plain(path) -> dict[str, list]:
+  """Columns of a Parquet file as Python values, null as None."""
+  import pyarrow
+  import pyarrow.parquet
+  try:
+    return pyarrow.parquet.read_table(path).to_pydict()
+  except (OSError, pyarrow.ArrowException) as e:
+    raise FileError(f"cannot read {path}: {str(e).splitlines()[0]}") from None
+
+
 def views(folders: tuple[str, ...] = (), results: str = "results") -> dict[str, pathlib.Path]:
   """Names of result tables, each after its path: results/leaderboard.parquet is leaderboard, results/walker_gear/runs.parquet walker_gear_runs.
 

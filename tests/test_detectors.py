@@ -231,7 +231,7 @@ def test_an_unknown_setting_is_named():
 
 
 def test_calibrated_settings_can_be_overridden():
-  assert detectors.make("rolling_sigma").init()[0].buffer.shape == (detectors.CALIBRATED["window"] + detectors.CALIBRATED["lag"],)
+  assert detectors.make("rolling_sigma").init()[0].buffer.shape == (detectors.CALIBRATED["walker"]["window"] + detectors.CALIBRATED["walker"]["lag"],)
   assert detectors.make("rolling_sigma", window=300, lag=20).init()[0].buffer.shape == (320,)
   assert detectors.make("rolling_sigma_plain").init()[0].buffer.shape == (1000,)
 

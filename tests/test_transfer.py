@@ -355,19 +355,38 @@ def test_each_stream_has_its_own_onset_event(whole):
 
 def test_latency_and_windows_are_counted_from_there(whole):
   out, trace, rows = whole[0], by_stream(whole[0]), table(whole[0], "runs")
+  assert rows["change"] == [0, 1] * 4 and rows["stream"] == [0, 0, 1, 1, 2, 2, 3, 3]
   for g in range(4):
-    row, at, reward = {k: v[g] for k, v in rows.items()}, entered(trace, g), trace["reward"][g].astype(float)
-    alarms = np.flatnonzero(trace["alarm"][g])
+    row, at = {k: v[2 * g] for k, v in rows.items()}, entered(trace, g)
+    then = {k: v[2 * g + 1] for k, v in rows.items()}["onset"]
+    assert then == ONSET + SECOND > at
+    reward, alarms = trace["reward"][g, :then].astype(float), np.flatnonzero(trace["alarm"][g, :then])
     after = alarms[alarms >= at]
     assert row["onset"] == at and row["false_alarms"] == (alarms < at).sum() and row["alarm_step"] == (after[0] if len(after) else None)
     assert row["latency_steps"] == (after[0] - at if len(after) else None)
     acted = [int(r.split()[-1]) for _, r in events_of(out, g, "start")]
     assert row["reward_pre"] == pytest.approx(reward[ADAPT.warmup:min([at] + acted[:1])].mean())
     assert row["return_lost"] == pytest.approx((row["reward_pre"] - reward[at:]).sum())
-    none, own = trace["reward"][2 + g % 2].astype(float), entered(trace, 2 + g % 2)
+    none, own = trace["reward"][2 + g % 2, :then].astype(float), entered(trace, 2 + g % 2)
     assert row["reward_drop"] == pytest.approx(1 - none[own:].mean() / none[ADAPT.warmup:own].mean())
   summary = json.loads((out / "summary.json").read_text())
   assert (summary["fault"], summary["severity"], summary["onset"]) == ("car/both", 1.0, ONSET)
+
+
+def test_the_second_change_has_rows_of_its_own(whole):
+  out, trace, rows = whole[0], by_stream(whole[0]), table(whole[0], "runs")
+  for g in range(4):
+    row, at = {k: v[2 * g + 1] for k, v in rows.items()}, ONSET + SECOND
+    reward, alarms = trace["reward"][g].astype(float), np.flatnonzero(trace["alarm"][g])
+    after = alarms[alarms >= at]
+    assert row["alarm_step"] == (after[0] if len(after) else None) and row["latency_steps"] == (after[0] - at if len(after) else None)
+    assert row["false_alarms"] is None and row["wall_s"] is None and row["return_lost_healthy"] is None  # what comes before is the first row's
+    assert row["reward_pre"] == pytest.approx(reward[:at].mean()) and row["reward_drop"] == pytest.approx(1 - reward[at:].mean() / reward[:at].mean())
+    assert row["terminations"] == trace["terminated"][g, at:].sum() and row["adapted_steps"] == (trace["phase"][g, at:] == "adapting").sum()
+    assert rows["updates"][2 * g] == trace["updates"][g, at] and row["updates"] >= trace["updates"][g, -1] - trace["updates"][g, at]
+  summary = json.loads((out / "summary.json").read_text())
+  (later,) = summary["later_changes"]
+  assert set(later) == set(summary["arms"]) and later["none"]["seeds"] == 2 and later["none"]["false_alarms_per_hour"] is None
 
 
 def test_the_task_is_accepted_by_the_level_of_the_robot_that_there_is(whole):
@@ -444,8 +463,8 @@ def test_a_robot_that_is_spared_stays_what_it_is(whole, short, saved, tmp_path):
   trace, rows, before = by_stream(tmp_path), table(tmp_path, "runs"), by_stream(whole[0])
   for g in (0, 1):
     assert not trace["severity"][g].any() and not trace["fault_active"][g].any() and set(trace["fault"][g]) == {"none"}
-    assert rows["onset"][g] is None and not events_of(tmp_path, g, "onset")
+    assert rows["onset"][rows["stream"].index(g)] is None and not events_of(tmp_path, g, "onset")
     at = min([entered(trace, g + 2)] + [s + 1 for s, _ in events_of(tmp_path, g, "start")])
     assert trace["reward"][g, :at].tobytes() == trace["reward"][g + 2, :at].tobytes() == before["reward"][g, :at].tobytes()
     np.testing.assert_array_equal(trace["severity"][g + 2], np.arange(STEPS) >= entered(trace, g + 2))
-    assert rows["onset"][g + 2] == entered(trace, g + 2)
+    assert rows["onset"][rows["stream"].index(g + 2)] == entered(trace, g + 2)

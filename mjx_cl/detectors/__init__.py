@@ -37,17 +37,19 @@ def paper_rule(threshold: float = 3.0, threshold_rpr: float | None = None, **set
 
 
 def calibrated_rule(**settings) -> Detector:
-  """The paper's rule calibrated to ARL0 = 100,000 steps on nominal walkers, seeds 100 to 109: trailing mean of the logarithms, a lagged
-  reference, one side, a threshold for each residual.
+  """The paper's rule calibrated to ARL0 = 100,000 steps on nominal robots, seeds 100 to 109: trailing mean of the logarithms, a lagged
+  reference, one side, a threshold for each residual. Figures of the walker; `make` takes those of the robot where it is told which.
 
   How the figures were found: benchmarks/calibrate.py; its table: results/arl0.json. Runs of single samples in a row do not do: a gait makes
   residuals swing, and at this ARL0 they find almost nothing within 500 steps.
   """
-  return paper_rule(**(CALIBRATED | settings))
+  return paper_rule(**(CALIBRATED["walker"] | settings))
 
 
-# chosen by benchmarks/calibrate.py on tuning seeds, see results/arl0.json
-CALIBRATED = {"window": 4000, "smooth": 400, "lag": 500, "threshold": 6.5, "patience": 1, "two_sided": False, "log": True}
+# by robot, chosen by benchmarks/calibrate.py on tuning seeds, see results/arl0.json, arl0_quadruped.json, arl0_car.json
+CALIBRATED = {
+    "walker": {"window": 4000, "smooth": 400, "lag": 500, "threshold": 6.5, "patience": 1, "two_sided": False, "log": True},
+}
 
 DETECTORS = {"rolling_sigma": calibrated_rule, "rolling_sigma_plain": paper_rule}
 DETECTORS |= {"z_score": z_score, "ewma": ewma, "cusum": cusum, "page_hinkley": page_hinkley, "shiryaev_roberts": shiryaev_roberts, "glr": glr}
@@ -76,7 +78,7 @@ DETECTORS |= _plugins()
 
 
 def make(name: str, channel: str | None = None, log: bool | None = None, whiten: int = 0, patience: int = 1, cool_down: int = 0,
-         **settings) -> Detector:
+         robot: str | None = None, **settings) -> Detector:
   """Builds detector `name`, a map over monitor.Residual. Unknown settings are refused.
 
   Args:
@@ -89,11 +91,14 @@ def make(name: str, channel: str | None = None, log: bool | None = None, whiten:
     patience: scores in a row above the threshold before a single-residual detector fires, see combine.patience; others have their own setting of
       this name, or none.
     cool_down: samples after an alarm in which no other counts, of the channels together, see combine.cool_down.
+    robot: whose figures `rolling_sigma` starts from, where CALIBRATED has them; default: the walker's.
   """
   name, at, after = name.partition("@")
   if at:
     channel = after
   build = choose("detector", name, DETECTORS)
+  if name == "rolling_sigma":
+    settings = CALIBRATED.get(robot, {}) | settings
   try:
     if getattr(build, "takes", "residual") != "scalar":
       if channel is not None or log is not None or whiten:

@@ -1,0 +1,334 @@
+"""`bench`: a suite of runs, each a folder as `mjx-cl run` writes it; finished parts are never run again.
+
+A suite is TOML: `name`, `about`, a table `run` of settings for every entry, and tables `entries.NAME` with settings of RunConfig (`adapt` is a table of
+AdaptConfig's, `settings` one of the detector's). A list where RunConfig takes one value makes a part of each, and several lists a grid:
+`severity = [0.25, 0.5]` with `adapt.ratio = [4, 16]` are four parts, NAME/severity=0.25,adapt.ratio=4 and so on. What is not given is RunConfig's default.
+
+OUT/suite.json holds the resolved parts; OUT/PART/ the result files of each; OUT/bench.parquet all rows of the finished parts' runs.parquet with their
+part in front, and OUT/bench.json their summaries. Parts are independent: several machines share a suite by `shard`, and `merge` takes over what others finished.
+"""
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import json
+import os
+import pathlib
+import shutil
+import time
+import tomllib
+from collections.abc import Callable
+from typing import NamedTuple
+
+from mjx_cl import store
+from mjx_cl.adapt.arms import ARMS, FOREVER
+from mjx_cl.config import AdaptConfig, RunConfig, becomes, replace
+from mjx_cl.errors import FileError, UserError
+
+SUITES = pathlib.Path(__file__).parent / "suites" / "bench"
+PUBLISHED = ("config.json", "events.parquet", "runs.parquet", "summary.json", "figure.png", "snapshots.parquet", "stop.parquet")
+MERGED = (*PUBLISHED, "trace.parquet", "residuals.parquet")
+
+# Seconds at a dense float32 product of 200 GFLOP/s, measured by `mjx-cl run` of ten seeds and two arms on 2 cores (results/paper/*/summary.json)
+WATCH_S, ACT_S = 0.25e-3, 0.12e-3      # monitor; acting: per stream and control step, size1m
+PHYSICS_S = {"walker": 0.05e-3, "quadruped": 0.12e-3, "car": 0.02e-3, "car_real": 0.1e-3}
+UPDATE_S = 0.1 / (4 * 64)              # per replayed step that an update trains on, size1m, every state an imagination start
+COMPILE_S = 45.0                       # programs of one part
+ADAPTS = 7_000                         # control steps that an adaptation with a stop rule lasted on walkers (results/walker_gear)
+
+
+class Part(NamedTuple):
+  """One run of a suite. Attributes: name: folder below OUT. config: RunConfig."""
+  name: str
+  config: RunConfig
+
+
+class Suite(NamedTuple):
+  """Attributes: name, about: for people. parts: in the order in which they run."""
+  name: str
+  about: str
+  parts: tuple[Part, ...]
+
+
+class Estimate(NamedTuple):
+  """What a part will take. Attributes: streams. stream_steps. updates: of all streams. seconds. bytes: of weights and replays."""
+  streams: int
+  stream_steps: int
+  updates: float
+  seconds: float
+  bytes: int
+
+
+# ---- suites --------------------------------------------------------------------------------------------------------------------------
+
+def shipped() -> dict[str, str]:
+  """Name -> about, of the suites that ship."""
+  return {path.stem: tomllib.loads(path.read_text())["about"] for path in sorted(SUITES.glob("*.toml"))}
+
+
+def suite(name: str, change: dict | None = None) -> Suite:
+  """A suite by name or from a TOML file.
+
+  Args:
+    change: settings that take the place of the suite's own in every entry, e.g. {"seeds": 2}.
+  Raises:
+    UserError for an unknown name, key or value, with the choices; FileError for a file that is no TOML.
+  """
+  path = SUITES / f"{name}.toml"
+  if not path.exists():
+    path = pathlib.Path(name)
+    if path.suffix != ".toml":
+      raise UserError(f"unknown suite {name!r}; choose from: {', '.join(shipped())}; or give a .toml file")
+  try:
+    data = tomllib.loads(path.read_text())
+  except OSError as e:
+    raise FileError(f"cannot read {path}: {e.strerror}") from None
+  except ValueError as e:
+    raise FileError(f"{path} is no TOML: {e}") from None
+  where = f"suite {path.name}"
+  unknown = sorted(set(data) - {"name", "about", "run", "entries"})
+  if unknown or "name" not in data:
+    wrong = f"unknown {', '.join(map(repr, unknown))}" if unknown else "no name"
+    raise UserError(f"{where}: {wrong}; it takes: name, about, run, entries")
+  entries = data.get("entries", {})
+  if not isinstance(entries, dict) or not entries or not all(isinstance(e, dict) for e in entries.values()):
+    raise UserError(f"{where}: it needs tables [entries.NAME]")
+  parts: list[Part] = []
+  for key, entry in entries.items():
+    parts += grid(f"{where}, entry {key!r}", key, merged(merged(data.get("run", {}), entry), change or {}))
+  return Suite(str(data["name"]), str(data.get("about", "")), tuple(parts))
+
+
+def merged(first: dict, second: dict) -> dict:
+  """`second` over `first`, tables within tables."""
+  both = dict(first)
+  for k, v in second.items():
+    both[k] = merged(both[k], v) if isinstance(v, dict) and isinstance(both.get(k), dict) else v
+  return both
+
+
+def grid(where: str, name: str, values: dict) -> list[Part]:
+  """Parts of one entry: all combinations of its lists."""
+  lists = [((k,), v) for k, v in values.items() if isinstance(v, list) and k != "arms"]
+  lists += [(("adapt", k), v) for k, v in values.get("adapt", {}).items() if isinstance(v, list)] if isinstance(values.get("adapt"), dict) else []
+  for path, choices in lists:
+    if not choices:
+      raise UserError(f"{where}: {'.'.join(path)} is an empty list")
+  parts = []
+  for combination in itertools.product(*(choices for _, choices in lists)):
+    own = merged(values, {})
+    for (path, _), value in zip(lists, combination):
+      own = merged(own, {path[0]: value} if len(path) == 1 else {path[0]: {path[1]: value}})
+    label = ",".join(f"{'.'.join(path)}={str(value).replace('/', '-')}" for (path, _), value in zip(lists, combination))
+    parts.append(Part(f"{name}/{label}" if label else name, config(where, own)))
+  return parts
+
+
+def config(where: str, values: dict) -> RunConfig:
+  """RunConfig from an entry's settings.
+
+  Raises:
+    UserError for an unknown setting or a value that RunConfig refuses.
+  """
+  values = dict(values)
+  known = {f.name for f in dataclasses.fields(RunConfig)}
+  unknown = sorted(set(values) - known)
+  if unknown:
+    raise UserError(f"{where}: unknown setting {', '.join(map(repr, unknown))}; it takes: {', '.join(sorted(known))}")
+  if "env" not in values:
+    raise UserError(f"{where}: it needs an env")
+  try:
+    if "adapt" in values:
+      values["adapt"] = replace(AdaptConfig(), **values["adapt"])
+    if "arms" in values:
+      values["arms"] = tuple(values["arms"])
+    return RunConfig(**values)
+  except UserError as e:
+    raise UserError(f"{where}: {e}") from None
+  except TypeError as e:
+    raise UserError(f"{where}: a value of the wrong kind ({e})") from None
+
+
+# ---- the plan ------------------------------------------------------------------------------------------------------------------------
+
+def matmul_rate(seconds: float = 1.0) -> float:
+  """FLOP/s of a dense float32 product of 2048 x 2048 matrices, the best of `seconds`; first calls, which compile, left out."""
+  import jax
+  import jax.numpy as jnp
+  x = jnp.ones((2048, 2048), jnp.float32)
+  dot = jax.jit(jnp.dot)
+  dot(x, x).block_until_ready()
+  best, end = float("inf"), time.perf_counter() + seconds
+  while time.perf_counter() < end:
+    begin = time.perf_counter()
+    dot(x, x).block_until_ready()
+    best = min(best, time.perf_counter() - begin)
+  return 2 * 2048**3 / best
+
+
+def adapting_steps(config: RunConfig, arm: str) -> int:
+  """Control steps that a stream of `arm` is expected to adapt for: those of its schedule, or ADAPTS where a rule ends it."""
+  own = ARMS[arm]
+  if own.trigger.listens and not own.breaks:
+    return 0
+  changes = [c for c in (config.onset,) if c < config.steps]
+  if own.trigger.listens:
+    starts = changes
+  else:
+    starts = [s for s in own.trigger.steps(config.adapt, tuple(changes), config.steps, config.first_seed) if s < config.steps]
+  limit = min(ADAPTS if own.end.rule else FOREVER, own.end.limit(config.adapt))
+  return sum(min(limit, config.steps - s) for s in starts)
+
+
+def estimate(part: Part, rate: float) -> Estimate:
+  """Expected cost of a part on a machine whose dense float32 products run at `rate` FLOP/s. Physics is taken to scale alike: an estimate, no promise."""
+  from mjx_cl import agents, envs, memory
+  c = part.config
+  spec = envs.make(c.env).spec
+  trained = agents.load(c.agent, c.env, len(spec.obs), len(spec.act)).agent.config
+  batch, starts = c.adapt.batch or trained.batch, c.adapt.last_starts
+  size = memory.parameters(trained.size, len(spec.obs), len(spec.act), trained.bins)[0] / 640_867  # of size1m on a walker
+  streams = len(c.arms) * c.seeds
+  updates = sum(c.seeds * max(0.0, adapting_steps(c, arm) - c.adapt.start_windows - trained.length) * c.adapt.ratio / (batch * trained.length)
+                for arm in c.arms)
+  share = 1.0 if not starts else 0.5 + 0.5 * starts / trained.length  # imagination is about half of an update
+  physics = max(PHYSICS_S.get(name, 0.1e-3) for name in filter(None, (c.env, becomes(c))))
+  seconds = streams * c.steps * ((WATCH_S + ACT_S) * size + physics) + updates * batch * trained.length * UPDATE_S * share * size
+  records = c.steps + 192
+  need = memory.need(trained.size, len(spec.obs), len(spec.act), records, trained.bins)
+  return Estimate(streams, streams * c.steps, updates, COMPILE_S + seconds * 200e9 / rate, need.total(streams))
+
+
+def estimates(parts) -> dict[str, Estimate]:
+  """Part -> Estimate on this machine."""
+  rate = matmul_rate()
+  return {p.name: estimate(p, rate) for p in parts}
+
+
+def check(part: Part) -> None:
+  """Refuses, before the suite starts, names and values that only the registries know: fault, target, detector, agent."""
+  from mjx_cl import detectors, envs, faults
+  from mjx_cl.config import changes
+  c = part.config
+  try:
+    detectors.make(c.detector, **c.settings)
+    faults.build(changes(c), envs.make(becomes(c) or c.env, c.physics), c.onset)
+  except UserError as e:
+    raise UserError(f"part {part.name}: {e}") from None
+
+
+# ---- running -------------------------------------------------------------------------------------------------------------------------
+
+def finished(out: pathlib.Path, part: Part) -> bool:
+  """Whether OUT/PART holds this part's results.
+
+  Raises:
+    UserError where it holds a run with other settings.
+  """
+  folder = out / part.name
+  if not (folder / "config.json").exists():
+    return False
+  from mjx_cl.run import check_same
+  wanted = {k: v for k, v in json.loads(json.dumps(dataclasses.asdict(part.config))).items() if k != "physics"}
+  check_same(folder, wanted)
+  return (folder / "summary.json").exists()
+
+
+def pick(parts: tuple[Part, ...], only: tuple[str, ...], shard: tuple[int, int] = (0, 1)) -> list[Part]:
+  """Parts whose name is in `only` or lies below one of its names, all where it is empty; of these every n-th from k on, shard = (k, n)."""
+  for name in only:
+    if not any(p.name == name or p.name.startswith((name + "/", name + ",")) for p in parts):
+      raise UserError(f"no part {name!r} in this suite; choose from: {', '.join(p.name for p in parts)}")
+  k, n = shard
+  if not 0 <= k < n:
+    raise UserError(f"shard K/N needs 0 <= K < N; got {k}/{n}")
+  chosen = [p for p in parts if not only or any(p.name == name or p.name.startswith((name + "/", name + ",")) for name in only)]
+  return chosen[k::n]
+
+
+def take(out: pathlib.Path, parts, folders) -> list[str]:
+  """Copies finished parts that lie in `folders`, others' OUT of the same suite, and are missing here; returns their names.
+
+  Raises:
+    UserError where a folder holds a part with other settings.
+  """
+  got = []
+  for folder in map(pathlib.Path, folders):
+    for part in parts:
+      if not finished(out, part) and finished(folder, part):
+        tmp = out / (part.name + ".tmp")
+        shutil.rmtree(tmp, ignore_errors=True)
+        tmp.mkdir(parents=True)
+        for name in MERGED:
+          if (folder / part.name / name).exists():
+            shutil.copyfile(folder / part.name / name, tmp / name)
+        shutil.rmtree(out / part.name, ignore_errors=True)
+        os.replace(tmp, out / part.name)
+        got.append(part.name)
+  return got
+
+
+def publish(out: pathlib.Path, parts, to) -> list[str]:
+  """Copies the finished parts' small files, all but the trace, to the folder `to`, as they are committed; returns the parts' names."""
+  to, done = pathlib.Path(to), []
+  for part in parts:
+    if not finished(out, part):
+      continue
+    for name in PUBLISHED:
+      if (out / part.name / name).exists():
+        (to / part.name).mkdir(parents=True, exist_ok=True)
+        store.atomic(to / part.name / name, lambda file, source=out / part.name / name: file.write(source.read_bytes()))
+    done.append(part.name)
+  return done
+
+
+def collect(out: pathlib.Path, plan: Suite) -> dict:
+  """Writes OUT/bench.parquet and OUT/bench.json from the finished parts and returns the latter's value."""
+  columns: dict[str, list] = {}
+  value = {"suite": plan.name, "parts": len(plan.parts), "finished": 0, "entries": {}}
+  for part in plan.parts:
+    if not finished(out, part):
+      continue
+    summary = json.loads((out / part.name / "summary.json").read_text())
+    value["finished"] += 1
+    value["entries"][part.name] = summary
+    rows = store.read_plain(out / part.name / "runs.parquet")
+    count = len(next(iter(rows.values())))
+    before = len(next(iter(columns.values()))) if columns else 0
+    for name, cells in ({"suite": [plan.name] * count, "part": [part.name] * count, "robot": [part.config.env] * count,
+                         "severity_asked": [part.config.severity] * count, "ratio": [part.config.adapt.ratio] * count} | rows).items():
+      columns.setdefault(name, [None] * before).extend(cells)
+    for cells in columns.values():
+      cells.extend([None] * (before + count - len(cells)))
+  if columns:
+    store.write_table(out / "bench.parquet", columns)
+  store.write_json(out / "bench.json", value)
+  return value
+
+
+def execute(plan: Suite, out, parts, estimates: dict[str, Estimate] | None = None, tell: Callable[[str], None] = lambda text: None,
+            display=None, save_every_s: float = 60.0) -> dict:
+  """Runs the parts that are not finished, in order; one that was cut off goes on from its last checkpoint.
+
+  Args:
+    parts: of the plan, see `pick`. estimates: part -> Estimate, for the time left. display: context manager that gives run.execute's progress.
+  Returns:
+    bench.json's value.
+  """
+  from mjx_cl import run
+  out = pathlib.Path(out)
+  store.write_json(out / "suite.json", {"suite": plan.name, "parts": {p.name: json.loads(json.dumps(dataclasses.asdict(p.config))) for p in plan.parts}})
+  todo = [p for p in parts if not finished(out, p)]
+  spent = expected = 0.0
+  for i, part in enumerate(todo):
+    guess = lambda p: estimates[p.name].seconds if estimates else 0.0
+    if estimates:
+      left = sum(map(guess, todo[i:])) * (spent / expected if expected else 1.0)
+      tell(f"{part.name} ({i + 1} of {len(todo)}); about {round(left / 60) or 1} min left")
+    begin = time.monotonic()
+    begun = (out / part.name / "config.json").exists()
+    with display() as progress:
+      run.execute(part.config, out / part.name, resume=begun, progress=progress, save_every_s=save_every_s)
+    spent, expected = spent + time.monotonic() - begin, expected + guess(part)
+    collect(out, plan)
+  return collect(out, plan)

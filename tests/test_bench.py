@@ -1,0 +1,238 @@
+"""`bench`: suites from TOML, the plan, parts that are run once, go on after a cut, are shared and merged."""
+import contextlib
+import dataclasses
+import json
+import pathlib
+
+import pyarrow.parquet
+import pytest
+from test_cli import content, mjx, refused  # noqa: F401  fixtures
+from test_run import saved  # noqa: F401  a fixture
+
+from mjx_cl import bench, run, store
+from mjx_cl.adapt.arms import ARMS
+from mjx_cl.config import AdaptConfig, RunConfig
+from mjx_cl.errors import UserError
+
+MINI = """
+name = "mini"
+about = "two short runs"
+[run]
+steps = 192
+onset = 100
+seeds = 2
+arms = ["none"]
+detector = "rolling_sigma_plain"
+agent = "AGENT"
+[run.adapt]
+warmup = 30
+[run.settings]
+window = 40
+warmup = 20
+[entries.walker]
+env = "walker"
+severity = [0.5, 1.0]
+[entries.healthy]
+env = "walker"
+fault = "none"
+"""
+
+
+@pytest.fixture
+def mini(saved, tmp_path):  # noqa: F811
+  path = tmp_path / "mini.toml"
+  path.write_text(MINI.replace("AGENT", str(saved)))
+  return path
+
+
+def write(tmp_path, text):
+  path = tmp_path / "own.toml"
+  path.write_text(text)
+  return str(path)
+
+
+# ---- suites --------------------------------------------------------------------------------------------------------------------------
+
+@pytest.mark.parametrize("name", bench.shipped())
+def test_shipped_suites_fit_the_registries(name):
+  suite = bench.suite(name)
+  assert suite.name == name and suite.about and suite.parts
+  for part in suite.parts:
+    bench.check(part)
+    assert part.config.first_seed == 0  # seeds 0 to 9 report, 100 to 109 tune
+    assert ".." not in part.name and not part.name.startswith("/")
+  assert len({p.name for p in suite.parts}) == len(suite.parts)
+
+
+def test_the_paper_suite_is_the_papers_protocol():
+  parts = {p.name: p.config for p in bench.suite("paper").parts}
+  assert all(c.seeds == 10 and set(c.arms) >= {"detector", "none"} for c in parts.values())
+  assert (parts["walker"].fault, parts["walker"].onset, parts["walker"].steps) == ("walker/gear-half", 5000, 25_000)
+  assert (parts["quadruped"].fault, parts["quadruped"].onset) == ("quadruped/rh-velocity-third", 9000) and parts["quadruped"].steps >= 26_000
+  assert (parts["car"].fault, parts["car"].onset) == ("car/transfer-then-socks", 10_000) and parts["car"].steps >= 62_000
+
+
+def test_lists_are_a_grid(tmp_path):
+  path = write(tmp_path, """
+name = "g"
+[run]
+seeds = 3
+[run.adapt]
+ratio = 8
+[entries.a]
+env = "walker"
+severity = [0.25, 0.5]
+arms = ["none", "detector"]
+[entries.a.adapt]
+ratio = [4, 16]
+[entries.b]
+env = "walker"
+fault = ["walker/gear-half", "none"]
+""")
+  parts = bench.suite(path).parts
+  assert [p.name for p in parts] == ["a/severity=0.25,adapt.ratio=4", "a/severity=0.25,adapt.ratio=16", "a/severity=0.5,adapt.ratio=4",
+                                     "a/severity=0.5,adapt.ratio=16", "b/fault=walker-gear-half", "b/fault=none"]
+  assert parts[1].config == RunConfig("walker", severity=0.25, seeds=3, arms=("none", "detector"), adapt=AdaptConfig(ratio=16))
+  assert parts[4].config.adapt.ratio == 8 and parts[4].config.severity is None
+  assert {p.config.seeds for p in bench.suite(path, {"seeds": 1}).parts} == {1}
+
+
+BAD = {
+    "unknown suite": (None, ["papre", "paper"]),
+    "no TOML": ("name = ", ["TOML"]),
+    "unknown key": ('name = "x"\nruns = 1\n[entries.a]\nenv = "walker"', ["runs", "entries"]),
+    "no name": ('[entries.a]\nenv = "walker"', ["no name"]),
+    "no entries": ('name = "x"', ["entries.NAME"]),
+    "unknown setting": ('name = "x"\n[entries.a]\nenv = "walker"\nsevertiy = 1', ["'a'", "severtiy", "severity"]),
+    "unknown setting of adapt": ('name = "x"\n[entries.a]\nenv = "walker"\n[entries.a.adapt]\nrate = 1', ["'a'", "rate", "ratio"]),
+    "no robot": ('name = "x"\n[entries.a]\nsteps = 5', ["env"]),
+    "out of range": ('name = "x"\n[entries.a]\nenv = "walker"\nseverity = [0.5, 1.5]', ["severity", "1.5"]),
+    "wrong kind": ('name = "x"\n[entries.a]\nenv = "walker"\nsteps = "many"', ["'a'", "kind"]),
+    "empty list": ('name = "x"\n[entries.a]\nenv = "walker"\nseverity = []', ["severity", "empty"]),
+    "unknown robot": ('name = "x"\n[entries.a]\nenv = "wlker"', ["wlker", "walker"]),
+    "unknown fault": ('name = "x"\n[entries.a]\nenv = "walker"\nfault = "geer"', ["geer", "gear"]),
+    "unknown detector": ('name = "x"\n[entries.a]\nenv = "walker"\ndetector = "cusums"', ["cusums", "cusum"]),
+    "unknown arm": ('name = "x"\n[entries.a]\nenv = "walker"\narms = ["nobody"]', ["nobody", "none"]),
+}
+
+
+@pytest.mark.parametrize("text, words", BAD.values(), ids=BAD)
+def test_a_wrong_suite_is_one_line_and_runs_nothing(refused, tmp_path, text, words):  # noqa: F811
+  name = "papre" if text is None else write(tmp_path, text)
+  out = tmp_path / "out"
+  message = refused(1 if words == ["TOML"] else 2, "bench", name, "--out", out)
+  assert all(word in message for word in words), message
+  assert not out.exists()
+
+
+def test_wrong_arguments_are_one_line(refused, mini, tmp_path):  # noqa: F811
+  assert "healthy" in refused(2, "bench", mini, "--only", "healhty")
+  assert "K/N" in refused(2, "bench", mini, "--shard", "2")
+  assert "0 <= K < N" in refused(2, "bench", mini, "--shard", "2/2")
+  assert "missing" in refused(2, "bench", mini, "--out", tmp_path / "o", "--merge", tmp_path / "missing").lower()
+
+
+# ---- the plan ------------------------------------------------------------------------------------------------------------------------
+
+def test_the_plan_runs_nothing(mjx, mini, tmp_path):  # noqa: F811
+  code, out, err = mjx("bench", mini, "--out", tmp_path / "out", "--plan", "--json")
+  rows = json.loads(out)
+  assert code == 0 and [r["part"] for r in rows] == ["walker/severity=0.5", "walker/severity=1.0", "healthy"]
+  assert all(r["streams"] == 2 and r["stream_steps"] == 384 and r["updates"] == 0 and not r["finished"] and r["seconds"] > 0 for r in rows)
+  assert not (tmp_path / "out").exists()
+
+
+def test_updates_of_the_plan():
+  """An arm that adapts to the end takes ratio / (batch x length) updates a step once its replay holds start_windows; one that never does, none."""
+  c = RunConfig("walker", steps=5000, onset=2000, seeds=3, arms=("always",), adapt=AdaptConfig(warmup=1000, start_windows=1024, ratio=16, batch=4))
+  assert bench.estimate(bench.Part("a", c), 1e11).updates == pytest.approx(3 * (5000 - 1000 - 1024 - 64) * 16 / (4 * 64))
+  for arm in ARMS:
+    own = RunConfig("walker", steps=20_000, onset=2000, seeds=1, arms=(arm,))
+    steps = bench.adapting_steps(own, arm)
+    assert 0 <= steps <= 19_000 and (steps == 0) == (arm in ("none", "no-fault"))
+  slow, quick = (bench.estimate(bench.Part("a", c), rate).seconds - bench.COMPILE_S for rate in (1e11, 2e11))
+  assert slow == pytest.approx(2 * quick)
+
+
+def test_shards_are_a_partition():
+  parts = bench.suite("paper").parts
+  split = [bench.pick(parts, (), (k, 2)) for k in (0, 1)]
+  assert sorted(p.name for part in split for p in part) == sorted(p.name for p in parts) and all(split)
+  assert [p.name for p in bench.pick(parts, ("car",))] == ["car"]
+  with pytest.raises(UserError, match="0 <= K < N"):
+    bench.pick(parts, (), (1, 1))
+
+
+# ---- running -------------------------------------------------------------------------------------------------------------------------
+
+def test_parts_run_once_go_on_and_merge(mjx, refused, mini, tmp_path, monkeypatch):  # noqa: F811
+  out, other, begun = tmp_path / "out", tmp_path / "other", []
+  init = run.Runner.__init__
+  monkeypatch.setattr(run.Runner, "__init__", lambda self, config, folder: begun.append(pathlib.Path(folder).name) or init(self, config, folder))
+
+  step = run.Runner.step
+
+  def cut(self):
+    if self.done_chunks == 1:
+      raise KeyboardInterrupt
+    progress = step(self)
+    self.save()
+    return progress
+  monkeypatch.setattr(run.Runner, "step", cut)
+  assert mjx("bench", mini, "--out", out, "--only", "walker/severity=0.5")[0] == 130
+  assert not (out / "walker/severity=0.5/summary.json").exists()
+  lived = []
+  monkeypatch.setattr(run.Runner, "step", lambda self: lived.append(self.done_chunks) or step(self))
+  assert mjx("bench", mini, "--out", out, "--only", "walker")[0] == 0
+  assert lived == [1, 2] + [0, 1, 2]  # the part that was cut off goes on, the other begins
+  del begun[:], lived[:]
+
+  assert mjx("bench", mini, "--out", other, "--shard", "2/3")[0] == 0
+  assert begun == ["healthy"]
+  del begun[:]
+  before = content(out / "walker")
+  code, text, err = mjx("bench", mini, "--out", out, "--merge", other, "--publish", tmp_path / "results", "--json")
+  value = json.loads(text)
+  assert code == 0 and begun == [] and "healthy: taken over" in err
+  assert (value["parts"], value["finished"], list(value["entries"])) == (3, 3, ["walker/severity=0.5", "walker/severity=1.0", "healthy"])
+  assert content(out / "walker") == before and content(out / "healthy") == content(other / "healthy")
+  rows = pyarrow.parquet.read_table(out / "bench.parquet").to_pydict()
+  assert rows["part"] == ["walker/severity=0.5"] * 2 + ["walker/severity=1.0"] * 2 + ["healthy"] * 2 and rows["seed"] == [0, 1] * 3
+  for part in value["entries"]:
+    own = pyarrow.parquet.read_table(out / part / "runs.parquet").to_pydict()
+    at = [i for i, p in enumerate(rows["part"]) if p == part]
+    assert all([rows[k][i] for i in at] == v for k, v in own.items())
+    kept = {p.name for p in (tmp_path / "results" / part).iterdir()}
+    assert kept == {"config.json", "events.parquet", "runs.parquet", "summary.json", "figure.png"}
+    assert all((tmp_path / "results" / part / name).read_bytes() == (out / part / name).read_bytes() for name in kept)
+  mini.write_text(mini.read_text().replace("steps = 192", "steps = 256"))
+  before = content(out)
+  assert "steps" in refused(2, "bench", mini, "--out", out)
+  assert content(out) == before
+
+
+def test_a_table_of_unlike_parts_has_nulls(tmp_path):
+  """Columns that only some parts have, such as those of a later version, are null elsewhere."""
+  plan = bench.Suite("s", "", tuple(bench.Part(n, RunConfig("walker")) for n in "ab"))
+  for part, columns in zip(plan.parts, ({"seed": [0, 1], "x": [1.0, 2.0]}, {"seed": [2], "y": [3.0]})):
+    (tmp_path / part.name).mkdir()
+    store.write_table(tmp_path / part.name / "runs.parquet", columns)
+    store.write_json(tmp_path / part.name / "summary.json", {})
+    store.write_json(tmp_path / part.name / "config.json", dataclasses.asdict(part.config))
+  assert bench.collect(tmp_path, plan)["finished"] == 2
+  rows = pyarrow.parquet.read_table(tmp_path / "bench.parquet").to_pydict()
+  assert rows["part"] == ["a", "a", "b"] and rows["x"] == [1.0, 2.0, None] and rows["y"] == [None, None, 3.0]
+
+
+def test_the_time_left_follows_what_parts_took(tmp_path, monkeypatch):
+  """Parts that took twice as long as expected double what is left."""
+  plan = bench.Suite("s", "", tuple(bench.Part(n, RunConfig("walker")) for n in "abc"))
+  now, said = [0.0], []
+  monkeypatch.setattr(bench.time, "monotonic", lambda: now[0])
+
+  def lived(config, out, **_):
+    now[0] += 1200.0
+  monkeypatch.setattr(run, "execute", lived)
+  expected = {n: bench.Estimate(1, 1, 0.0, 600.0, 0) for n in "abc"}
+  bench.execute(plan, tmp_path, plan.parts, expected, said.append, lambda: contextlib.nullcontext(lambda p: None))
+  assert [s.split("about ")[1] for s in said] == ["30 min left", "40 min left", "20 min left"]
