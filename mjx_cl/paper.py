@@ -28,7 +28,12 @@ class Statement(NamedTuple):
 
 
 class Experiment(NamedTuple):
-  """One experiment: `folder` under results/paper, `change` = which row of a stream in runs.parquet, `onset` of the paper's first change."""
+  """One of the paper's experiments and the run that repeats it.
+
+  Attributes:
+    folder: of the run, under results/paper. change: the rows of runs.parquet that count, by their column `change`.
+    onset: of the paper's first change [control steps]. protocol, runs: of the paper, in words. robot: what the robot differs in, None: nothing.
+  """
   folder: str
   change: int
   onset: int
@@ -41,24 +46,27 @@ class Experiment(NamedTuple):
 EXPERIMENTS: dict[str, Experiment] = {
     "paper/walker": Experiment("walker", 0, 5000, "one random joint's gear halved", "10 runs", None, (
         Statement("alarm after onset", "\"rapidly\"", "IV-A", "latency"),
-        Statement("recovery after onset", "most metrics near their old values in less than 10,000 steps", "IV-A", "recovery", 10_000),
+        Statement("reward back after onset", "most metrics near their old values in less than 10,000 steps", "IV-A", "recovery", 10_000),
         Statement("reward at the end / before", "\"slightly less\"", "IV-A", "kept"),
     )),
-    "paper/quadruped": Experiment("quadruped", 0, 9000, "right hind leg's velocity limits to a third", "9 runs and a failed one", "MuJoCo in place of Isaac Lab", (
+    "paper/quadruped": Experiment(
+        "quadruped", 0, 9000, "right hind leg's velocity limits to a third", "9 runs and a failed one", "MuJoCo in place of Isaac Lab", (
         Statement("alarm after onset", "\"quickly\"", "IV-B", "latency"),
-        Statement("recovery after onset", "walking stable after 5,000 steps on average", "IV-B", "recovery", 5000),
+        Statement("reward back after onset", "walking stable after 5,000 steps on average", "IV-B", "recovery", 5000),
         Statement("last finetuning stops at step", "26,000", "IV-B", "last_stop", 26_000),
-        Statement("how finetuning ends", "9 converged, 1 aborted", "IV-B, caption", "outcomes"),
+        Statement("how finetuning ends", "9 runs stop by themselves, a failed one is aborted", "IV-B", "outcomes", 0.9),
     )),
     "paper/car-transfer": Experiment("car", 0, 10_000, "simulator to car", "1 run", "a simulated four-wheel car in place of the real one", (
         Statement("alarm after transfer", "\"quickly\"", "IV-C", "latency"),
-        Statement("recovery after transfer", "40,000 steps (driving stable after 10,000)", "IV-C, V-C", "recovery", 40_000),
+        Statement("reward back after transfer", "40,000 steps (driving stable after 10,000)", "IV-C, V-C", "recovery", 40_000),
         Statement("finetuning ends after", "shortly after step 50,000, that is 40,000 steps", "IV-C", "stop", 40_000),
     )),
-    "paper/car-socks": Experiment("car", 1, 10_000, "rear friction cut, as by socks", "1 run", "friction under a sock is a guess", (
+    "paper/car-socks": Experiment(
+        "car", 1, 10_000, "rear friction cut, as by socks", "1 run",
+        "a simulated four-wheel car in place of the real one, whose friction under a sock is a guess", (
         Statement("reward lost at first", "20 %", "IV-C", "drop", 0.2),
         Statement("alarm after the socks", "OPR nearly blind", "IV-C", "latency"),
-        Statement("recovery after the socks", "10,000 steps", "V-C", "recovery", 10_000),
+        Statement("reward back after the socks", "10,000 steps", "V-C", "recovery", 10_000),
         Statement("reward at the end / before", "\"slightly lower\"", "IV-C", "kept"),
     )),
 }
@@ -98,7 +106,8 @@ def shares(values: list[float], n: str) -> Measured:
   if not values:
     return Measured(None, f"none of {n}", "%")
   ci, value = bootstrap.interval(values), float(bootstrap.iqm(values))
-  return Measured(value, f"{number(100 * value)} {span(ci and [None if x is None else 100 * x for x in ci])} %, {len(values)} {n}".replace("  ", " "), "%")
+  interval = span(ci and [None if x is None else 100 * x for x in ci])
+  return Measured(value, f"{number(100 * value)} {interval} %, {len(values)} {n}".replace("  ", " "), "%")
 
 
 def latency(rows: list[dict]) -> Measured:
@@ -120,15 +129,17 @@ def last_stop(rows: list[dict]) -> Measured:
   """Absolute step of the last stop or abort; None while a stream is still adapting. A maximum has no bootstrap interval."""
   ends, still = [r["adapt_stop"] for r in rows if r["adapt_stop"] is not None], sum(r["outcome"] == "adapting" for r in rows)
   last = max(ends) if ends and not still else None
-  return Measured(last, f"{number(last)}, {len(ends)} streams that ended one" + (f", {still} still adapting" if still else "") + ", a maximum has no interval")
+  more = f", {still} still adapting" if still else ""
+  return Measured(last, f"{number(last)}, {len(ends)} streams that ended one{more}, a maximum has no interval")
 
 
 def outcomes(rows: list[dict]) -> Measured:
+  """How the streams ended; the value is the share that converged."""
   count = lambda *names: sum(r["outcome"] in names for r in rows)
   n, good = len(rows), count("converged")
-  ci = bootstrap.wilson(good, n)
-  return Measured(None, f"converged {good} of {n} {span(ci and [x * n for x in ci], 1)}, aborted {sum(r['outcome'].startswith('aborted') for r in rows)}, "
-                  f"still adapting {count('adapting')}, never alarmed {count('nominal')}", "")
+  ci = [x * n for x in bootstrap.wilson(good, n)]
+  return Measured(good / n, f"converged {good} of {n} {span(ci, 1)}, aborted {count('aborted_by_rule', 'aborted_by_budget')}, "
+                  f"still adapting {count('adapting')}, never alarmed {count('nominal')}", "%")
 
 
 def kept(rows: list[dict]) -> Measured:
@@ -153,7 +164,7 @@ def difference(paper: float | None, own: Measured) -> str:
   return f"{'+' if gap > 0 else ''}{number(gap)} {unit}"
 
 
-def setup(experiment: Experiment, config: dict) -> str:
+def setup(experiment: Experiment, config: dict) -> list[str]:
   """What differs from the paper's set-up: the settings that config.json holds against the authors' defaults, then what the robot differs in."""
   card, adapt, author = config["agent_card"], config["adapt"], DreamerConfig()
   own = lambda name: adapt[name] if adapt[name] is not None else card["dreamer"][name]
@@ -165,7 +176,7 @@ def setup(experiment: Experiment, config: dict) -> str:
     words.append(f"detector `{config['detector']}` in place of three deviations of single residuals")
   if card.get("demonstrator"):
     words.append("agent pretrained with a demonstrator")
-  return "; ".join(words + ([experiment.robot] if experiment.robot else []))
+  return words + ([experiment.robot] if experiment.robot else [])
 
 
 def compare(name: str, config: dict, runs: list[dict]) -> list[tuple[str, str, str, str]]:

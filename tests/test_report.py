@@ -1,0 +1,392 @@
+"""README and results agree; every number of a marked block comes from a file; bad input gives one line."""
+import json
+import pathlib
+import re
+import shutil
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pyarrow
+import pyarrow.parquet as parquet
+import pytest
+
+from mjx_cl import cli, paper, report
+from mjx_cl.errors import FileError, UserError
+
+ROOT = pathlib.Path(__file__).parent.parent
+RESULTS, README = ROOT / "results", ROOT / "README.md"
+USED = [b.name for b in report.find(README.read_text().splitlines(), "README.md")]
+SOURCES = {
+    "run-walker": ("walker_gear/config.json", "walker_gear/summary.json", "walker_gear/runs.parquet"),
+    "arl0": ("arl0.json",),
+    "leaderboard": ("leaderboard.json", "leaderboard.parquet", "leaderboard_overall.parquet"),
+    "physics": ("physics.json",),
+    "dreamer": ("dreamer_update.json",),
+    "agents": ("walker_agent/eval.json", "walker_agent/curve.parquet", "car_agent/eval.json", "car_agent/eval_car_real.json",
+               "car_agent/curve.parquet", "quadruped_agent/eval.json", "quadruped_agent/curve.parquet"),
+    "detectors": ("detectors.json",),
+    "paper": tuple(f"paper/{robot}/{file}" for robot in ("walker", "quadruped", "car") for file in ("config.json", "summary.json", "runs.parquet")),
+}
+ALL = [(name, file) for name, files in SOURCES.items() for file in files]
+
+
+@pytest.fixture
+def mjx(capsys):
+  """mjx(*argv): (exit code, standard output, standard error) of `mjx-cl` in this process."""
+  before = signal.getsignal(signal.SIGTERM)
+
+  def call(*argv):
+    capsys.readouterr()
+    return cli.main([str(a) for a in argv]), *capsys.readouterr()
+  yield call
+  signal.signal(signal.SIGTERM, before)
+
+
+def write(path, rows):
+  path.parent.mkdir(parents=True, exist_ok=True)
+  parquet.write_table(pyarrow.Table.from_pylist(rows), path)
+
+
+@pytest.fixture
+def results(tmp_path):
+  """A copy of results/ in which no file of any block is missing: the experiments of the paper are the walker's run, the car's with two changes."""
+  out = tmp_path / "results"
+  shutil.copytree(RESULTS, out, ignore=shutil.ignore_patterns("*.png", "*.html", "paper", "detectors.json"))
+  rows = [{"name": "cusum: 1000 streams", "value": 0.4567, "unit": "s", "goal": "<= 1", "holds": True},
+          {"name": "adwin: 1000 streams", "value": 23.4, "unit": "s", "goal": "<= 20", "holds": False},
+          {"name": "ewma: a sample", "value": 1234.5, "unit": "ns", "goal": None, "holds": None}]
+  (out / "detectors.json").write_text(json.dumps(rows))
+  runs = parquet.read_table(out / "walker_gear/runs.parquet").to_pylist()
+  for robot in ("walker", "quadruped", "car"):
+    (out / "paper" / robot).mkdir(parents=True)
+    for file in ("config.json", "summary.json"):
+      shutil.copy(out / "walker_gear" / file, out / "paper" / robot)
+    later = [r | {"change": 1, "onset": 9000, "reward_drop": r["reward_drop"] + 0.1,
+                  "recovery_step": r["recovery_step"] and r["recovery_step"] + 5000} for r in runs]
+    write(out / "paper" / robot / "runs.parquet", [r | {"change": 0} for r in runs] + (later if robot == "car" else []))
+  return out
+
+
+def page(tmp_path, text, end="\n"):
+  path = tmp_path / "PAGE.md"
+  path.write_bytes(text.replace("\n", end).encode())
+  return path
+
+
+def block(name):
+  return f"<!-- report:{name} -->\n<!-- /report -->\n"
+
+
+# ---- README and results ----------------------------------------------------------------------------------------------------------
+
+def test_readme_agrees_with_results():
+  rows = report.report(RESULTS, README, check=True)
+  assert [r["name"] for r in rows if not r["agrees"]] == [], "run `mjx-cl report`"
+  assert set(USED) >= {"run-walker", "arl0", "leaderboard", "physics", "dreamer", "agents"}
+
+
+def test_every_block_has_its_sources_here():
+  assert set(SOURCES) == set(report.BLOCKS)
+
+
+@pytest.mark.parametrize("name", USED)
+def test_one_changed_digit_is_found(name, mjx, tmp_path):
+  lines = README.read_text().splitlines(keepends=True)
+  (at,) = [b for b in report.find(lines, "README.md") if b.name == name]
+  k = max(k for k in range(at.first + 1, at.last) if re.search(r"\d", lines[k]))
+  lines[k] = re.sub(r"\d(?=\D*$)", lambda m: str((int(m[0]) + 1) % 10), lines[k].rstrip("\n")) + "\n"
+  wrong = page(tmp_path, "".join(lines))
+  before = wrong.read_bytes()
+  code, out, err = mjx("report", "--results", RESULTS, "--readme", wrong, "--check")
+  assert (code, out) == (1, "") and err.count("\n") == 1 and f"disagrees with {RESULTS} in: {name};" in err
+  assert wrong.read_bytes() == before != README.read_bytes()
+  assert mjx("report", "--results", RESULTS, "--readme", wrong)[:2] == (0, f"{wrong}: written anew: {name}\n")
+  assert wrong.read_bytes() == README.read_bytes()
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+def test_nothing_outside_the_blocks_changes(end, mjx, results, tmp_path):
+  before, after = "\ufeffa  \n\n\x0b ü 1.25\u2028x\n", "b\n  <b>-->\n" + block("physics") + "last line without an end"
+  path = page(tmp_path, before + block("arl0") + after, end)
+  assert mjx("report", "--results", results, "--readme", path)[0] == 0
+  once = path.read_bytes()
+  text = once.decode().replace(end, "\n")
+  assert text.startswith(before + "<!-- report:arl0 -->\nDetector and stop rule") and once.count(b"\n") == once.count(end.encode()) > 10
+  assert text.endswith("last line without an end") and report.render("arl0", results) in text and report.render("physics", results) in text
+  stamp = path.stat().st_mtime_ns, path.stat().st_ino
+  assert mjx("report", "--results", results, "--readme", path)[1] == f"{path}: all 2 blocks agree with {results}\n"
+  assert path.read_bytes() == once and (path.stat().st_mtime_ns, path.stat().st_ino) == stamp  # not even written
+
+
+def test_json_says_which_agree(mjx, results, tmp_path):
+  path = page(tmp_path, "x\n" + block("arl0") + block("physics") + block("arl0"))
+  code, out, err = mjx("report", "--results", results, "--readme", path, "--json")
+  assert code == 0 and err == "" and json.loads(out) == [
+      {"name": "arl0", "line": 2, "agrees": False}, {"name": "physics", "line": 4, "agrees": False}, {"name": "arl0", "line": 6, "agrees": False}]
+  path.write_text(path.read_text().replace("Speed", "Haste"))
+  code, out, err = mjx("report", "--results", results, "--readme", path, "--json", "--check")
+  assert code == 1 and [r["agrees"] for r in json.loads(out)] == [True, False, True] and "in: physics;" in err
+
+
+def test_no_jax_is_imported():
+  code = ("import sys; from mjx_cl import cli; code = cli.main(['report', '--check']); "
+          "print(code, [m for m in ('jax', 'mujoco', 'flax', 'matplotlib') if m in sys.modules])")
+  done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+  assert done.stdout.splitlines()[-1] == "0 []", done
+
+
+# ---- bad input -------------------------------------------------------------------------------------------------------------------
+
+@pytest.mark.parametrize("text, says", [
+    ("<!-- report:arl -->\n<!-- /report -->\n", "PAGE.md:1: unknown block 'arl'; choose from: agents, arl0,"),
+    ("\n<!-- report:arl0 -->\nx\n", "PAGE.md:2: block 'arl0' is not closed by <!-- /report -->"),
+    ("<!-- report:arl0 -->\n<!-- report:physics -->\n<!-- /report -->\n", "PAGE.md:1: block 'arl0' is not closed"),
+    ("a\n<!-- /report -->\n", "PAGE.md:2: <!-- /report --> closes nothing"),
+    ("<!--report:arl0-->\n<!-- /report -->\n", "PAGE.md:1: '<!--report:arl0-->' is no marker; write <!-- report:NAME -->"),
+    ("<!-- report: arl0 -->\n<!-- /report -->\n", "PAGE.md:1: '<!-- report: arl0 -->' is no marker"),
+    ("text <!-- report:arl0 --> 5\n", "PAGE.md:1: 'text <!-- report:arl0 --> 5' is no marker"),
+    ("<!-- report:arl0 -->\n<!-- /report --> x\n", "PAGE.md:2: '<!-- /report --> x' is no marker"),
+    ("<!-- report:arl0 -->\n5 <!-- /report:arl0 -->\n", "PAGE.md:2: '5 <!-- /report:arl0 -->' is no marker"),
+])
+def test_bad_markers(text, says, mjx, results, tmp_path):
+  path = page(tmp_path, text)
+  code, out, err = mjx("report", "--results", results, "--readme", path)
+  assert (code, out) == (1, "") and err.count("\n") == 1 and says in err and path.read_text() == text
+
+
+def test_files_that_are_not_there(mjx, results, tmp_path):
+  path = page(tmp_path, "\n")
+  assert mjx("report", "--results", tmp_path / "none", "--readme", path) == (2, "", f"mjx-cl: no folder {tmp_path / 'none'}\n")
+  assert mjx("report", "--results", results, "--readme", tmp_path / "none.md") == (2, "", f"mjx-cl: no file {tmp_path / 'none.md'}\n")
+  code, out, err = mjx("report", "--results", results, "--readme", tmp_path)
+  assert code == 1 and err.count("\n") == 1 and "irectory" in err
+  assert mjx("report", "--results", results, "--readme", path) == (0, f"{path}: no marked block\n", "")
+  path.write_bytes(b"\xff\xfe\x00")
+  assert mjx("report", "--results", results, "--readme", path) == (1, "", f"mjx-cl: {path} is no UTF-8 text\n")
+
+
+@pytest.mark.parametrize("name, file", ALL)
+@pytest.mark.parametrize("how", ["missing", "empty", "other"])
+def test_a_file_of_a_block_is_missing_or_broken(name, file, how, results, tmp_path):
+  path, target = page(tmp_path, block("arl0") + block(name)), results / file
+  before = path.read_bytes()
+  if how == "missing":
+    target.unlink()
+  elif how == "empty":
+    target.write_bytes(b"")
+  elif file.endswith("parquet"):
+    write(target, [{"some": 1}])
+  else:
+    target.write_text('{"some": 1}')
+  if how == "other" and name == "paper" and file.endswith("summary.json") or how == "other" and name == "detectors":
+    target.write_text("[1]")
+  with pytest.raises(FileError) as e:
+    report.report(results, path)
+  said = str(e.value)
+  assert f"block '{name}'" in said and (str(target) in said or how == "other") and "\n" not in said and path.read_bytes() == before
+
+
+def test_a_missing_row_of_a_script_is_named(results):
+  path = results / "physics.json"
+  value = json.loads(path.read_text())
+  gone = value["rows"].pop(0)["name"]
+  path.write_text(json.dumps(value))
+  with pytest.raises(FileError, match=re.escape(f"block 'physics': {path} has no row {gone!r}")):
+    report.render("physics", results)
+
+
+# ---- every number comes from a file ----------------------------------------------------------------------------------------------
+
+def changed(value, key="", place=0):
+  """Every number of a JSON value, or column, becomes another one: by its key, so that no ratio or difference of two stays; 0 may stay 0."""
+  if isinstance(value, dict):
+    return {k: changed(v, k) for k, v in value.items()}
+  if isinstance(value, list):
+    return [changed(v, key, i) for i, v in enumerate(value)]
+  if isinstance(value, str) and key in ("goal", "machine"):
+    return re.sub(r"\d+(\.\d+)?", lambda m: f"{2 * float(m[0]) + 0.03:g}", value)
+  if value is None or isinstance(value, (str, bool)) or key in ("change", "seed", "stream"):
+    return value
+  if isinstance(value, int):
+    return value + value // 3 + len(key) + place
+  return value * (2.1 + 0.1 * (len(key) % 7)) + (0.173 if value > 0 else 0.0)
+
+
+def change(path):
+  if path.suffix == ".json":
+    path.write_text(json.dumps(changed(json.loads(path.read_text()))))
+    return
+  rows = [changed(r) for r in parquet.read_table(path).to_pylist()]
+  if path.name == "runs.parquet":  # counts of rows are numbers too
+    rows += rows
+  elif path.name == "leaderboard.parquet":
+    rows += [r | {"fault": "another"} for r in rows]
+  elif path.name == "leaderboard_overall.parquet":
+    rows.append(rows[-1] | {"detector": "another", "cost_standard": -1e9})
+  write(path, rows)
+
+
+CONSTANTS = {  # what a block says of itself: windows of the definitions, sizes in names of rows, goals
+    "run-walker": {"95", "500", "2,000", "10,000"},
+    "arl0": {"500"},
+    "leaderboard": {"100", "95", "1", "5", "3"},
+    "physics": {"160", "256"},
+    "dreamer": {"2,048", "16", "64", "15", "1,024", "256", "1", "12", "40", "32"},
+    "agents": {"95", "0.25", "5"},
+    "detectors": {"1000"},
+    "paper": {"95"} | {x for e in paper.EXPERIMENTS.values() for s in e.statements for x in re.findall(r"[\d,.]*\d", s.text)}
+             | {x for e in paper.EXPERIMENTS.values() for x in re.findall(r"[\d,.]*\d", e.runs)}
+             | {f"{e.onset:,}" for e in paper.EXPERIMENTS.values()}
+             | {"16", "12", "4", "05"},  # the authors' batch, size and learning rate
+}
+
+
+@pytest.mark.parametrize("name", report.BLOCKS)
+def test_every_number_follows_the_files(name, results):
+  old = report.render(name, results)
+  for file in SOURCES[name]:
+    change(results / file)
+  new = report.render(name, results)
+  tokens = lambda text: re.findall(r"[\d,.]*\d", text)
+  old, new = tokens(old), tokens(new)
+  assert len(old) > 2
+  stays = [(a, old[max(0, k - 3):k + 3]) for k, (a, b) in enumerate(zip(old, new))
+           if a == b and a not in CONSTANTS[name] and float(a.replace(",", ""))]
+  assert stays == []
+
+
+@pytest.mark.parametrize("name, file", [p for p in ALL if "paper/" not in p[1] or "summary" not in p[1]])
+def test_every_file_counts(name, file, results):
+  old = report.render(name, results)
+  change(results / file)
+  assert report.render(name, results) != old
+
+
+# ---- values ----------------------------------------------------------------------------------------------------------------------
+
+def cells(text, start):
+  """Cells of the one table row that begins with `start`."""
+  (line,) = [x for x in text.split("\n") if x.startswith(f"| {start}")]
+  return [x.strip() for x in line.strip("|").split("|")]
+
+
+def test_the_walkers_table_against_its_runs(results):
+  text = report.render("run-walker", results)
+  runs = parquet.read_table(results / "walker_gear/runs.parquet").to_pylist()
+  main = [r for r in runs if r["arm"] == "detector"]
+  hit = [r for r in main if r["affected"]]
+  back = sorted(r["recovery_step"] - 5000 for r in hit)
+  assert cells(text, "recovery, median")[1].startswith(f"{back[2]:,} [")
+  recovered = f"{sum(x <= 10_000 for x in back)} of {len(hit)} [2.6, 5.8] ({len(back)} within 20,000)"
+  assert cells(text, "affected streams recovered")[1:] == [recovered, "0 of 6"]
+  final = np.sort([r["reward_final"] for r in hit])[1:-1].mean()
+  assert cells(text, "reward over the last")[1].startswith(f"{final:.2f} [")
+  hips = [r["reward_final"] / r["reward_pre"] for r in hit if r["fault"] == "gear:right_hip"]
+  assert f"right_hip {100 * np.mean(hips):.0f} % ({len(hips)})" in text
+  assert f"lose at most {100 * max(r['reward_drop'] for r in main if not r['affected']):.1f} %" in text
+
+
+def test_the_board_is_sorted_and_whole(results):
+  text = report.render("leaderboard", results)
+  overall = parquet.read_table(results / "leaderboard_overall.parquet").to_pylist()
+  shown = [re.match(r"\| (.+?) \| (-?\d+) \[", line).groups() for line in text.split("\n") if re.match(r"\| .+ \| -?\d+ \[", line)]
+  assert [int(x) for _, x in shown] == sorted((int(x) for _, x in shown), reverse=True) and len(shown) > 10
+  rest = text[text.rindex("\n\n"):].replace("\n", " ")
+  assert {r["detector"] for r in overall} == {d for d, _ in shown} | {r["detector"] for r in overall if f" {r['detector']} " in rest}
+  assert "-0 " not in text and "-0]" not in text and "-0.0" not in text
+
+
+def test_missed_goals_are_said(results):
+  path = results / "physics.json"
+  value = json.loads(path.read_text())
+  for row in value["rows"]:
+    row["holds"] = None if row["goal"] is None else True
+  path.write_text(json.dumps(value))
+  assert "missed" not in report.render("physics", results)
+  value["rows"][0]["holds"] = False
+  path.write_text(json.dumps(value))
+  assert "runs at 0.93 (goal 0.85, missed) of bare mjbatch" in report.render("physics", results)
+  assert "| adwin: 1000 streams | 23.4 s | 20, missed |" in report.render("detectors", results)
+  assert "| ewma: a sample | 1,234 ns | |" in report.render("detectors", results)
+
+
+# ---- the paper -------------------------------------------------------------------------------------------------------------------
+
+def run_row(seed, **other):
+  return {"stream": seed, "arm": "detector", "seed": seed, "change": 0, "onset": 5000, "latency_steps": 100, "adapt_start": 5110,
+          "adapt_stop": 12_000, "outcome": "converged", "affected": True, "recovery_step": 9000,
+          "reward_pre": 1.0, "reward_drop": 0.3, "reward_final": 0.9} | other
+
+
+CONFIG = json.loads((RESULTS / "walker_gear/config.json").read_text())
+
+
+def test_medians_and_intervals_are_those_of_the_summary(results):
+  summary = json.loads((results / "paper/walker/summary.json").read_text())
+  runs = parquet.read_table(results / "paper/walker/runs.parquet").to_pylist()
+  lines = {what: (own, gap) for what, _, own, gap in paper.compare("paper/walker", CONFIG, runs)}
+  low, high = summary["recovery_median_steps_ci"]
+  assert lines["reward back after onset"] == (f"5,092 [{low:,.0f}, {high:,.0f}] steps, 6 of 6 affected streams", "-4,908 steps")
+  low, high = summary["latency_median_steps_ci"]
+  assert high is None and lines["alarm after onset"] == (f"271 [{low:,.0f}, -] steps, 6 of 10 streams", "the paper gives no figure")
+
+
+def test_each_measure_by_hand():
+  calm = run_row(1, latency_steps=None, adapt_start=None, adapt_stop=None, outcome="nominal", recovery_step=None, reward_drop=0.0, affected=False)
+  lost = run_row(2, latency_steps=300, adapt_stop=20_000, outcome="aborted_by_rule", recovery_step=None, reward_final=0.5)
+  rows = [run_row(0), calm, lost, run_row(3, reward_final=1.0)]
+  measured = {name: f(rows) for name, f in paper.MEASURES.items()}
+  assert {name: m.value for name, m in measured.items()} == {
+      "latency": 100, "recovery": 4000, "stop": 7000, "last_stop": 20_000, "outcomes": 0.5, "kept": pytest.approx(0.8), "drop": pytest.approx(0.3)}
+  assert measured["recovery"].text.endswith("2 of 3 affected streams") and measured["latency"].text.endswith("3 of 4 streams")
+  assert measured["outcomes"].text == "converged 2 of 4 [0.6, 3.4], aborted 1, still adapting 0, never alarmed 1"
+  assert measured["last_stop"].text == "20,000, 3 streams that ended one, a maximum has no interval"
+  rows.append(run_row(4, outcome="adapting", adapt_stop=None))
+  assert paper.last_stop(rows).value is None and "1 still adapting" in paper.last_stop(rows).text
+  assert paper.recovery([run_row(0, affected=False)]) == paper.Measured(None, "none of affected streams")
+  never = [run_row(k, recovery_step=None) for k in range(4)]
+  assert paper.recovery(never) == paper.Measured(None, "- [-, -] steps, 0 of 4 affected streams")
+
+
+def test_differences():
+  assert paper.difference(10_000, paper.Measured(12_500.0, "")) == "+2,500 steps"
+  assert paper.difference(10_000, paper.Measured(10_000, "")) == "0 steps"
+  assert paper.difference(0.2, paper.Measured(0.15, "", "%")) == "-5 points"
+  assert paper.difference(None, paper.Measured(3, "")) == "the paper gives no figure"
+  assert paper.difference(5, paper.Measured(None, "")) == "not reached"
+
+
+def test_each_change_of_the_car_has_rows_of_its_own():
+  later = {"change": 1, "onset": 47_000, "reward_drop": 0.25, "latency_steps": None}
+  runs = [run_row(k) for k in range(4)] + [run_row(k, recovery_step=50_000 + k, **later) for k in range(4)]
+  first, second = (dict((line[0], line[2:]) for line in paper.compare(name, CONFIG, runs)) for name in ("paper/car-transfer", "paper/car-socks"))
+  assert first["reward back after transfer"][0].startswith("4,000 [") and second["reward back after the socks"][0].startswith("3,001 [")
+  assert second["reward lost at first"] == ("25 [25, 25] %, 4 streams", "+5 points")
+  assert second["alarm after the socks"][0] == "- [-, -] steps, 0 of 4 streams"
+  assert first["finetuning ends after"] == ("7,000 [7,000, 7,000] steps, 4 of 4 streams", "-33,000 steps")
+  with pytest.raises(FileError, match="paper/car-socks: runs.parquet holds no row of arm `detector` with change 1"):
+    paper.compare("paper/car-socks", CONFIG, runs[:4])
+
+
+def test_what_differs_from_the_papers_setup():
+  walker, dog = paper.EXPERIMENTS["paper/walker"], paper.EXPERIMENTS["paper/quadruped"]
+  assert paper.setup(walker, CONFIG) == [
+      "size1m in place of size12m", "4 sequences an update in place of 16", "learning rate 0.0001 in place of 4e-05",
+      "detector `rolling_sigma` in place of three deviations of single residuals", "agent pretrained with a demonstrator"]
+  same = json.loads(json.dumps(CONFIG)) | {"detector": "rolling_sigma_plain", "onset": 9000}
+  same["adapt"] |= {"batch": None, "lr": None}
+  same["agent_card"] = {"dreamer": {"size": "size12m", "batch": 16, "lr": 4e-5}}
+  assert paper.setup(dog, same) == ["MuJoCo in place of Isaac Lab"]
+  assert paper.setup(walker, same) == ["onset 9,000 in place of 5,000"]
+
+
+def test_the_papers_block_names_every_experiment(results):
+  text = report.render("paper", results)
+  for name, e in paper.EXPERIMENTS.items():
+    assert text.count(f"| `{name}`: {e.protocol}; ") == 1
+  assert sum(line.startswith("| ") for line in text.split("\n")) == 1 + sum(len(e.statements) for e in paper.EXPERIMENTS.values())
+  assert text.count("size1m") == 1  # what all share is said once
+  assert cells(text, "`paper/quadruped`")[-1] == "onset 5,000 in place of 9,000; MuJoCo in place of Isaac Lab"
+  assert len({line.count("|") for line in text.split("\n") if line.startswith("|")}) == 1
