@@ -350,6 +350,11 @@ def test_each_measure_by_hand():
   assert paper.recovery(never) == paper.Measured(None, "- [-, -] steps, 0 of 4 affected streams")
 
 
+def test_numbers_and_intervals():
+  assert [paper.number(-0.3), paper.number(-0.04, 1), paper.number(-1234.56, 1), paper.number(None)] == ["0", "0.0", "-1,234.6", "-"]
+  assert [paper.span([-0.2, 1e4]), paper.span([1.0, None], 1), paper.span(None)] == ["[0, 10,000]", "[1.0, -]", ""]
+
+
 def test_differences():
   assert paper.difference(10_000, paper.Measured(12_500.0, "")) == "+2,500 steps"
   assert paper.difference(10_000, paper.Measured(10_000, "")) == "0 steps"
