@@ -8,9 +8,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mjx_cl.config import AdaptConfig, DreamerConfig
+from mjx_cl.config import DreamerConfig
 from mjx_cl.errors import FileError
 from mjx_cl.scoring import bootstrap
+
+RATIO = 16.0  # the paper's train ratio while finetuning, III-C
 
 
 class Statement(NamedTuple):
@@ -169,7 +171,7 @@ def setup(experiment: Experiment, config: dict) -> list[str]:
   card, adapt, author = config["agent_card"], config["adapt"], DreamerConfig()
   own = lambda name: adapt[name] if adapt[name] is not None else card["dreamer"][name]
   pairs = [(card["dreamer"]["size"], author.size, "{} in place of {}"), (own("batch"), author.batch, "{} sequences an update in place of {}"),
-           (own("lr"), author.lr, "learning rate {:g} in place of {:g}"), (adapt["ratio"], AdaptConfig().ratio, "train ratio {:g} in place of {:g}"),
+           (own("lr"), author.lr, "learning rate {:g} in place of {:g}"), (adapt["ratio"], RATIO, "train ratio {:g} in place of {:g}"),
            (config["onset"], experiment.onset, "onset {:,} in place of {:,}")]
   words = [text.format(ours, theirs) for ours, theirs, text in pairs if ours != theirs]
   if config["detector"] != "rolling_sigma_plain":
