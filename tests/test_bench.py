@@ -7,7 +7,7 @@ import pathlib
 import pyarrow.parquet
 import pytest
 from test_cli import content, mjx, refused  # noqa: F401  fixtures
-from test_run import saved  # noqa: F401  a fixture
+from test_transfer import saved  # noqa: F401  a fixture: a tiny agent of the car, whose programs hold no callback and are cached
 
 from mjx_cl import bench, run, store
 from mjx_cl.adapt.arms import ARMS
@@ -29,12 +29,16 @@ warmup = 30
 [run.settings]
 window = 40
 warmup = 20
-[entries.walker]
-env = "walker"
+[entries.grip]
+env = "car"
+fault = "friction"
+target = "rear"
 severity = [0.5, 1.0]
 [entries.healthy]
-env = "walker"
-fault = "none"
+env = "car"
+fault = "friction"
+target = "rear"
+severity = 0.0
 """
 
 
@@ -137,7 +141,7 @@ def test_wrong_arguments_are_one_line(refused, mini, tmp_path):  # noqa: F811
 def test_the_plan_runs_nothing(mjx, mini, tmp_path):  # noqa: F811
   code, out, err = mjx("bench", mini, "--out", tmp_path / "out", "--plan", "--json")
   rows = json.loads(out)
-  assert code == 0 and [r["part"] for r in rows] == ["walker/severity=0.5", "walker/severity=1.0", "healthy"]
+  assert code == 0 and [r["part"] for r in rows] == ["grip/severity=0.5", "grip/severity=1.0", "healthy"]
   assert all(r["streams"] == 2 and r["stream_steps"] == 384 and r["updates"] == 0 and not r["finished"] and r["seconds"] > 0 for r in rows)
   assert not (tmp_path / "out").exists()
 
@@ -179,25 +183,25 @@ def test_parts_run_once_go_on_and_merge(mjx, refused, mini, tmp_path, monkeypatc
     self.save()
     return progress
   monkeypatch.setattr(run.Runner, "step", cut)
-  assert mjx("bench", mini, "--out", out, "--only", "walker/severity=0.5")[0] == 130
-  assert not (out / "walker/severity=0.5/summary.json").exists()
+  assert mjx("bench", mini, "--out", out, "--only", "grip/severity=0.5")[0] == 130
+  assert not (out / "grip/severity=0.5/summary.json").exists()
   lived = []
   monkeypatch.setattr(run.Runner, "step", lambda self: lived.append(self.done_chunks) or step(self))
-  assert mjx("bench", mini, "--out", out, "--only", "walker")[0] == 0
+  assert mjx("bench", mini, "--out", out, "--only", "grip")[0] == 0
   assert lived == [1, 2] + [0, 1, 2]  # the part that was cut off goes on, the other begins
   del begun[:], lived[:]
 
   assert mjx("bench", mini, "--out", other, "--shard", "2/3")[0] == 0
   assert begun == ["healthy"]
   del begun[:]
-  before = content(out / "walker")
+  before = content(out / "grip")
   code, text, err = mjx("bench", mini, "--out", out, "--merge", other, "--publish", tmp_path / "results", "--json")
   value = json.loads(text)
   assert code == 0 and begun == [] and "healthy: taken over" in err
-  assert (value["parts"], value["finished"], list(value["entries"])) == (3, 3, ["walker/severity=0.5", "walker/severity=1.0", "healthy"])
-  assert content(out / "walker") == before and content(out / "healthy") == content(other / "healthy")
+  assert (value["parts"], value["finished"], list(value["entries"])) == (3, 3, ["grip/severity=0.5", "grip/severity=1.0", "healthy"])
+  assert content(out / "grip") == before and content(out / "healthy") == content(other / "healthy")
   rows = pyarrow.parquet.read_table(out / "bench.parquet").to_pydict()
-  assert rows["part"] == ["walker/severity=0.5"] * 2 + ["walker/severity=1.0"] * 2 + ["healthy"] * 2 and rows["seed"] == [0, 1] * 3
+  assert rows["part"] == ["grip/severity=0.5"] * 2 + ["grip/severity=1.0"] * 2 + ["healthy"] * 2 and rows["seed"] == [0, 1] * 3
   for part in value["entries"]:
     own = pyarrow.parquet.read_table(out / part / "runs.parquet").to_pydict()
     at = [i for i, p in enumerate(rows["part"]) if p == part]
