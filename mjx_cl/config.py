@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, field
 
 from mjx_cl import fault_presets
-from mjx_cl.adapt.arms import ARMS
+from mjx_cl.adapt.arms import ARMS, never_stops
 from mjx_cl.dreamer.sizes import SIZES
 from mjx_cl.errors import UserError, choose
 
@@ -215,6 +215,8 @@ class RunConfig:
     physics: auto, native or mjx.
     form, actions: of the residual (monitor.Monitor).
     deterministic: act by the policy's mean.
+    snapshots: control steps of adaptation between two snapshots of the weights that act, in arms that never stop by themselves; 0: none.
+      Each is evaluated on the broken robot once the run is over, see snapshots.py.
   """
   env: str
   fault: str = "gear"
@@ -237,6 +239,7 @@ class RunConfig:
   actions: str = "recorded"
   deterministic: bool = False
   adapt: AdaptConfig = AdaptConfig()
+  snapshots: int = 0
 
   def __post_init__(self):
     last = self.steps
@@ -273,6 +276,11 @@ class RunConfig:
       raise UserError(f"name each arm once; got {', '.join(self.arms) or 'none'}")
     if self.physics not in ("auto", "native", "mjx"):
       raise UserError(f"unknown physics {self.physics!r}; choose from: auto, native, mjx")
+    if not 0 <= self.snapshots < 2**31 - 1:
+      raise UserError(f"snapshots must lie in 0..2,147,483,646 control steps; got {self.snapshots}")
+    if self.snapshots and not any(never_stops(ARMS[arm]) for arm in self.arms):
+      endless = ", ".join(name for name, arm in ARMS.items() if never_stops(arm))
+      raise UserError(f"snapshots={self.snapshots} needs an arm that never stops by itself: {endless}")
 
 
 def becomes(config: RunConfig) -> str | None:

@@ -21,14 +21,16 @@ import numpy as np
 
 from mjx_cl import agents, checkpoint, detectors, envs, faults, memory, store
 from mjx_cl.adapt import phase as phase_lib
-from mjx_cl.adapt.arms import ARMS, FOREVER, NEVER
+from mjx_cl.adapt.arms import ARMS, FOREVER, NEVER, never_stops
+from mjx_cl.adapt.convergence import SIGNALS
 from mjx_cl.adapt.loop import Choices, Loop, LoopState, choices
 from mjx_cl.config import RunConfig, becomes, changes
 from mjx_cl.errors import FileError
 from mjx_cl.interrupt import Interruptible
 from mjx_cl.monitor import Monitor
 from mjx_cl.rollout import Rollout, Stream, nest, start
-from mjx_cl.scoring import alarms as alarm_score, bootstrap, recovery
+from mjx_cl.scoring import alarms as alarm_score, bootstrap, recovery, stop
+from mjx_cl.snapshots import Snapshots
 from mjx_cl.transfer import Moving, Transfer
 
 CHUNK = 64  # decisions
@@ -104,6 +106,9 @@ class Runner:
     self._alarms = np.zeros(self.groups, int)
     self._phase = np.zeros(self.groups, int)
     self.work = self.out / "work"
+    self.endless = any(never_stops(ARMS[arm]) for arm in config.arms)
+    self.snapshots = Snapshots(config, self.robots[-1], agent, self.faults, self.changes, self.repeat, self.labels, self.trained.train.params,
+                               self.work / "snapshots") if config.snapshots else None
 
   def open(self) -> None:
     """Makes the working folder; before that nothing in `out` is touched."""
@@ -126,6 +131,7 @@ class Runner:
     digest = jax.tree.map(np.asarray, jax.block_until_ready(digest))
     digested = time.perf_counter()
     self.state = State(streams, loop)
+    before = self._phase
     self._log(rows, digest)
     updates = digest.updates - self._updates
     self._updates = digest.updates
@@ -134,6 +140,8 @@ class Runner:
     if broken.any():
       bad = [self.labels[g] for g in np.flatnonzero(broken)]
       raise FileError(f"numeric failure at step {now} in stream {bad[0]}: a loss is not finite; the last checkpoint is intact")
+    if self.snapshots:
+      self.snapshots.take(loop.acting, before, digest, now, self.chunk_steps)
     if self.done_chunks > 1:  # the first chunk compiles
       self.seconds["physics"] += physics
       self.seconds["acting"] += acted - begin - physics
@@ -189,6 +197,12 @@ class Runner:
         "phase": np.broadcast_to(self._phase.astype(np.int8), rewards.shape).copy(),
         "updates": np.broadcast_to(self._updates.astype(np.int32), rewards.shape).copy(),
         "signals": digest.signals[None], "decision": digest.decision[None], "since": digest.since[None], "settled": digest.settled[None]}
+    if self.endless:  # what the stop rule reads besides the signals
+      now = (self.done_chunks + 1) * self.chunk_steps
+      level = self._acceptance(self.state.streams, now) if self.config.adapt.acceptance is None else self.config.adapt.acceptance
+      index = (self.env.spec.posture or (0, 0.0))[0]
+      part |= {"posture": np.asarray(rows.final_obs)[:, :, 0, index].mean(0)[None],
+               "acceptance": np.broadcast_to(np.float32(self.env.spec.acceptance if level is None else level), (1, self.groups)).copy()}
     self._phase = digest.phase
     self.parts.append(part)
 
@@ -243,9 +257,14 @@ class Runner:
             "control_s": self.env.spec.control_s, **store.provenance()}
 
   def finish(self) -> dict:
-    """Writes trace, events, runs, summary and figure; removes the working files. Returns summary.json's value."""
+    """Writes trace, events, runs, summary and figure, of an arm that never stops also signals, snapshots and stop; removes the working files.
+
+    Returns summary.json's value.
+    """
     from mjx_cl import plots
     steps = self.config.steps
+    if self.snapshots:
+      self.save()  # their evaluation takes a while; one that is cut off goes on from here
     trace = {k: v[:steps] if v.shape[0] >= steps else v for k, v in self._trace().items()}
     if self.other is None:
       targets = np.asarray(self.state.streams.injection.target)[:, 0]  # (groups, F)
@@ -260,7 +279,17 @@ class Runner:
     store.write_table(self.out / "events.parquet", {k: [e[k] for e in events] for k in ("stream", "arm", "seed", "step", "kind", "reason", "fault")})
     store.write_table(self.out / "runs.parquet", {k: [r[k] for r in runs] for k in runs[0]})
     plots.figure(self.out)
+    if self.endless and "posture" in trace:
+      store.write_table(self.out / "signals.parquet", self._signals(trace))
     summary = self._summary(runs, trace)
+    taken = self.snapshots.taken(trace, self.chunk_steps) if self.snapshots else []
+    if taken:
+      last = self.state.streams if self.other is None else self.state.streams.after
+      columns, summary["wall_s_snapshots"] = self.snapshots.evaluate(taken, np.asarray(last.injection.target)[:, 0])
+      store.write_table(self.out / "snapshots.parquet", columns)
+      judged = stop.of_folder(self.out)
+      store.write_table(self.out / "stop.parquet", {k: [r[k] for r in judged] for k in stop.COLUMNS})
+      summary["stop_rule"] = stop.summarise(judged)
     store.write_json(self.out / "summary.json", summary)
     self.checkpoints.close()
     shutil.rmtree(self.work, ignore_errors=True)
@@ -282,6 +311,18 @@ class Runner:
       values[at] = trace["signals"][:, :, index]
       table[column_name] = flat(values)
     return table | {"updates": flat(trace["updates"])}
+
+  def _signals(self, trace) -> dict:
+    """Per chunk what the stop rule read: the six signals, posture and the levels asked for."""
+    chunks, groups = trace["decision"].shape
+    flat = lambda x: np.ascontiguousarray(x.T).reshape(-1)
+    column = lambda values: np.repeat(np.asarray(values), chunks)
+    step = np.minimum((np.arange(chunks, dtype=np.int32) + 1) * self.chunk_steps, self.config.steps) - 1
+    least = (self.env.spec.posture or (0, np.nan))[1]
+    return {"stream": column(np.arange(groups, dtype=np.int32)), "arm": column([a for a, _ in self.labels]),
+            "seed": column(np.asarray([s for _, s in self.labels], np.int32)), "step": np.tile(step, groups).astype(np.int32),
+            **{name: flat(trace["signals"][:, :, i]) for i, name in enumerate(SIGNALS)}, "posture": flat(trace["posture"]),
+            "acceptance": flat(trace["acceptance"]), "least_posture": np.full(chunks * groups, least, np.float32)}
 
   def _events(self, trace, names) -> list[dict]:
     """Every onset, alarm, start, stop, abort and repair, with its reason."""
@@ -462,7 +503,8 @@ def execute(config: RunConfig, out, resume: bool = False, overwrite: bool = Fals
   return runner.finish()
 
 
-RESULTS = ("config.json", "trace.parquet", "events.parquet", "runs.parquet", "residuals.parquet", "summary.json", "figure.png", "metrics.parquet")
+RESULTS = ("config.json", "trace.parquet", "events.parquet", "runs.parquet", "residuals.parquet", "summary.json", "figure.png", "metrics.parquet",
+           "signals.parquet", "snapshots.parquet", "stop.parquet")
 
 
 def clear(out: pathlib.Path) -> None:
@@ -481,6 +523,7 @@ def check_same(out: pathlib.Path, values: dict) -> None:
   except ValueError:
     raise FileError(f"{out / 'config.json'} is not a run's; give --overwrite or another --out") from None
   skip = ("git_commit", "machine", "python")
-  changed = [k for k in values if k not in skip and old.get(k) != values[k]]
+  default = {f.name: f.default for f in dataclasses.fields(RunConfig)}  # of a setting that did not exist when the run began
+  changed = [k for k in values if k not in skip and old.get(k, default.get(k)) != values[k]]
   if changed:
     raise UserError(f"--resume: {out} was begun with another {', '.join(changed)}; give the same settings or --overwrite")

@@ -47,7 +47,8 @@ def test_by_hand_against_an_expert():
 
 def test_what_means_little_is_undefined():
   assert normalised.normalise(0.7, 0.5, 0.9, 1.0) == pytest.approx(0.5)
-  assert normalised.normalise(0.7, 0.75, 1.0, 2.5) == pytest.approx(-0.2) and normalised.normalise(0.7, 0.75, 1.0, 2.6) is None  # at a tenth, below it
+  at_a_tenth, below = (normalised.normalise(0.7, 0.75, 1.0, pre) for pre in (2.5, 2.6))
+  assert at_a_tenth == pytest.approx(-0.2) and below is None
   assert normalised.normalise(0.7, 0.9, 0.5, 1.0) is None and normalised.normalise(0.7, 0.5, 0.9, 0.0) is None
   assert normalised.normalise(-3.0, -4.0, -2.0, -1.0) is None
   for gap in range(4):

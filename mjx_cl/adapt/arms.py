@@ -79,6 +79,17 @@ PERIOD_STEPS = End(False, lambda adapt: adapt.period_steps)
 RANDOM_STEPS = End(False, lambda adapt: adapt.random_steps)
 NO_END = End(False, lambda adapt: FOREVER)
 
+
+def never_stops(arm: Arm) -> bool:
+  """Nothing but the budget ends the arm's adaptation: it shows what every possible stop would have been worth."""
+  return arm.end is BUDGET
+
+
+def stops(arm: Arm) -> bool:
+  """The arm goes on from the shipped agent, all of it learns, and the stop rule ends that: its stop compares with those of one that never stops."""
+  return arm.end is RULE and arm.breaks and not arm.fresh and not arm.world_only
+
+
 ARMS: dict[str, Arm] = {
     "detector": Arm("finetuning starts on the detector's alarm", ALARM, RULE),
     "none": Arm("no adaptation; alarms are logged", NEVER, NO_END),
