@@ -4,6 +4,11 @@ Where the robot becomes another one (a preset with `becomes`, see transfer.py) e
 episode of the other robot begins. That step is its `onset` in events.parquet, from it on its `severity` is 1, and latency, windows and recovery
 in runs.parquet are counted from it. `onset` is null there, and every alarm a false one, for a stream that never changed. Faults that follow have
 events of their own at the run's onset plus their `after`.
+
+A stream that changes more than once (a preset in sequence, such as car/transfer-then-socks) has a row in runs.parquet for each change, numbered in
+column `change`; summary.json holds the first in `arms`, the others in `later_changes`. A row ends where the next change begins. Of a later change
+reward_pre is the mean of the 2,000 steps before it, and reward_drop that of the same stream, whatever its arm did in those steps: no stream
+without adaptation shares its past.
 """
 from __future__ import annotations
 
@@ -76,7 +81,7 @@ class Runner:
     agent, self.repeat = self.trained.agent, int(self.trained.card.get("repeat", 1))
     self.changes = changes(config)
     self.faults, plan, target = faults.build(self.changes, self.robots[-1], config.onset)
-    detector = detectors.make(config.detector, **config.settings)
+    detector = detectors.make(config.detector, robot=getattr(type(self.env), "agents_of", None) or config.env, **config.settings)
     monitor = Monitor(agent, n=15, form=config.form, actions=config.actions, spec=spec)
     if self.other is None:
       self.rollout = Rollout(self.env, agent, self.faults, self.repeat, config.deterministic)
@@ -178,6 +183,11 @@ class Runner:
     if self.other is None:
       return [self.config.onset if breaks else None for breaks in self.breaks]
     return [int(step) if step < self.config.steps else None for step in np.asarray(self.state.streams.after.enter)[:, 0]]
+
+  def _later(self, onset: int) -> list[int]:
+    """Control steps at which a stream with this onset changes: the onset, and those of faults that come later inside the run."""
+    c = self.config
+    return sorted({onset} | {c.onset + change.after for change in self.changes if change.fault != "none" and onset < c.onset + change.after < c.steps})
 
   def _log(self, rows, digest) -> None:
     """Keeps a chunk's rows, (control steps, groups), and its chunk values (groups,)."""
@@ -363,13 +373,14 @@ class Runner:
     return sorted(events, key=lambda e: (e["stream"], e["step"]))
 
   def _runs(self, trace, events, names) -> list[dict]:
-    """One row per stream."""
+    """One row per stream and change, in order: the first change's row holds the stream from its start up to the next change, see _later."""
     c, rows = self.config, []
     control_s = self.env.spec.control_s
-    onsets = [c.steps if onset is None else onset for onset in self.onsets()]
+    changes = [[c.steps] if onset is None else self._later(onset) for onset in self.onsets()]
+    onsets = [own[0] for own in changes]
     pre, drop, begun = {}, {}, {}
     for g, ((arm, seed), onset) in enumerate(zip(self.labels, onsets)):
-      reward = trace["reward"][:, g].astype(float)
+      reward = trace["reward"][:(changes[g] + [c.steps])[1], g].astype(float)
       acted = [int(s) for s, d in zip(trace["since"][:, g], trace["decision"][:, g]) if d == phase_lib.START]
       begun[g] = acted[0] if acted else None
       pre[g] = recovery.reward_pre(reward, onset, c.adapt.warmup, begun[g])
@@ -378,31 +389,37 @@ class Runner:
     for g, (arm, seed) in enumerate(self.labels):  # no alarm ends the window of an arm that does not listen: the same life goes on in arm `none`
       if not ARMS[arm].trigger.listens and ("none", seed) in self.labels:
         pre[g] = pre[self.labels.index(("none", seed))]
-    for g, ((arm, seed), onset) in enumerate(zip(self.labels, onsets)):
-      reward = trace["reward"][:, g].astype(float)
-      own = [e for e in events if e["stream"] == g]
-      score = alarm_score.score(trace["alarm"][:, g], onset)
-      starts = [e["step"] for e in own if e["kind"] == "start"]
-      ends = [e for e in own if e["kind"] in ("stop", "abort")]
-      outcome = "nominal" if not starts else "adapting"
-      if starts and ends and ends[-1]["step"] > starts[-1]:
-        reason = ends[-1]["reason"]
-        outcome = OUTCOMES[phase_lib.REASONS.index(reason)]
-      never = self.onsets()[g] is None
-      lost = None if never else drop.get(seed)
-      affected = None if lost is None else bool(lost >= 0.1)
-      back = recovery.recovery_step(reward, onset, pre[g])
-      rows.append({
-          "stream": g, "arm": arm, "seed": seed, "fault": names[g], "onset": None if never else onset,
-          "alarm_step": score.alarm_step, "latency_steps": score.latency_steps,
-          "latency_s": None if score.latency_steps is None else score.latency_steps * control_s, "false_alarms": score.false_alarms,
-          "adapt_start": starts[0] if starts else None, "adapt_stop": ends[-1]["step"] if ends else None, "outcome": outcome,
-          "reason": ends[-1]["reason"] if ends else None, "affected": affected, "recovery_step": back if affected else None,
-          "reward_pre": pre[g], "reward_drop": lost, "reward_final": float(np.mean(reward[-recovery.FINAL:])),
-          "return_lost": None if never else recovery.return_lost(reward, onset, pre[g]),
-          "return_lost_healthy": recovery.return_lost_healthy(reward, onset, pre[g], begun[g]), "terminations": int(trace["terminated"][:, g].sum()),
-          "adapted_steps": int(np.sum(trace["phase"][:, g] == phase_lib.ADAPTING)),
-          "updates": int(self._updates[g]), "wall_s": float(self.stream_seconds[g])})
+    for g, (arm, seed) in enumerate(self.labels):
+      for change, onset in enumerate(changes[g]):
+        begin, end = (onset if change else 0), (changes[g] + [c.steps])[change + 1]
+        reward = trace["reward"][:end, g].astype(float)
+        own = [e for e in events if e["stream"] == g and begin <= e["step"] < max(end, 1)]
+        score = alarm_score.score(trace["alarm"][begin:end, g], onset - begin)
+        starts = [e["step"] for e in own if e["kind"] == "start"]
+        ends = [e for e in own if e["kind"] in ("stop", "abort")]
+        outcome = "adapting" if starts or change and trace["phase"][begin, g] == phase_lib.ADAPTING else "nominal"
+        if ends and (not starts or ends[-1]["step"] > starts[-1]):
+          outcome = OUTCOMES[phase_lib.REASONS.index(ends[-1]["reason"])]
+        never = self.onsets()[g] is None
+        before, lost = pre[g], None if never else drop.get(seed)
+        if change:  # no arm without adaptation lives on as this one does: its own first steps after the change say what that cost
+          before = float(np.mean(reward[max(0, onset - recovery.FINAL):onset]))
+          lost = recovery.reward_drop(reward, onset, before)
+        affected = None if lost is None else bool(lost >= 0.1)
+        back = recovery.recovery_step(reward, onset, before)
+        last = (self._updates[g] if end == c.steps else trace["updates"][end, g]) - (trace["updates"][begin, g] if change else 0)
+        rows.append({
+            "stream": g, "arm": arm, "seed": seed, "fault": names[g], "change": change, "onset": None if never else onset,
+            "alarm_step": None if score.alarm_step is None else score.alarm_step + begin, "latency_steps": score.latency_steps,
+            "latency_s": None if score.latency_steps is None else score.latency_steps * control_s, "false_alarms": None if change else score.false_alarms,
+            "adapt_start": starts[0] if starts else None, "adapt_stop": ends[-1]["step"] if ends else None, "outcome": outcome,
+            "reason": ends[-1]["reason"] if ends else None, "affected": affected, "recovery_step": back if affected else None,
+            "reward_pre": before, "reward_drop": lost, "reward_final": float(np.mean(reward[-recovery.FINAL:])),
+            "return_lost": None if never else recovery.return_lost(reward, onset, before),
+            "return_lost_healthy": None if change else recovery.return_lost_healthy(reward, onset, before, begun[g]),
+            "terminations": int(trace["terminated"][begin:end, g].sum()),
+            "adapted_steps": int(np.sum(trace["phase"][begin:end, g] == phase_lib.ADAPTING)),
+            "updates": int(last), "wall_s": None if change else float(self.stream_seconds[g])})
     return rows
 
   def _summary(self, runs, trace) -> dict:
@@ -410,8 +427,12 @@ class Runner:
     severity = 1.0 if self.other is not None else max(c.severity for c in self.changes)
     out = {"env": self.config.env, "fault": self.config.fault, "severity": severity, "onset": self.config.onset, "steps": self.config.steps,
            "detector": self.config.detector}
-    arms = {arm: summarise([r for r in runs if r["arm"] == arm], self.config, self.env.spec.control_s) for arm in self.config.arms}
-    out["arms"] = arms
+    of = lambda change: {arm: summarise(own, self.config, self.env.spec.control_s) for arm in self.config.arms
+                         if (own := [r for r in runs if r["arm"] == arm and r["change"] == change])}
+    out["arms"] = arms = of(0)
+    later = range(1, 1 + max(r["change"] for r in runs))
+    if later:
+      out["later_changes"] = [of(change) for change in later]
     if "detector" in arms:
       out |= arms["detector"]
     nominal = trace["valid"][15 * self.repeat:]
@@ -422,7 +443,7 @@ class Runner:
     shares = {"physics": self.seconds["physics"], "acting": self.seconds["acting"], "monitor": monitor, "updates": self.seconds["digest"] - monitor,
               "other": self.seconds["other"]}
     out["wall_s"] = wall
-    out["wall_s_arms"] = {arm: float(sum(r["wall_s"] for r in runs if r["arm"] == arm)) for arm in arms}
+    out["wall_s_arms"] = {arm: float(sum(r["wall_s"] or 0.0 for r in runs if r["arm"] == arm)) for arm in arms}
     out["wall_share"] = {k: v / wall for k, v in shares.items()}
     return out
 
@@ -446,8 +467,8 @@ def summarise(rows: list[dict], config: RunConfig, control_s: float) -> dict:
     p = bootstrap.wilson(hits, n)
     put(name, hits, None if p is None else [p[0] * n, p[1] * n])
   count("alarms", sum(np.isfinite(x) for x in latency), len(met))
-  count("false_alarm_streams", sum(r["false_alarms"] > 0 for r in rows), len(rows))
-  hours = sum(config.steps if r["onset"] is None else min(r["onset"], config.steps) for r in rows) * control_s / 3600
+  count("false_alarm_streams", sum(bool(r["false_alarms"]) for r in rows), len(rows))
+  hours = sum(config.steps if r["onset"] is None else min(r["onset"], config.steps) for r in rows if not r["change"]) * control_s / 3600
   out["false_alarms_per_hour"] = sum(r["false_alarms"] for r in rows) / hours if hours else None
   median = lambda x: bootstrap.finite(bootstrap.censored_median(x)) if len(x) else None
   put("latency_median_steps", median(latency), bootstrap.interval(latency, bootstrap.censored_median) if latency else None)

@@ -44,11 +44,12 @@ def write_json(path, value) -> None:
   atomic(path, lambda file: file.write(text.encode()))
 
 
-def write_table(path, columns: dict, nan_is_null: bool = True, level: int | None = None, split: tuple[str, ...] = ()) -> None:
+def write_table(path, columns: dict, nan_is_null: bool = True, codec: str = "zstd", level: int | None = None,
+                split: tuple[str, ...] = ()) -> None:
   """Writes columns (name -> 1-D array or list) as Parquet; nan becomes null.
 
   Args:
-    level: of the compression, zstd. split: float columns whose bytes are stored apart, which suits rounded values; integers then as differences.
+    codec, level: of the compression. split: float columns whose bytes are stored apart, which suits rounded values; integers then as differences.
   """
   import numpy as np
   import pyarrow
@@ -59,7 +60,7 @@ def write_table(path, columns: dict, nan_is_null: bool = True, level: int | None
   for name, values in columns.items():
     floating = isinstance(values, np.ndarray) and values.dtype.kind == "f"
     arrays[name] = pyarrow.array(values, mask=np.isnan(values) if floating and nan_is_null else None)
-  atomic(path, lambda file: pyarrow.parquet.write_table(pyarrow.table(arrays), file, compression="zstd", compression_level=level, **how))
+  atomic(path, lambda file: pyarrow.parquet.write_table(pyarrow.table(arrays), file, compression=codec, compression_level=level, **how))
 
 
 def read_table(path) -> dict:
