@@ -1,4 +1,4 @@
-"""figure.png of a run: the paper's two panels, mean and standard deviation over the streams of arm `detector`, arm `none` in grey."""
+"""figure.png of a run: the paper's two panels, mean and standard deviation over the streams of arm `detector`, arm `none` in grey, one aborted run dotted."""
 from __future__ import annotations
 
 import os
@@ -46,6 +46,7 @@ def figure(folder, width: int = 500) -> pathlib.Path:
     if arm in (main, "none"):
       mask = trace["arm"] == arm
       panels[arm] = {c: np.asarray(trace[c][mask], float).reshape(-1, steps) for c, _ in UPPER + LOWER}
+  failed = next((g for g, k, a in zip(events["stream"], events["kind"], events["arm"]) if k == "abort" and a == main), None)
   fig, axes = plt.subplots(2, 1, figsize=(10, 7.2), sharex=True, constrained_layout=True)
   x = np.arange(steps)
   every = max(1, steps // 2000)
@@ -65,6 +66,9 @@ def figure(folder, width: int = 500) -> pathlib.Path:
         if arm == main:
           host.fill_between(x[::every], (mean - std)[::every], (mean + std)[::every], color=color, alpha=0.14, lw=0)
         top = max(top, np.nanmax((mean + std)[min(width, steps - 1):], initial=0.0))
+      if failed is not None:  # one run that was given up, on its own
+        curve = smooth(np.asarray(trace[column][trace["stream"] == failed], float)[None], width)[0]
+        host.plot(x[::every], curve[::every], color=color, lw=0.7, ls=":", zorder=2, label=f"stream {int(failed)}, aborted" if column == "reward" else None)
       host.set_ylim(0, 1.1 * top if top else 1)
       host.set_ylabel(label, color=color)
       host.tick_params(axis="y", colors=color)
