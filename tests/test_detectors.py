@@ -1,5 +1,7 @@
 """Detectors: one contract for every entry of the table and every scalar detector, then each against its own oracle."""
 import importlib
+import json
+import pathlib
 import pkgutil
 
 import chex
@@ -232,6 +234,18 @@ def test_an_unknown_setting_is_named():
 
 def test_calibrated_settings_can_be_overridden():
   assert detectors.make("rolling_sigma").init()[0].buffer.shape == (detectors.CALIBRATED["walker"]["window"] + detectors.CALIBRATED["walker"]["lag"],)
+
+
+@pytest.mark.parametrize("robot", detectors.CALIBRATED)
+def test_each_robot_has_its_own_figures(robot):
+  """The settings are those that benchmarks/calibrate.py chose and results/ holds; a setting that is given wins."""
+  own = detectors.CALIBRATED[robot]
+  chosen = json.loads((pathlib.Path(__file__).parents[1] / f"results/arl0{'' if robot == 'walker' else '_' + robot}.json").read_text())["chosen"]
+  assert {k: chosen[k] for k in own} == own and chosen["arl0"] >= 100_000
+  assert chosen["threshold_rpr"] == own.get("threshold_rpr", own["threshold"])
+  state = detectors.make("rolling_sigma", robot=robot).init()
+  assert state[0].buffer.shape == (own["window"] + own["lag"],) and state[0].recent.shape == (own["smooth"],)
+  assert detectors.make("rolling_sigma", robot=robot, smooth=7).init()[0].recent.shape == (7,)
   assert detectors.make("rolling_sigma", window=300, lag=20).init()[0].buffer.shape == (320,)
   assert detectors.make("rolling_sigma_plain").init()[0].buffer.shape == (1000,)
 
