@@ -63,6 +63,8 @@ LEVELS = {"easy": (1, 0.1, 0.01), "medium": (2, 0.3, 0.05), "hard": (3, 1.0, 0.1
 
 PRESETS: dict[str, Preset] = {
     "walker/gear-half": Preset("walker", (Change("gear", None, 0.5),), "one random joint's gear ratio halved", "the paper, walker"),
+    "walker/gear-half-twice": Preset("walker", (Change("gear", "right_knee", 0.5, 0, 10_000), Change("gear", "right_knee", 0.5, 20_000)),
+                                     "right knee's gear halved for 10,000 control steps, whole for 10,000, halved again", "the paper's fault, twice"),
     "quadruped/rh-velocity-third": Preset("quadruped", (Change("velocity_limit", "RH", THIRD),), "right hind leg's velocity limits cut to a third",
                                           "the paper, ANYmal"),
     "car/sim-to-real": Preset("car", (), "the simulated car becomes the stand-in for the real one at an episode's end", "the paper, race car", "car_real"),

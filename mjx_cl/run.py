@@ -5,8 +5,8 @@ episode of the other robot begins. That step is its `onset` in events.parquet, f
 in runs.parquet are counted from it. `onset` is null there, and every alarm a false one, for a stream that never changed. Faults that follow have
 events of their own at the run's onset plus their `after`.
 
-A stream that changes more than once (a preset in sequence, such as car/transfer-then-socks) has a row in runs.parquet for each change, numbered in
-column `change`; summary.json holds the first in `arms`, the others in `later_changes`. A row ends where the next change begins. Of a later change
+A stream that changes more than once (a preset in sequence, such as car/transfer-then-socks, or a fault that is repaired) has a row in runs.parquet for
+each change, numbered in column `change`, `kind` onset or repair; summary.json holds the first in `arms`, the others in `later_changes`. A row ends where the next change begins. Of a later change
 reward_pre is the mean of the 2,000 steps before it, and reward_drop that of the same stream, whatever its arm did in those steps: no stream
 without adaptation shares its past.
 """
@@ -184,10 +184,15 @@ class Runner:
       return [self.config.onset if breaks else None for breaks in self.breaks]
     return [int(step) if step < self.config.steps else None for step in np.asarray(self.state.streams.after.enter)[:, 0]]
 
-  def _later(self, onset: int) -> list[int]:
-    """Control steps at which a stream with this onset changes: the onset, and those of faults that come later inside the run."""
-    c = self.config
-    return sorted({onset} | {c.onset + change.after for change in self.changes if change.fault != "none" and onset < c.onset + change.after < c.steps})
+  def _later(self, onset: int) -> dict[int, str]:
+    """Control steps at which a stream with this onset changes, in order, and what happens: its onset, those of faults that come later, and repairs."""
+    c, out = self.config, {onset: "onset"}
+    for change in self.changes:
+      begin = c.onset + change.after
+      for step, kind in ((begin, "onset"), (begin + (change.duration or FOREVER), "repair")):
+        if change.fault != "none" and onset < step < c.steps and out.get(step) != "onset":
+          out[step] = kind
+    return dict(sorted(out.items()))
 
   def _log(self, rows, digest) -> None:
     """Keeps a chunk's rows, (control steps, groups), and its chunk values (groups,)."""
@@ -376,7 +381,8 @@ class Runner:
     """One row per stream and change, in order: the first change's row holds the stream from its start up to the next change, see _later."""
     c, rows = self.config, []
     control_s = self.env.spec.control_s
-    changes = [[c.steps] if onset is None else self._later(onset) for onset in self.onsets()]
+    happens = [{c.steps: "onset"} if onset is None else self._later(onset) for onset in self.onsets()]
+    changes = [list(own) for own in happens]
     onsets = [own[0] for own in changes]
     pre, drop, begun = {}, {}, {}
     for g, ((arm, seed), onset) in enumerate(zip(self.labels, onsets)):
@@ -409,7 +415,7 @@ class Runner:
         back = recovery.recovery_step(reward, onset, before)
         last = (self._updates[g] if end == c.steps else trace["updates"][end, g]) - (trace["updates"][begin, g] if change else 0)
         rows.append({
-            "stream": g, "arm": arm, "seed": seed, "fault": names[g], "change": change, "onset": None if never else onset,
+            "stream": g, "arm": arm, "seed": seed, "fault": names[g], "change": change, "kind": happens[g][onset], "onset": None if never else onset,
             "alarm_step": None if score.alarm_step is None else score.alarm_step + begin, "latency_steps": score.latency_steps,
             "latency_s": None if score.latency_steps is None else score.latency_steps * control_s, "false_alarms": None if change else score.false_alarms,
             "adapt_start": starts[0] if starts else None, "adapt_stop": ends[-1]["step"] if ends else None, "outcome": outcome,

@@ -7,7 +7,7 @@ import pathlib
 import pyarrow.parquet
 import pytest
 from test_cli import content, mjx, refused  # noqa: F401  fixtures
-from test_transfer import saved  # noqa: F401  a fixture: a tiny agent of the car, whose programs hold no callback and are cached
+from test_transfer import agent, saved  # noqa: F401  fixtures: a tiny agent of the car, whose programs hold no callback and are cached
 
 from mjx_cl import bench, run, store
 from mjx_cl.adapt.arms import ARMS

@@ -237,6 +237,10 @@ def test_a_preset_of_several_faults_ends_in_all_files(saved, tmp_path):
   severity = np.asarray(table(tmp_path / "out", "trace")["severity"])
   np.testing.assert_allclose(severity, np.where((np.arange(128) >= 40) & (np.arange(128) < 70), np.float32(1 / 3), 0), rtol=1e-6)
   assert set(e["fault"]) == {"+".join(f"{n}:all" for n in names)} and (tmp_path / "out" / "figure.png").stat().st_size > 5000
+  rows = table(tmp_path / "out", "runs")
+  assert (rows["change"], rows["kind"], rows["onset"]) == ([0, 1], ["onset", "repair"], [40, 70])
+  reward = np.asarray(table(tmp_path / "out", "trace")["reward"], float)
+  assert rows["reward_final"] == pytest.approx([reward[:70].mean(), reward.mean()]) and rows["reward_pre"][1] == pytest.approx(reward[:70].mean())
 
 
 def test_a_healthy_run_has_no_severity(saved, tmp_path):
