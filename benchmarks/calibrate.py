@@ -20,7 +20,7 @@ import time
 import numpy as np
 
 # fault and severity that detection is tuned on; of quadruped and car one that is in no experiment
-TUNE = {"walker": ("gear", 0.5), "quadruped": ("joint_damping", 1.0), "car": ("command_dropout", 0.25)}
+TUNE = {"walker": ("gear", 0.5), "quadruped": ("joint_damping", 1.0), "car": ("dead_band", 0.5)}
 WARMUP = 1000  # control steps at the start of a stream that nothing is counted in, as in `run`
 
 
@@ -97,6 +97,8 @@ def main() -> None:
       np.savez(args.cache, **data)
   pre, post = data["f_reward"][WARMUP:5000].mean(0), data["f_reward"][5000:7000].mean(0)
   affected = 1 - post / pre >= 0.1
+  if not affected.any():
+    raise SystemExit(f"{TUNE[args.robot][0]} {TUNE[args.robot][1]} costs no stream a tenth of its reward; nothing to tune detection on")
   steps = (data["n_opr"].shape[0] - WARMUP) * data["n_opr"].shape[1]
   rows = []
 
