@@ -5,7 +5,7 @@ AdaptConfig's, `settings` one of the detector's). A list where RunConfig takes o
 `severity = [0.25, 0.5]` with `adapt.ratio = [4, 16]` are four parts, NAME/severity=0.25,adapt.ratio=4 and so on. What is not given is RunConfig's default.
 
 OUT/suite.json holds the resolved parts; OUT/PART/ the result files of each; OUT/bench.parquet all rows of the finished parts' runs.parquet with their
-part in front, and OUT/bench.json their summaries. Parts are independent: several machines share a suite by `shard`, and `merge` takes over what others finished.
+part in front, OUT/bench.json their summaries and what their arms say together (`scores`), OUT/recovery.png the Kaplan-Meier curves of recovery. Parts are independent: several machines share a suite by `shard`, and `merge` takes over what others finished.
 """
 from __future__ import annotations
 
@@ -279,11 +279,47 @@ def publish(out: pathlib.Path, parts, to) -> list[str]:
         (to / part.name).mkdir(parents=True, exist_ok=True)
         store.atomic(to / part.name / name, lambda file, source=out / part.name / name: file.write(source.read_bytes()))
     done.append(part.name)
+  for name in ("suite.json", "bench.json", "bench.parquet", "recovery.png"):
+    if done and (out / name).exists():
+      store.atomic(to / name, lambda file, source=out / name: file.write(source.read_bytes()))
   return done
 
 
+HORIZON = 10_000  # control steps after the onset, of the restricted mean time to recovery
+
+
+def scores(folder) -> dict:
+  """What several arms of one finished part say together.
+
+  Returns:
+    normalised: arm -> recovery, 0 = arm `none`, 1 = reward_pre (scoring.normalised.summarise); null without arm `none`.
+    against_oracle: paired difference of `detector` and `oracle` in it (scoring.normalised.difference); null without both arms.
+    recovery: arm -> Kaplan-Meier of the affected streams: n, recovered, median_steps, restricted_mean_steps up to HORIZON or to where the run ends, each with
+      _ci; null without affected streams.
+  """
+  from mjx_cl.scoring import normalised, recovery, survival
+  config, rows = json.loads((folder / "config.json").read_text()), store.read_rows(folder / "runs.parquet")
+  first, arms = [r for r in rows if not r["change"]], config["arms"]
+  scored = normalised.rows(rows) if "none" in arms else []
+  out = {"normalised": normalised.summarise(scored) or None, "against_oracle": None, "recovery": {}}
+  if scored and {"detector", "oracle"} <= set(arms):
+    out["against_oracle"] = normalised.difference(scored, "detector", "oracle")
+  for arm in arms:
+    own = [r for r in rows if r["arm"] == arm]
+    if not any(r["affected"] for r in own if not r["change"]):
+      out["recovery"][arm] = None
+      continue
+    time_, seen = survival.of_runs([r for r in own if not r["change"]] + [dict(r, affected=False) for r in own if r["change"]], config["steps"])
+    median, median_ci = survival.quantile(survival.kaplan_meier(time_, seen))
+    horizon = min(HORIZON, config["steps"] - max(r["onset"] for r in first if r["onset"] is not None) - recovery.HOLD)
+    mean, mean_ci = survival.restricted_mean(time_, seen, horizon) if horizon > 0 else (None, None)
+    out["recovery"][arm] = {"n": len(seen), "recovered": int(seen.sum()), "median_steps": median, "median_steps_ci": median_ci,
+                            "restricted_mean_steps": mean, "restricted_mean_steps_ci": mean_ci, "horizon": horizon}
+  return out
+
+
 def collect(out: pathlib.Path, plan: Suite) -> dict:
-  """Writes OUT/bench.parquet and OUT/bench.json from the finished parts and returns the latter's value."""
+  """Writes OUT/bench.parquet, OUT/bench.json and OUT/recovery.png from the finished parts and returns the second's value."""
   columns: dict[str, list] = {}
   value = {"suite": plan.name, "parts": len(plan.parts), "finished": 0, "entries": {}}
   for part in plan.parts:
@@ -291,7 +327,7 @@ def collect(out: pathlib.Path, plan: Suite) -> dict:
       continue
     summary = json.loads((out / part.name / "summary.json").read_text())
     value["finished"] += 1
-    value["entries"][part.name] = summary
+    value["entries"][part.name] = summary | {"scores": scores(out / part.name)}
     rows = store.read_plain(out / part.name / "runs.parquet")
     count = len(next(iter(rows.values())))
     before = len(next(iter(columns.values()))) if columns else 0
@@ -302,6 +338,8 @@ def collect(out: pathlib.Path, plan: Suite) -> dict:
       cells.extend([None] * (before + count - len(cells)))
   if columns:
     store.write_table(out / "bench.parquet", columns)
+    from mjx_cl import plots
+    plots.survival(out, list(value["entries"]))
   store.write_json(out / "bench.json", value)
   return value
 

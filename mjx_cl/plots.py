@@ -92,3 +92,45 @@ def figure(folder, width: int = 500) -> pathlib.Path:
   plt.close(fig)
   os.replace(tmp, folder / "figure.png")
   return folder / "figure.png"
+
+
+def survival(out, parts: list[str], columns: int = 3) -> pathlib.Path | None:
+  """Draws OUT/recovery.png: of each part with affected streams and several arms, the share not yet recovered (Kaplan-Meier) since the onset.
+
+  Returns:
+    The file; None where no part has an affected stream.
+  """
+  import json
+  import matplotlib
+  matplotlib.use("Agg")
+  import matplotlib.pyplot as plt
+  from mjx_cl.scoring import survival as estimate
+  out, drawn = pathlib.Path(out), []
+  for part in parts:
+    rows, config = store.read_rows(out / part / "runs.parquet"), json.loads((out / part / "config.json").read_text())
+    if any(r["affected"] for r in rows if not r["change"]):
+      drawn.append((part, rows, config))
+  if not drawn:
+    return None
+  lines = -(-len(drawn) // columns)
+  fig, axes = plt.subplots(lines, min(columns, len(drawn)), figsize=(4.2 * min(columns, len(drawn)), 3.3 * lines), squeeze=False, constrained_layout=True)
+  for axis in axes.flat[len(drawn):]:
+    axis.set_axis_off()
+  for axis, (part, rows, config) in zip(axes.flat, drawn):
+    for k, arm in enumerate(config["arms"]):
+      own = [dict(r, affected=bool(r["affected"]) and not r["change"]) for r in rows if r["arm"] == arm]
+      if not any(r["affected"] for r in own):
+        continue
+      time, seen = estimate.of_runs(own, config["steps"])
+      curve = estimate.kaplan_meier(time, seen)
+      x, level = [0.0, *curve.time, curve.last], [1.0, *curve.survival]
+      axis.step(x, level + level[-1:], where="post", color=f"C{k}", lw=1.6, label=f"{arm}, {int(seen.sum())} of {len(seen)}")
+      axis.plot(time[~seen], [level[int(np.searchsorted(curve.time, t, "right"))] for t in time[~seen]], "|", color=f"C{k}", ms=7)
+    axis.set(title=part, xlabel="control steps since onset", ylim=(-0.03, 1.05))
+    axis.legend(fontsize=7, title="recovered", title_fontsize=7)
+  axes[0, 0].set_ylabel("share not yet recovered")
+  tmp = out / "recovery.tmp.png"
+  fig.savefig(tmp, dpi=110)
+  plt.close(fig)
+  os.replace(tmp, out / "recovery.png")
+  return out / "recovery.png"

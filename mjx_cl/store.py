@@ -84,6 +84,12 @@ def read_plain(path) -> dict[str, list]:
     raise FileError(f"cannot read {path}: {str(e).splitlines()[0]}") from None
 
 
+def read_rows(path) -> list[dict]:
+  """Rows of a Parquet file as Python values by column, null as None."""
+  columns = read_plain(path)
+  return [dict(zip(columns, cells)) for cells in zip(*columns.values())]
+
+
 def views(folders: tuple[str, ...] = (), results: str = "results") -> dict[str, pathlib.Path]:
   """Names of result tables, each after its path: results/leaderboard.parquet is leaderboard, results/walker_gear/runs.parquet walker_gear_runs.
 

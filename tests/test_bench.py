@@ -218,7 +218,8 @@ def test_parts_run_once_go_on_and_merge(mjx, refused, mini, tmp_path, monkeypatc
 def test_a_table_of_unlike_parts_has_nulls(tmp_path):
   """Columns that only some parts have, such as those of a later version, are null elsewhere."""
   plan = bench.Suite("s", "", tuple(bench.Part(n, RunConfig("walker")) for n in "ab"))
-  for part, columns in zip(plan.parts, ({"seed": [0, 1], "x": [1.0, 2.0]}, {"seed": [2], "y": [3.0]})):
+  own = {k: [v] for k, v in lived(0, "none", None, 0.9, affected=False).items()}
+  for part, columns in zip(plan.parts, ({k: 2 * v for k, v in own.items()} | {"x": [1.0, 2.0]}, own | {"y": [3.0]})):
     (tmp_path / part.name).mkdir()
     store.write_table(tmp_path / part.name / "runs.parquet", columns)
     store.write_json(tmp_path / part.name / "summary.json", {})
@@ -240,3 +241,39 @@ def test_the_time_left_follows_what_parts_took(tmp_path, monkeypatch):
   expected = {n: bench.Estimate(1, 1, 0.0, 600.0, 0) for n in "abc"}
   bench.execute(plan, tmp_path, plan.parts, expected, said.append, lambda: contextlib.nullcontext(lambda p: None))
   assert [s.split("about ")[1] for s in said] == ["30 min left", "40 min left", "20 min left"]
+
+
+def lived(seed, arm, recovery, final, pre=1.0, affected=True, change=0, onset=2000):
+  return {"stream": len(ARMS) * seed + list(ARMS).index(arm), "arm": arm, "seed": seed, "change": change, "onset": onset, "affected": affected,
+          "recovery_step": recovery, "reward_pre": pre, "reward_final": final}
+
+
+def test_what_arms_say_together(tmp_path):
+  """By hand: detector wins back 0.8, 0.6 and 0.4 of a loss of 0.5, oracle all; two of three streams of it recover, one is censored."""
+  rows = [lived(s, "none", None, 0.5) for s in range(3)] + [lived(s, "oracle", 2000 + 1000, 1.0) for s in range(3)]
+  rows += [lived(0, "detector", 2000 + 1000, 0.9), lived(1, "detector", 2000 + 3000, 0.8), lived(2, "detector", None, 0.7)]
+  rows += [lived(s, arm, None, 0.9, affected=False) for s in (3,) for arm in ("none", "oracle", "detector")]
+  rows.append(lived(0, "detector", 11_000, 0.9, change=1, onset=10_500))  # a later change: not of the first one's curves
+  store.write_table(tmp_path / "runs.parquet", {k: [r[k] for r in rows] for k in rows[0]})
+  store.write_json(tmp_path / "config.json", {"arms": ["detector", "none", "oracle"], "steps": 10_000})
+  got = bench.scores(tmp_path)
+  assert got["normalised"]["detector"]["normalised"] == pytest.approx(0.6) and got["normalised"]["oracle"]["normalised"] == pytest.approx(1.0)
+  assert got["normalised"]["detector"]["undefined"] == 1  # the fourth seed lost too little
+  assert got["against_oracle"]["difference"] == pytest.approx(-0.4) and got["against_oracle"]["seeds"] == 3
+  own = got["recovery"]["detector"]
+  # S = 1, 2/3 from 1,000, 1/3 from 3,000; watched for 8,000 less the 2,000 that recovery must hold
+  assert (own["n"], own["recovered"], own["median_steps"], own["horizon"]) == (3, 2, 3000.0, 6000)
+  assert own["restricted_mean_steps"] == pytest.approx(1000 + 2000 * 2 / 3 + 3000 / 3)
+  assert got["recovery"]["none"] == {"n": 3, "recovered": 0, "median_steps": None, "median_steps_ci": [None, None], "restricted_mean_steps": 6000.0,
+                                     "restricted_mean_steps_ci": None, "horizon": 6000}
+  (tmp_path / "part").mkdir()
+  for name in ("runs.parquet", "config.json"):
+    (tmp_path / name).rename(tmp_path / "part" / name)
+  from mjx_cl import plots
+  assert plots.survival(tmp_path, ["part"]).stat().st_size > 5000
+
+
+def test_arms_alone_say_nothing_together(tmp_path):
+  store.write_table(tmp_path / "runs.parquet", {k: [v] for k, v in lived(0, "detector", None, 0.9, affected=None).items()})
+  store.write_json(tmp_path / "config.json", {"arms": ["detector"], "steps": 10_000})
+  assert bench.scores(tmp_path) == {"normalised": None, "against_oracle": None, "recovery": {"detector": None}}
