@@ -105,7 +105,7 @@ def make(name: str, channel: str | None = None, log: bool | None = None, whiten:
     if getattr(build, "takes", "residual") != "scalar":
       if channel is not None or log is not None or whiten:
         raise UserError(f"detector {name!r} has channels of its own; leave out channel, log and whiten")
-      detector = build(**settings, **({} if patience == 1 else {"patience": patience}))
+      detector = build(**(settings | ({} if patience == 1 else {"patience": patience})))
       return combine.cool_down(detector, cool_down) if cool_down else detector
     detector = build(**settings) if patience == 1 else combine.patience(build, patience, **settings)
   except TypeError as e:
