@@ -293,8 +293,30 @@ def experiments(results: pathlib.Path) -> str:
       (heads[name] if not k else "", *line, own[name] if not k else "") for name, k, line in rows])
 
 
+def arms(results: pathlib.Path) -> str:
+  """The arms of the paper's suite side by side: recovery, what it is worth, what it cost."""
+  rows, pairs = [], []
+  for part, entry in load(results / "paper" / "bench.json")["entries"].items():
+    scores = entry["scores"]
+    for k, (arm, own) in enumerate(entry["arms"].items()):
+      back, worth = scores["recovery"][arm], (scores["normalised"] or {}).get(arm)
+      rows.append((f"`{part}`" if not k else "", arm, f"{back['recovered']} of {back['n']}" if back else "none affected",
+                   both(back, "median_steps") if back else "-", both(back, "restricted_mean_steps") if back else "-",
+                   f"{both(worth, 'normalised', 2)}, {worth['seeds']} seeds" if worth and worth["seeds"] else "-",
+                   number(own["updates_mean"]), number(own["terminations_mean"], 1)))
+    pair = scores["against_oracle"]
+    if pair and pair["seeds"]:
+      holds = {True: "the interval holds 0", False: "the interval does not hold 0", None: "no interval"}[pair["holds_zero"]]
+      pairs.append(f"{part} {both(pair, 'difference', 2)}, {pair['seeds']} seeds, {holds}")
+  text = fill(f"""
+      Affected streams that recover, Kaplan-Meier's median with Brookmeyer and Crowley's interval, restricted mean up to 10,000 steps or to where the run
+      ends; normalised recovery over the last 2,000 steps before the next change (0: arm `none`, 1: the reward before onset), interquartile mean with its bootstrap
+      interval; updates and falls or crashes a stream, means. {f"Method minus oracle trigger, paired over seeds: {'; '.join(pairs)}." if pairs else ""}""")
+  return text + "\n\n" + grid(("experiment", "arm", "recovered", "median [steps]", "restricted mean [steps]", "normalised recovery", "updates", "falls"), rows)
+
+
 BLOCKS = {"run-walker": run_walker, "arl0": arl0, "leaderboard": leaderboard, "physics": physics, "dreamer": dreamer, "agents": agents,
-          "detectors": detectors, "paper": experiments}
+          "detectors": detectors, "paper": experiments, "arms": arms}
 
 
 # ---- README ----------------------------------------------------------------------------------------------------------------------

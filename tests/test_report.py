@@ -28,6 +28,7 @@ SOURCES = {
                "car_agent/curve.parquet", "quadruped_agent/eval.json", "quadruped_agent/curve.parquet"),
     "detectors": ("detectors.json",),
     "paper": tuple(f"paper/{robot}/{file}" for robot in ("walker", "quadruped", "car") for file in ("config.json", "summary.json", "runs.parquet")),
+    "arms": ("paper/bench.json",),
 }
 ALL = [(name, file) for name, files in SOURCES.items() for file in files]
 
@@ -66,6 +67,14 @@ def results(tmp_path):
     later = [r | {"change": 1, "onset": 9000, "reward_drop": r["reward_drop"] + 0.1,
                   "recovery_step": r["recovery_step"] and r["recovery_step"] + 5000} for r in runs]
     write(out / "paper" / robot / "runs.parquet", [r | {"change": 0} for r in runs] + (later if robot == "car" else []))
+  summary = json.loads((out / "walker_gear/summary.json").read_text())
+  back = {"n": 6, "recovered": 5, "median_steps": 4321.0, "median_steps_ci": [1234.0, None], "restricted_mean_steps": 5432.1,
+          "restricted_mean_steps_ci": [3456.7, 6543.2], "horizon": 10_000}
+  worth = {"seeds": 7, "undefined": 3, "normalised": 0.876, "normalised_ci": [0.764, 1.043]}
+  entry = {"arms": {arm: summary["arms"][arm] | {"updates_mean": 232.4, "terminations_mean": 3.21} for arm in ("detector", "none")}, "scores": {
+      "normalised": {"detector": worth, "none": worth | {"normalised": 0.012}}, "recovery": {"detector": back, "none": None},
+      "against_oracle": {"seeds": 8, "difference": -0.067, "difference_ci": [-0.189, 0.045], "holds_zero": True}}}
+  (out / "paper/bench.json").write_text(json.dumps({"suite": "paper", "parts": 1, "finished": 1, "entries": {"walker": entry}}))
   return out
 
 
@@ -240,6 +249,7 @@ CONSTANTS = {  # what a block says of itself: windows of the definitions, sizes 
              | {x for e in paper.EXPERIMENTS.values() for x in re.findall(r"[\d,.]*\d", e.runs)}
              | {f"{e.onset:,}" for e in paper.EXPERIMENTS.values()}
              | {"16", "12", "4", "05"},  # the authors' batch, size and learning rate
+    "arms": {"95", "1", "2,000", "10,000"},
 }
 
 
@@ -296,6 +306,13 @@ def test_the_board_is_sorted_and_whole(results):
   rest = text[text.rindex("\n\n"):].replace("\n", " ")
   assert {r["detector"] for r in overall} == {d for d, _ in shown} | {r["detector"] for r in overall if f" {r['detector']} " in rest}
   assert "-0 " not in text and "-0]" not in text and "-0.0" not in text
+
+
+def test_arms_side_by_side(results):
+  text = report.render("arms", results)
+  assert cells(text, "`walker`") == ["`walker`", "detector", "5 of 6", "4,321 [1,234, -]", "5,432 [3,457, 6,543]", "0.88 [0.76, 1.04], 7 seeds", "232", "3.2"]
+  assert cells(text, " none")[:5] == ["", "none", "none affected", "-", "-"]
+  assert "walker -0.07 [-0.19, 0.04], 8 seeds, the interval holds 0" in " ".join(text.split())
 
 
 def test_missed_goals_are_said(results):
