@@ -311,7 +311,7 @@ def test_the_board_is_sorted_and_whole(results):
 def test_arms_side_by_side(results):
   text = report.render("arms", results)
   assert cells(text, "`walker`") == ["`walker`", "detector", "5 of 6", "4,321 [1,234, -]", "5,432 [3,457, 6,543]", "0.88 [0.76, 1.04], 7 seeds", "232", "3.2"]
-  assert cells(text, " none")[:5] == ["", "none", "none affected", "-", "-"]
+  assert cells(text, "| none")[:5] == ["", "none", "none affected", "-", "-"]
   assert "walker -0.07 [-0.19, 0.04], 8 seeds, the interval holds 0" in " ".join(text.split())
 
 
