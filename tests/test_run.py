@@ -263,10 +263,11 @@ def test_figure_of_a_run_in_which_little_happened(tmp_path, starts):
   """No alarm, no residual yet: still a figure, and one whose layout has not collapsed (Matplotlib warns of that)."""
   steps = 90
   numbers = np.tile(np.linspace(0, 1, steps), 2)
-  trace = {"arm": ["detector"] * steps + ["none"] * steps, "step": np.tile(np.arange(steps), 2), "reward": numbers}
+  trace = {"stream": [0] * steps + [1] * steps, "arm": ["detector"] * steps + ["none"] * steps, "step": np.tile(np.arange(steps), 2), "reward": numbers}
   trace |= {k: np.full(2 * steps, np.nan) for k in ("opr", "rpr", "adv_mag", "dyn_loss")} | {"value_loss": numbers}
   store.write_table(tmp_path / "trace.parquet", trace)
-  events = {"step": [40] + starts, "kind": ["onset"] + ["start"] * len(starts), "arm": ["detector"] * (1 + len(starts))}
+  events = {"step": [40] + starts + [80], "kind": ["onset"] + ["start"] * len(starts) + ["abort" if starts else "alarm"],
+            "arm": ["detector"] * (2 + len(starts)), "stream": [0] * (2 + len(starts))}
   store.write_table(tmp_path / "events.parquet", events)
   store.write_json(tmp_path / "config.json", {"env": "walker", "fault": "gear", "severity": 0.5, "onset": 40, "control_s": 0.025})
   with warnings.catch_warnings():
