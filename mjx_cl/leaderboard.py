@@ -13,7 +13,7 @@ from typing import Any, Callable, NamedTuple
 import numpy as np
 
 from mjx_cl import detectors as detectors_lib
-from mjx_cl import oracles
+from mjx_cl import oracles, passes
 from mjx_cl.errors import FileError, UserError, choose
 from mjx_cl.scoring import healthy, limits, metrics
 from mjx_cl.streams import Streams, StreamSet
@@ -122,20 +122,8 @@ def joined(a, b):
   return jax.tree.map(lambda x, y: np.concatenate([x[:steps], y[:steps]], 1), a, b)
 
 
-def _padded(residual, steps: int, streams: int):
-  """A residual filled up with unknown rows and streams, so that one compiled program serves every robot."""
-  import jax
-
-  def fill(x):
-    shape = (steps, streams) + x.shape[2:]
-    out = np.zeros(shape, bool) if x.dtype == bool else np.full(shape, np.nan, x.dtype)
-    out[:x.shape[0], :x.shape[1]] = x
-    return out
-  return jax.tree.map(fill, residual)
-
-
 def program(build):
-  """(thresholds (K,), residual (T, S)) -> (fired bool (K, T, S), score float32 (K, T, S)), jitted."""
+  """(thresholds (K,), residual (T, S)) -> (fired bool (K, T, S), score float32 (K, T, S)), jitted: the plain form that `passes` is held against."""
   import jax
   import jax.numpy as jnp
 
@@ -151,45 +139,44 @@ def program(build):
   return jax.jit(run)
 
 
-def examine(one: Entry, data: Data, nominal, faults, run=None) -> Found:
+def examine(one: Entry, data: Data, runner: passes.Runner, samples: passes.Samples) -> Found:
   """Calibrates a detector on one robot and runs it.
 
   Args:
-    nominal: monitor.Residual of the tuning, then the scoring streams. faults: of the fault streams, padded. run: of `program`, compiled before.
+    runner: of the detector, compiled once for all robots. samples: of `data`.
   """
-  run = run or program(one.build)
-  tune, together = data.tune.residual.opr.shape[1], healthy.TOGETHER
-  streams, steps = data.fault.residual.opr.shape[1], data.fault.residual.opr.shape[0]
-  same = lambda t: np.full(together, t, np.float32)
-  first = lambda out: tuple(np.asarray(x)[0] for x in out)
-  threshold, tried, counted, kept = math.nan, [], 0, {}
-  if one.calibrated:
-    free = first(run(same(np.inf), nominal))[1][data.count_from:, :tune]
-    counted = int(healthy.seeing(free, 0).sum()) * len(free)
-    target = counted / data.arl0
-
-    def count(levels):
-      fired, score = (np.asarray(x) for x in run(levels.astype(np.float32), nominal))
-      alarms = fired[:, data.count_from:, :tune].sum((1, 2))
-      few = [k for k, n in enumerate(alarms) if n <= target]
-      if few:  # most likely the one that is looked for: it need not be run again
-        k = min(few, key=lambda k: levels[k])
-        kept[float(levels[k])] = fired[k].copy(), score[k].copy()
-      return alarms
-    threshold, tried = healthy.narrow(count, free, target)
-  fired, score = kept[threshold] if threshold in kept else first(run(same(threshold if one.calibrated else 0.0), nominal))
-  levels = [threshold if one.calibrated else 0.0] + [healthy.nearest(tried, counted, a) for a in CURVE if tried]
-  padded = np.asarray((levels + levels[:1] * together)[:together], np.float32)
-  run(padded, faults)[0].block_until_ready()
-  begin = time.perf_counter()
-  out = run(padded, faults)
-  out[0].block_until_ready()
-  us = (time.perf_counter() - begin) / (together * faults.opr.size) * 1e6
-  fault_fired, fault_score = (np.asarray(x)[:, :steps, :streams] for x in out)
+  tune, streams = data.tune.residual.opr.shape[1], len(samples.healthy)
+  threshold, tried, counted, counter = math.nan if one.calibrated else 0.0, [], 0, None
+  every = lambda t: list(zip(range(streams), np.full((streams, runner.together), t, np.float32)))
+  runner.prepare(samples)
+  for reuse in (True, False):
+    if one.calibrated:
+      counter = passes.Counter(runner, samples, tune, data.count_from, reuse)
+      free = counter.score()[data.count_from:]
+      counted = int(healthy.seeing(free, 0).sum()) * len(free)
+      target = counted / data.arl0
+      threshold, tried = healthy.narrow(lambda levels: counter.count(levels, target), free, target)
+    runs = list(runner.healthy(every(threshold), samples))
+    fired = np.stack([f[0] for f, _ in runs], 1)
+    score = np.stack([passes.strongest(s[0]) for _, s in runs], 1)
+    # a threshold that is used otherwise than as score > threshold lets no run tell of another; then all are run
+    if counter is None or counter.sound and fired[data.count_from:, :tune].sum() == dict(tried).get(threshold, 0):
+      break
+  levels = [threshold] + [healthy.nearest(tried, counted, a) for a in CURVE if tried]
+  faults_fired, faults_score, us = runner.faults(np.asarray(levels, np.float32), samples)
   alarms = dict(tried)
-  pairs = [(alarms[t], f) for t, f in zip(levels, fault_fired) if t in alarms]
-  points = curve(pairs, data, counted)
-  return found(data, float(np.float32(threshold)) if one.calibrated else None, fired, score, fault_fired[0], fault_score[0], us, points)
+  first, shape = data.fault.onset, data.fault.residual.opr.shape
+  pairs = [(alarms[t], _placed(f, first, shape, False)) for t, f in zip(levels, faults_fired) if t in alarms]
+  own = _placed(faults_fired[0], first, shape, False), _placed(faults_score[0], first, shape, np.nan)
+  return found(data, float(np.float32(threshold)) if one.calibrated else None, fired, score, *own, us, curve(pairs, data, counted))
+
+
+def _placed(x: np.ndarray, onset: np.ndarray, shape: tuple[int, int], unknown) -> np.ndarray:
+  """(T, F) from rows (H, F) that begin at the onsets; `unknown` before and behind, where nothing counts."""
+  out = np.full(shape, unknown, x.dtype)
+  for k, first in enumerate(onset):
+    out[first:first + len(x), k] = x[:shape[0] - first, k]
+  return out
 
 
 def curve(pairs, data: Data, counted: float) -> list[dict]:
@@ -284,36 +271,53 @@ def score(streams: StreamSet, entries: list[Entry], robots=(), extra=(), progres
   """
   begin = time.perf_counter()
   robots = streams.choose(robots)
-  steps, wide = (max(extent) for extent in zip(*(streams.extent(r) for r in robots)))
-  programs = {e.name: program(e.build) for e in entries}
+  room = passes.room(streams, robots)
+  runners = {e.name: passes.Runner(e.build, room) for e in entries}
   rows, curves, pages, n = [], {}, [], len(robots) * (len(entries) + len(extra) + 1)
   done = lived = 0
   for robot in robots:
     data = load(streams, robot)
-    nominal, faults = joined(data.tune.residual, data.score.residual), _padded(data.fault.residual, steps, wide)
+    nominal = joined(data.tune.residual, data.score.residual)
+    samples = passes.samples(nominal, data.fault.residual, data.fault.onset, data.fault.seed, data.horizon, room.samples) if entries else None
     known = oracles.oracles(streams, data)
     rows += oracle_rows(data, known)
     done += 1
     progress(robot, "oracles", done, n, time.perf_counter() - begin)
     alarms: dict[str, np.ndarray] = {}
-    for name, get in [(e.name, lambda d, e=e: _guarded(e, d, nominal, faults, programs[e.name])) for e in entries] + list(extra):
+    jobs = [(e.name, lambda d, e=e: _guarded(e, d, runners[e.name], samples)) for e in entries] + list(extra)
+
+    def rated(name, get):
       result = get(data)
-      reference = next((e.reference for e in entries if e.name == name), False)
-      rows += rows_of(name, reference, result, data, known)
-      curves.setdefault(name, {})[robot] = result.curve
-      alarms[name] = result.fired
-      lived += nominal.opr.size + data.fault.residual.opr.size
-      done += 1
-      progress(robot, name, done, n, time.perf_counter() - begin)
+      return result, rows_of(name, next((e.reference for e in entries if e.name == name), False), result, data, known)
+    with _workers() as pool:
+      waiting = [(name, pool.submit(rated, name, get)) for name, get in jobs]
+      try:
+        for name, job in waiting:
+          result, own = job.result()
+          rows += own
+          curves.setdefault(name, {})[robot] = result.curve
+          alarms[name] = result.fired
+          lived += nominal.opr.size + data.fault.residual.opr.size
+          done += 1
+          progress(robot, name, done, n, time.perf_counter() - begin)
+      finally:
+        pool.shutdown(wait=False, cancel_futures=True)  # after an error or Ctrl-C what has not begun never does
     pages += _pages(data, known, alarms)
   return Board(rows, metrics.overall(rows), {k: v for k, v in curves.items() if any(v.values())}, pages, time.perf_counter() - begin, lived)
 
 
-def _guarded(one: Entry, data: Data, nominal, faults, run) -> Found:
+def _workers():
+  """A thread per core, eight at the most: the program of a detector runs on one core, and several run side by side."""
+  import concurrent.futures
+  import os
+  return concurrent.futures.ThreadPoolExecutor(min(8, os.cpu_count() or 1), "detector")
+
+
+def _guarded(one: Entry, data: Data, runner: passes.Runner, samples) -> Found:
   """`examine`; whatever goes wrong inside a detector, which may be anybody's, becomes one line that names it."""
   import jax
   try:
-    return examine(one, data, nominal, faults, run)
+    return examine(one, data, runner, samples)
   except UserError:
     raise
   except jax.errors.ConcretizationTypeError as e:

@@ -60,11 +60,11 @@ def _attempt(estimate: Callable[[], Any]) -> tuple[Any, str | None]:
     return None, str(e)
 
 
-def _known(normal: np.ndarray, after: np.ndarray, arl0: float) -> tuple[limits.Parameters | None, dict]:
-  """Fit of a fault, None where too little is known of it, and its limits; (T, S, C) healthy and after the onset."""
-  fit, no_fit = _attempt(lambda: limits.fit(normal, after, ORDER))
-  information, no_information = _attempt(lambda: limits.information(normal, after, ORDER))
-  form, no_form = _attempt(lambda: limits.closed_form(normal[..., 0], after[..., 0], arl0, ORDER))
+def _known(normal: limits.Healthy, first: limits.Healthy, after: np.ndarray, arl0: float) -> tuple[limits.Parameters | None, dict]:
+  """Fit of a fault, None where too little is known of it, and its limits; healthy channels and the first of them, (T, S, C) after the onset."""
+  fit, no_fit = _attempt(lambda: limits.fit(normal, after))
+  information, no_information = _attempt(lambda: limits.information(normal, after))
+  form, no_form = _attempt(lambda: limits.closed_form(first, after[..., 0], arl0))
   unknown = dict.fromkeys(("information_nats_per_step", "information_nats_per_step_ci", "optimal_delay_steps"))
   return fit, unknown | {"note": no_fit or no_information or no_form} | (information or {}) | (form or {})
 
@@ -93,11 +93,12 @@ def oracles(streams: StreamSet, data) -> dict[tuple[str, float], Oracle]:
   each = lanes // len(dict.fromkeys(data.tune.seed.tolist()))
   tune, score = (channels(x.residual) for x in (data.tune, data.score))
   ratio = lambda x, p: np.concatenate([np.full((ORDER, x.shape[1]), np.nan), limits.log_ratio(x, p)])
-  known = {}
+  normal = tune[data.count_from:, ::each]
+  normal, first, known = limits.Healthy(normal, ORDER), limits.Healthy(normal[..., 0], ORDER), {}
   for key in streams.faults(data.robot):
     tuned = streams.get(data.robot, streams.find(data.robot, "fault", "tune", *key))
     after = np.stack([channels(tuned.residual, slice(s, s + 1))[o:o + data.horizon, 0] for s, o in enumerate(tuned.onset)], 1)
-    known[key] = _known(tune[data.count_from:, ::each], after, data.arl0)
+    known[key] = _known(normal, first, after, data.arl0)
   out = {key: Oracle(limit, None) for key, (_, limit) in known.items()}
   fits = {key: fit for key, (fit, _) in known.items() if fit is not None}
   levels = []

@@ -8,7 +8,7 @@ import numpy as np
 import pyarrow.parquet
 import pytest
 
-from mjx_cl import detectors, leaderboard, oracles, recording, store, streams, submissions
+from mjx_cl import detectors, leaderboard, oracles, passes, recording, store, streams, submissions
 from mjx_cl.detectors.host import HostDetector
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.scoring import healthy, limits
@@ -250,6 +250,65 @@ def test_restarted_cusum_equals_the_detector(small):
   fired, score = oracles.restarted(ratio, np.full(SEEDS, 3.0))
   np.testing.assert_allclose(alarm.score, score, rtol=1e-3, atol=1e-3)  # float32 sums of a few hundred terms
   assert (np.asarray(alarm.fired) == fired).mean() > 0.995
+
+
+# ---- passes --------------------------------------------------------------------------------------------------------------------------
+
+@pytest.mark.parametrize("name, settings, together", [
+    ("cusum", {"warmup": 150}, 1), ("rolling_sigma_plain", {"window": 150, "warmup": 100}, healthy.TOGETHER), ("knn", {"warmup": 150, "references": 30}, 1)])
+def test_passes_equal_whole_streams_at_every_threshold(small, name, settings, together):
+  """Shared pasts, reused runs and unused lanes against the plain scan over whole streams."""
+  data = leaderboard.load(small[0], "walker")
+  nominal, onset, horizon = leaderboard.joined(data.tune.residual, data.score.residual), data.fault.onset, data.horizon
+  one, tune = leaderboard.entry(name, settings), len(data.tune.stream)
+  known = passes.samples(nominal, data.fault.residual, onset, data.fault.seed, horizon)
+  runner, plain = passes.Runner(one.build), leaderboard.program(one.build)
+  assert len(known.past) == SEEDS  # three faults of a seed share one
+  counter = passes.Counter(runner, known, tune, data.count_from)
+  free = counter.score()
+  assert runner.together == together
+  np.testing.assert_allclose(free, np.asarray(plain(np.float32([np.inf]), nominal)[1])[0, :, :tune], rtol=1e-4, atol=1e-5)
+  ran, run = [], runner.healthy
+  runner.healthy = lambda lanes, data: ran.append(len(lanes)) or run(lanes, data)
+  spread = free[data.count_from:][np.isfinite(free[data.count_from:])]
+  for levels in (np.quantile(spread, [0.5, 0.9, 0.99, 0.999]), np.quantile(spread, [0.99, 0.9903, 0.9906, 0.991]), spread.max() + np.arange(1, 5)):
+    alarms = np.asarray(plain(levels.astype(np.float32), nominal)[0])[:, data.count_from:, :tune].sum((1, 2))
+    np.testing.assert_array_equal(counter.count(levels, 0.0), alarms)
+  assert sum(ran) < 3 * 4 * tune // together or together > 1 and ran[2] == 0  # above all scores nothing need be run
+  levels = np.quantile(spread, [0.9, 0.99, 0.999]).astype(np.float32)
+  fired, score, _ = runner.faults(levels, known)
+  whole = [np.asarray(x) for x in plain(levels, data.fault.residual)]
+  after = [np.stack([x[:, k:k + horizon, s] for s, k in enumerate(onset)], 2) for x in whole]
+  np.testing.assert_array_equal(fired, after[0])
+  assert fired.any() or name == "knn"
+  np.testing.assert_allclose(score, after[1], rtol=1e-4, atol=1e-5)
+
+
+def test_other_pasts_are_not_shared(small):
+  data = leaderboard.load(small[0], "walker")
+  nominal = leaderboard.joined(data.tune.residual, data.score.residual)
+  other = data.fault.residual._replace(opr=data.fault.residual.opr.copy())
+  other.opr[100, 0] += 1.0
+  known = passes.samples(nominal, other, data.fault.onset, data.fault.seed, data.horizon)
+  assert len(known.past) == SEEDS + 1 and (known.owner == known.owner[0]).sum() == 1
+
+
+def test_a_run_tells_of_thresholds_that_part_no_score():
+  scores = np.array([[1.0, np.nan], [3.0, 5.0]])
+  assert passes.same(scores, 3.0, 4.9) and passes.same(scores, 4.9, 3.0) and passes.same(scores, 5.0, np.inf)
+  assert not passes.same(scores, 4.9, 5.0) and not passes.same(scores, 2.9, 3.0) and not passes.same(scores, np.inf, 4.9)
+
+
+def test_a_threshold_used_otherwise_is_found_out_and_all_is_run(small):
+  """Fires a quarter below its threshold: no score lies between two thresholds, yet their alarms differ."""
+  from mjx_cl.detectors.base import Alarm, Detector
+  early = lambda t: Detector(lambda: jnp.int32(0), lambda s, x: (s, Alarm(x.opr > t - 0.25, x.opr)))
+  data = leaderboard.load(small[0], "walker")
+  known = passes.samples(leaderboard.joined(data.tune.residual, data.score.residual), data.fault.residual, data.fault.onset, data.fault.seed, data.horizon)
+  got = leaderboard.examine(leaderboard.Entry("early", early, True, False, ""), data, passes.Runner(early), known)
+  opr = data.tune.residual.opr[data.count_from:]
+  want, _ = healthy.narrow(lambda t: (opr[None] > t.astype(np.float32)[:, None, None] - np.float32(0.25)).sum((1, 2)), opr, opr.size / data.arl0)
+  assert got.threshold == np.float32(want) and got.arl0["alarms"] == (opr > np.float32(got.threshold) - np.float32(0.25)).sum() > 0
 
 
 # ---- other ways in -------------------------------------------------------------------------------------------------------------------

@@ -48,6 +48,7 @@ def any_of(*detectors: Detector) -> Detector:
     scores = jnp.stack([alarm.score for _, alarm in out])
     known = jnp.where(jnp.isnan(scores), -jnp.inf, scores).max()
     return tuple(state for state, _ in out), Alarm(fired, jnp.where(jnp.all(jnp.isnan(scores)), jnp.nan, known))
+  update.members = detectors  # for passes.updates: the largest score hides what the other members do
   return Detector(lambda: tuple(d.init() for d in detectors), update)
 
 

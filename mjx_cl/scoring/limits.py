@@ -11,6 +11,7 @@ Delay counts the samples used, so delay = latency_steps + 1: an alarm in the fir
 """
 from __future__ import annotations
 
+import functools
 import math
 from typing import NamedTuple
 
@@ -129,21 +130,55 @@ def _conditional(x: np.ndarray, order: int, floor: np.ndarray) -> Conditional:
                      np.linalg.inv(factor), 2 * np.log(np.diag(factor)).sum())
 
 
+class Healthy:
+  """Healthy streams and what is fitted to them alone, each once: many faults are held against one healthy robot.
+
+  Args:
+    streams: float (T,), (T, S) or (T, S, C). order: of the autoregression.
+  """
+
+  def __init__(self, streams, order: int = 8):
+    self.streams, self.order = _streams(streams, "nominal"), order
+
+  @functools.cached_property
+  def floor(self) -> np.ndarray:
+    """Least innovation variance of each channel, (C,)."""
+    return FLOOR * np.maximum(np.nanvar(self.streams, axis=(0, 1)), 1e-12)
+
+  @functools.cached_property
+  def model(self) -> Conditional:
+    """Fit of all streams."""
+    return _conditional(self.streams, self.order, self.floor)
+
+  @functools.cached_property
+  def halves(self) -> tuple[Healthy, Healthy]:
+    """Even and odd streams."""
+    return Healthy(self.streams[:, ::2], self.order), Healthy(self.streams[:, 1::2], self.order)
+
+  @functools.cached_property
+  def white(self) -> np.ndarray:
+    """Innovations of the first channel, (T - order, S)."""
+    return innovations(self.streams, self.model)[..., 0]
+
+
+def _healthy(nominal, order: int) -> Healthy:
+  return nominal if isinstance(nominal, Healthy) else Healthy(nominal, order)
+
+
 def fit(nominal, faulty, order: int = 8) -> Parameters:
   """Conditional densities before and after the change, by least squares over all streams.
 
   Args:
     nominal, faulty: float (T, S), (T, S, C): healthy steps, and steps after the onset alone; T and S of the two may differ. A step counts where it
-      and the `order` steps before it are finite.
+      and the `order` steps before it are finite. nominal may be a Healthy, whose order then holds.
     order: of the autoregression; 0 takes steps as independent.
   Returns:
     Parameters, arrays float64.
   """
-  nominal, faulty = _streams(nominal, "nominal"), _streams(faulty, "faulty")
-  if nominal.shape[2] != faulty.shape[2]:
-    raise UserError(f"healthy and faulty streams must have the same channels; got {nominal.shape[2]} and {faulty.shape[2]}")
-  floor = FLOOR * np.maximum(np.nanvar(nominal, axis=(0, 1)), 1e-12)
-  return Parameters(_conditional(nominal, order, floor), _conditional(faulty, order, floor))
+  healthy, faulty = _healthy(nominal, order), _streams(faulty, "faulty")
+  if healthy.streams.shape[2] != faulty.shape[2]:
+    raise UserError(f"healthy and faulty streams must have the same channels; got {healthy.streams.shape[2]} and {faulty.shape[2]}")
+  return Parameters(healthy.model, _conditional(faulty, healthy.order, healthy.floor))
 
 
 def innovations(x, model: Conditional) -> np.ndarray:
@@ -172,17 +207,17 @@ def information(nominal, faulty, order: int = 8, reps: int = REPS) -> dict:
   `order` steps, and takes all faulty steps as alike: a fault that acts at once and fades has more at first.
 
   Args:
-    nominal, faulty: (T, S) or (T, S, C), stream s of both is seed s; faulty: steps after the onset alone. S >= 2.
+    nominal, faulty: (T, S) or (T, S, C), stream s of both is seed s; faulty: steps after the onset alone. S >= 2. nominal may be a Healthy.
   Returns:
     {information_nats_per_step, its _ci: bootstrap over seeds, None for fewer than two}.
   """
-  nominal, faulty = _streams(nominal, "nominal"), _streams(faulty, "faulty")
+  healthy, faulty = _healthy(nominal, order), _streams(faulty, "faulty")
   seeds = faulty.shape[1]
-  if seeds < 2 or nominal.shape[1] != seeds:
-    raise UserError(f"information needs two or more seeds, the same ones healthy and faulty; got {nominal.shape[1]} and {seeds}")
+  if seeds < 2 or healthy.streams.shape[1] != seeds:
+    raise UserError(f"information needs two or more seeds, the same ones healthy and faulty; got {healthy.streams.shape[1]} and {seeds}")
   rate = np.empty(seeds)
   for half in (0, 1):
-    ratio = log_ratio(faulty[:, half::2], fit(nominal[:, 1 - half::2], faulty[:, 1 - half::2], order))
+    ratio = log_ratio(faulty[:, half::2], fit(healthy.halves[1 - half], faulty[:, 1 - half::2], order))
     known = np.isfinite(ratio)
     rate[half::2] = np.where(known, ratio, 0).sum(0) / np.where(known.any(0), known.sum(0), np.nan)
   rate = rate[np.isfinite(rate)]
@@ -233,10 +268,13 @@ def closed_form(nominal, faulty, arl0: float, order: int = 8, lags: int = 20) ->
   Returns:
     {optimal_delay_steps: samples or None, note: the reason for None, else None, ljung_box_p}.
   """
-  white, model = whiten(nominal, order)
-  _, p = ljung_box(white, lags, order)
-  shift = float(np.nanmean(innovations(faulty, model)))
-  rate = information(nominal, faulty, order)["information_nats_per_step"]
+  healthy = _healthy(nominal, order)
+  if healthy.streams.shape[2] != 1:
+    raise UserError(f"closed_form takes one channel; got {healthy.streams.shape[2]}")
+  order = healthy.order
+  _, p = ljung_box(healthy.white, lags, order)
+  shift = float(np.nanmean(innovations(faulty, healthy.model)))
+  rate = information(healthy, faulty, order)["information_nats_per_step"]
   note = None
   if p < WHITE:
     note = f"no closed form: healthy innovations of order {order} are not white (Ljung-Box p = {p:.2g})"
