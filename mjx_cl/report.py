@@ -275,19 +275,25 @@ def detectors(results: pathlib.Path) -> str:
 
 
 def experiments(results: pathlib.Path) -> str:
-  """The paper's figures, those of mjx_cl and the difference; see paper.py."""
-  rows, differs, heads = [], {}, {}
+  """The paper's figures, those of mjx_cl and the difference; see paper.py. An experiment without a folder is named as not run."""
+  rows, differs, heads, absent = [], {}, {}, []
   for name, experiment in paper.EXPERIMENTS.items():
     folder = results / "paper" / experiment.folder
+    if not folder.is_dir():
+      absent.append(f"`{name}`")
+      continue
     config, summary, runs = load(folder / "config.json"), load(folder / "summary.json"), table(folder / "runs.parquet")
     heads[name] = f"`{name}`: {experiment.protocol}; paper {experiment.runs}, here {summary['arms']['detector']['seeds']} seeds"
     differs[name] = paper.setup(experiment, config)
     rows += [(name, k, line) for k, line in enumerate(paper.compare(name, config, runs))]
+  if not rows:
+    raise FileError(f"{results / 'paper'} holds no experiment; run mjx-cl bench paper --publish {results / 'paper'}")
   common = [words for words in next(iter(differs.values())) if all(words in other for other in differs.values())]
   text = fill(f"""
       Arm `detector`. Times are medians in control steps in which a stream that never gets there counts as infinite, shares interquartile means;
       95 % intervals are bootstrapped over streams, of counts Wilson's, all conditional on the one agent that the streams of an experiment share. In
-      brackets: the paper's section. {f"Other than in the paper, everywhere: {'; '.join(common)}." if common else ""}""")
+      brackets: the paper's section. {f"Other than in the paper, everywhere: {'; '.join(common)}." if common else ""}
+      {f"Not run to its end yet: {joined(absent)}." if absent else ""}""")
   own = {name: "; ".join(words for words in differs[name] if words not in common) for name in differs}
   return text + "\n\n" + grid(("experiment", "what", "paper", "mjx_cl", "difference", "set-up other than the paper's"), [
       (heads[name] if not k else "", *line, own[name] if not k else "") for name, k, line in rows])

@@ -308,6 +308,15 @@ def test_the_board_is_sorted_and_whole(results):
   assert "-0 " not in text and "-0]" not in text and "-0.0" not in text
 
 
+def test_an_experiment_that_was_not_run_is_named(results):
+  shutil.rmtree(results / "paper/car")
+  text = " ".join(report.render("paper", results).split())
+  assert "Not run to its end yet: `paper/car-transfer` and `paper/car-socks`." in text and "| `paper/walker`" in text
+  shutil.rmtree(results / "paper")
+  with pytest.raises(FileError, match="bench paper"):
+    report.render("paper", results)
+
+
 def test_arms_side_by_side(results):
   text = report.render("arms", results)
   assert cells(text, "`walker`") == ["`walker`", "detector", "5 of 6", "4,321 [1,234, -]", "5,432 [3,457, 6,543]", "0.88 [0.76, 1.04], 7 seeds", "232", "3.2"]
