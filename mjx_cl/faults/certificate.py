@@ -119,16 +119,19 @@ def program(env, faults: tuple):
 
 
 def plans(faults: dict[str, faults_lib.Fault], chosen: list[Lane], onset: int):
-  """Plan (lanes, F) and targets (lanes, F): each lane has its own fault or faults, the others rest at severity 0."""
+  """Plan (lanes, F) and targets (lanes, F): each lane has its own fault or faults, the others rest at severity 0.
+
+  Of a preset that has a fault again, later, its first time counts here: each fault has one place in the program, and the proof is of what it does.
+  """
   names, shape = list(faults), (len(chosen), len(faults))
   columns = {"severity": np.zeros(shape), "onset": np.full(shape, onset), "duration": np.full(shape, faults_lib.FOREVER), "schedule": np.zeros(shape, int),
              "period": np.full(shape, 1000), "share": np.full(shape, 0.5)}
   target = np.zeros(shape, np.int32)
   for i, lane in enumerate(chosen):
     changes = (fault_presets.Change(lane.fault, lane.target, lane.severity),) if "/" not in lane.fault else fault_presets.PRESETS[lane.fault].changes
-    if len({c.fault for c in changes}) < len(changes):
-      raise ValueError(f"preset {lane.fault!r} has a fault twice, which one program cannot hold")
-    for c in changes:
+    if len({(c.fault, c.after) for c in changes}) < len(changes):
+      raise ValueError(f"preset {lane.fault!r} has a fault twice at once, which one program cannot hold")
+    for c in {c.fault: c for c in sorted(changes, key=lambda c: -c.after)}.values():  # the earliest of each comes last, and stays
       f = names.index(c.fault)
       values = (c.severity, onset + c.after, c.duration or faults_lib.FOREVER, list(schedule.SCHEDULES).index(c.schedule), c.period, c.share)
       for column, value in zip(columns.values(), values):
