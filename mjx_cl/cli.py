@@ -854,6 +854,7 @@ def main(argv: list[str] | None = None) -> int:
   def stop(*_):
     raise KeyboardInterrupt
   signal.signal(signal.SIGTERM, stop)
+  command = None
   try:
     command = parse(argv)
     if not isinstance(command, (Plot, Query, Report)):
@@ -865,7 +866,9 @@ def main(argv: list[str] | None = None) -> int:
     say(f"mjx-cl: {' '.join(str(e).split())}")
     return e.exit_code
   except KeyboardInterrupt:
-    say("mjx-cl: interrupted; what was saved can be resumed with --resume")
+    kind = type(command) if command else None
+    say("mjx-cl: interrupted" + ("; what was saved can be resumed with --resume" if kind in (Run, Train) else
+                                 "; the same command goes on where it stopped" if kind in (Record, Bench) else ""))
     return 130
   except BrokenPipeError:
     return 0

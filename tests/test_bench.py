@@ -183,7 +183,8 @@ def test_parts_run_once_go_on_and_merge(mjx, refused, mini, tmp_path, monkeypatc
     self.save()
     return progress
   monkeypatch.setattr(run.Runner, "step", cut)
-  assert mjx("bench", mini, "--out", out, "--only", "grip/severity=0.5")[0] == 130
+  code, _, err = mjx("bench", mini, "--out", out, "--only", "grip/severity=0.5")
+  assert code == 130 and err.endswith("the same command goes on where it stopped\n")
   assert not (out / "grip/severity=0.5/summary.json").exists()
   lived = []
   monkeypatch.setattr(run.Runner, "step", lambda self: lived.append(self.done_chunks) or step(self))
