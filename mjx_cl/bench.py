@@ -23,7 +23,7 @@ from typing import NamedTuple
 from mjx_cl import store
 from mjx_cl.adapt.arms import ARMS, FOREVER
 from mjx_cl.config import AdaptConfig, RunConfig, becomes, replace
-from mjx_cl.errors import FileError, UserError
+from mjx_cl.errors import UserError
 
 SUITES = pathlib.Path(__file__).parent / "suites" / "bench"
 PUBLISHED = ("config.json", "events.parquet", "runs.parquet", "summary.json", "figure.png", "snapshots.parquet", "stop.parquet")
@@ -74,17 +74,7 @@ def suite(name: str, change: dict | None = None) -> Suite:
   Raises:
     UserError for an unknown name, key or value, with the choices; FileError for a file that is no TOML.
   """
-  path = SUITES / f"{name}.toml"
-  if not path.exists():
-    path = pathlib.Path(name)
-    if path.suffix != ".toml":
-      raise UserError(f"unknown suite {name!r}; choose from: {', '.join(shipped())}; or give a .toml file")
-  try:
-    data = tomllib.loads(path.read_text())
-  except OSError as e:
-    raise FileError(f"cannot read {path}: {e.strerror}") from None
-  except ValueError as e:
-    raise FileError(f"{path} is no TOML: {e}") from None
+  path, data = store.read_suite(name, SUITES)
   where = f"suite {path.name}"
   unknown = sorted(set(data) - {"name", "about", "run", "entries"})
   if unknown or "name" not in data:

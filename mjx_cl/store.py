@@ -8,6 +8,7 @@ import pathlib
 import platform
 import re
 import subprocess
+import tomllib
 
 from mjx_cl.errors import FileError, UserError
 
@@ -61,6 +62,25 @@ def write_table(path, columns: dict, nan_is_null: bool = True, codec: str = "zst
     floating = isinstance(values, np.ndarray) and values.dtype.kind == "f"
     arrays[name] = pyarrow.array(values, mask=np.isnan(values) if floating and nan_is_null else None)
   atomic(path, lambda file: pyarrow.parquet.write_table(pyarrow.table(arrays), file, compression=codec, compression_level=level, **how))
+
+
+def read_suite(name: str, folder: pathlib.Path) -> tuple[pathlib.Path, dict]:
+  """A suite by name, FOLDER/NAME.toml, or from a TOML file: (its path, its tables).
+
+  Raises:
+    UserError for an unknown name; FileError for a file that is no TOML.
+  """
+  path = folder / f"{name}.toml"
+  if not path.exists():
+    path = pathlib.Path(name)
+    if path.suffix != ".toml":
+      raise UserError(f"unknown suite {name!r}; choose from: {', '.join(sorted(p.stem for p in folder.glob('*.toml')))}; or give a .toml file")
+  try:
+    return path, tomllib.loads(path.read_text())
+  except OSError as e:
+    raise FileError(f"cannot read {path}: {e.strerror}") from None
+  except ValueError as e:
+    raise FileError(f"{path} is no TOML: {e}") from None
 
 
 def read_table(path) -> dict:

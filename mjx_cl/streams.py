@@ -12,7 +12,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import pathlib
-import tomllib
 from typing import NamedTuple
 
 import numpy as np
@@ -112,17 +111,7 @@ def suite(name: str) -> Suite:
   Raises:
     UserError for an unknown name or a value out of range; FileError for a file that is no TOML.
   """
-  path = SUITES / f"{name}.toml"
-  if not path.exists():
-    path = pathlib.Path(name)
-    if path.suffix != ".toml":
-      raise UserError(f"unknown suite {name!r}; choose from: {', '.join(sorted(p.stem for p in SUITES.glob('*.toml')))}; or give a .toml file")
-  try:
-    data = tomllib.loads(path.read_text())
-  except OSError as e:
-    raise FileError(f"cannot read {path}: {e.strerror}") from None
-  except ValueError as e:
-    raise FileError(f"{path} is no TOML: {e}") from None
+  path, data = store.read_suite(name, SUITES)
   fields = {f.name for f in dataclasses.fields(Suite)}
   if set(data) != fields:
     wrong = [f"unknown {k!r}" for k in sorted(set(data) - fields)] + [f"missing {k!r}" for k in sorted(fields - set(data))]
