@@ -29,11 +29,12 @@ SUITES = pathlib.Path(__file__).parent / "suites" / "bench"
 PUBLISHED = ("config.json", "events.parquet", "runs.parquet", "summary.json", "figure.png", "snapshots.parquet", "stop.parquet")
 MERGED = (*PUBLISHED, "trace.parquet", "residuals.parquet")
 
-# Seconds at a dense float32 product of 200 GFLOP/s, measured by `mjx-cl run` of ten seeds and two arms on 2 cores (results/paper/*/summary.json)
-WATCH_S, ACT_S = 0.25e-3, 0.12e-3      # monitor; acting: per stream and control step, size1m
-PHYSICS_S = {"walker": 0.05e-3, "quadruped": 0.12e-3, "car": 0.02e-3, "car_real": 0.1e-3}
-UPDATE_S = 0.1 / (4 * 64)              # per replayed step that an update trains on, size1m, every state an imagination start
-COMPILE_S = 45.0                       # programs of one part
+# Seconds on 2 quiet cores whose dense float32 products run at RATE (matmul_rate), from wall_s, wall_share and updates in results/quick/*/summary.json
+RATE = 440e9
+WATCH_S, ACT_S = 0.25e-3, 0.11e-3      # monitor; acting: per stream and control step, size1m
+PHYSICS_S = {"walker": 0.05e-3, "quadruped": 0.06e-3, "car": 0.0, "car_real": 0.06e-3}  # car: within acting; car_real: results/physics.json
+UPDATE_S = 0.07 / (4 * 64)             # per replayed step that an update trains on, size1m, every state an imagination start
+COMPILE_S = 35.0                       # programs of one part
 ADAPTS = 7_000                         # control steps that an adaptation with a stop rule lasted on walkers (results/walker_gear)
 
 
@@ -186,7 +187,7 @@ def estimate(part: Part, rate: float) -> Estimate:
   seconds = streams * c.steps * ((WATCH_S + ACT_S) * size + physics) + updates * batch * trained.length * UPDATE_S * share * size
   records = c.steps + 192
   need = memory.need(trained.size, len(spec.obs), len(spec.act), records, trained.bins)
-  return Estimate(streams, streams * c.steps, updates, COMPILE_S + seconds * 200e9 / rate, need.total(streams))
+  return Estimate(streams, streams * c.steps, updates, COMPILE_S + seconds * RATE / rate, need.total(streams))
 
 
 def estimates(parts) -> dict[str, Estimate]:

@@ -122,23 +122,6 @@ def joined(a, b):
   return jax.tree.map(lambda x, y: np.concatenate([x[:steps], y[:steps]], 1), a, b)
 
 
-def program(build):
-  """(thresholds (K,), residual (T, S)) -> (fired bool (K, T, S), score float32 (K, T, S)), jitted: the plain form that `passes` is held against."""
-  import jax
-  import jax.numpy as jnp
-
-  def run(thresholds, residual):
-    streams = residual.opr.shape[1]
-
-    def one(threshold):
-      detector = build(threshold)
-      start = jax.tree.map(lambda x: jnp.broadcast_to(x, (streams,) + jnp.shape(x)), detector.init())
-      alarm = jax.lax.scan(jax.vmap(detector.update), start, residual)[1]
-      return alarm.fired, alarm.score
-    return jax.vmap(one)(thresholds)
-  return jax.jit(run)
-
-
 def examine(one: Entry, data: Data, runner: passes.Runner, samples: passes.Samples) -> Found:
   """Calibrates a detector on one robot and runs it.
 
