@@ -7,7 +7,7 @@ from test_cli import mjx, refused  # noqa: F401  fixtures
 from test_leaderboard import submission, trailing
 from test_run import saved  # noqa: F401  a fixture
 
-from mjx_cl import leaderboard, recording, store, streams
+from mjx_cl import leaderboard, passes, recording, store, streams
 
 SUITE = """
 name = "mini"
@@ -115,13 +115,16 @@ def test_the_leaderboard_refuses(refused, recorded, tmp_path):
   assert "the board has a detector 'never' already" in refused(2, "leaderboard", recorded[0], "--detector", "never", "--add", "river.drift:PageHinkley", "--name", "never")
 
 
-def test_pure_detectors_do_not_look_ahead(recorded):
-  """Every entry of the board on a stream and on the same stream cut off: equal up to there."""
-  held = streams.StreamSet(recorded[0])
+@pytest.mark.parametrize("name", sorted(leaderboard.variants()))
+def test_pure_detectors_do_not_look_ahead(recorded, name):
+  """Every entry of the board on a stream and on the same stream with another end: equal up to there, in alarms and scores."""
   import jax
-  whole = held.get("walker", held.find("walker", "nominal", "score")).residual
-  cut = jax.tree.map(lambda x: x[:200], whole)
-  for name in ("cusum", "rolling_sigma_plain"):
-    run = leaderboard.program(leaderboard.entry(name, {}).build)
-    a, b = (run(np.full(1, 3.0, np.float32), x) for x in (whole, cut))
-    np.testing.assert_array_equal(np.asarray(a[0])[:, :200], b[0])
+  held = streams.StreamSet(recorded[0])
+  x = jax.tree.map(lambda x: x[:300, 0], held.get("walker", held.find("walker", "nominal", "score")).residual)
+  ends = lambda x: np.stack([x, np.concatenate([x[:200], x[200:][::-1]])])
+  assert (ends(x.opr)[0, 200:] != ends(x.opr)[1, 200:]).any()
+  detector = leaderboard.entry(name, leaderboard.variants()[name]).build(3.0)
+  run = jax.jit(jax.vmap(lambda xs: jax.lax.scan(passes.updates(detector), detector.init(), xs)[1]))
+  fired, scores = (np.asarray(r) for r in run(jax.tree.map(ends, x)))
+  np.testing.assert_array_equal(fired[0, :200], fired[1, :200])
+  np.testing.assert_array_equal(scores[0, :200], scores[1, :200])
