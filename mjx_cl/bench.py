@@ -23,11 +23,11 @@ from typing import NamedTuple
 from mjx_cl import store
 from mjx_cl.adapt.arms import ARMS, FOREVER
 from mjx_cl.config import AdaptConfig, RunConfig, becomes, replace
-from mjx_cl.errors import UserError
+from mjx_cl.errors import FileError, UserError
 
 SUITES = pathlib.Path(__file__).parent / "suites" / "bench"
 PUBLISHED = ("config.json", "events.parquet", "runs.parquet", "summary.json", "figure.png", "snapshots.parquet", "stop.parquet")
-MERGED = (*PUBLISHED, "trace.parquet", "residuals.parquet")
+MERGED = (*PUBLISHED, "trace.parquet", "residuals.parquet", "signals.parquet")
 
 # Seconds on 2 quiet cores whose dense float32 products run at RATE (matmul_rate), from wall_s, wall_share and updates in results/quick/*/summary.json
 RATE = 440e9
@@ -287,14 +287,21 @@ def scores(folder) -> dict:
     against_oracle: paired difference of `detector` and `oracle` in it (scoring.normalised.difference); null without both arms.
     recovery: arm -> Kaplan-Meier of the affected streams: n, recovered, median_steps, restricted_mean_steps up to HORIZON or to where the run ends, each with
       _ci; null without affected streams.
+    ablation: the stop rule with each signal left out (scoring.stop.ablated); only where an arm that never stops has adapted.
   """
-  from mjx_cl.scoring import normalised, recovery, survival
+  from mjx_cl.scoring import normalised, recovery, stop, survival
   config, rows = json.loads((folder / "config.json").read_text()), store.read_rows(folder / "runs.parquet")
   first, arms = [r for r in rows if not r["change"]], config["arms"]
   scored = normalised.rows(rows) if "none" in arms else []
   out = {"normalised": normalised.summarise(scored) or None, "against_oracle": None, "recovery": {}}
   if scored and {"detector", "oracle"} <= set(arms):
     out["against_oracle"] = normalised.difference(scored, "detector", "oracle")
+  if (folder / "signals.parquet").exists():
+    try:
+      out["ablation"] = stop.ablated(stop.ablation(folder))
+    except UserError as e:
+      if isinstance(e, FileError):
+        raise  # else no stream has adapted
   for arm in arms:
     own = [r for r in rows if r["arm"] == arm]
     if not any(r["affected"] for r in own if not r["change"]):
@@ -335,19 +342,39 @@ def collect(out: pathlib.Path, plan: Suite) -> dict:
   return value
 
 
+def write_plan(plan: Suite, out) -> None:
+  """OUT/suite.json: name and the resolved settings of every part."""
+  out = pathlib.Path(out)
+  out.mkdir(parents=True, exist_ok=True)
+  store.write_json(out / "suite.json", {"suite": plan.name, "parts": {p.name: json.loads(json.dumps(dataclasses.asdict(p.config))) for p in plan.parts}})
+
+
 def execute(plan: Suite, out, parts, estimates: dict[str, Estimate] | None = None, tell: Callable[[str], None] = lambda text: None,
-            display=None, save_every_s: float = 60.0) -> dict:
+            display=None, save_every_s: float = 60.0, jobs: int = 1) -> dict:
   """Runs the parts that are not finished, in order; one that was cut off goes on from its last checkpoint.
 
   Args:
     parts: of the plan, see `pick`. estimates: part -> Estimate, for the time left. display: context manager that gives run.execute's progress.
+    jobs: parts side by side, see workers.py, the longest first. The last digits of a run depend on how many cores it has.
   Returns:
     bench.json's value.
   """
-  from mjx_cl import run
+  from mjx_cl import run, workers
   out = pathlib.Path(out)
-  store.write_json(out / "suite.json", {"suite": plan.name, "parts": {p.name: json.loads(json.dumps(dataclasses.asdict(p.config))) for p in plan.parts}})
+  write_plan(plan, out)
   todo = [p for p in parts if not finished(out, p)]
+  if jobs > 1 and len(todo) > 1:
+    names = [p.name for p in todo]
+    if estimates:
+      names.sort(key=lambda name: -estimates[name].seconds)
+    over = []
+
+    def end(name):
+      over.append(name)
+      collect(out, plan)
+      tell(f"{name} finished, {len(over)} of {len(names)}")
+    workers.together(out, names, min(jobs, len(names)), end, tell)
+    return collect(out, plan)
   spent = expected = 0.0
   for i, part in enumerate(todo):
     guess = lambda p: estimates[p.name].seconds if estimates else 0.0

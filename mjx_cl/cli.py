@@ -214,6 +214,8 @@ class Bench:
   """Only print the plan."""
   shard: str = "0/1"
   """K/N: this machine runs every N-th part from the K-th on."""
+  jobs: int | None = None
+  """Parts side by side, each on its share of the cores; default: one per core as far as memory allows."""
   merge: tuple[str, ...] = ()
   """Folders of the same suite from other machines; their finished parts are copied here and not run."""
   publish: str | None = None
@@ -449,7 +451,7 @@ def summary_text(s: dict, out: str) -> str:
 
 
 def do_bench(args: Bench) -> None:
-  from mjx_cl import bench, memory
+  from mjx_cl import bench, memory, workers
   change = {k: v for k, v in (("seeds", args.seeds), ("first_seed", args.first_seed), ("arms", list(args.arm) or None),
                               ("physics", None if args.physics == "auto" else args.physics)) if v is not None}
   suite = bench.suite(args.suite, change)
@@ -472,9 +474,10 @@ def do_bench(args: Bench) -> None:
   for folder in args.merge:
     if not os.path.isdir(folder):
       raise UserError(f"--merge: no folder {folder}")
-  need, space = max((e.bytes for e in estimates.values()), default=0), int(memory.MARGIN * memory.free())
-  if need > space:
-    raise UserError(f"a part needs {need / 2**30:.1f} GiB, {space / 2**30:.1f} GiB may be used; fewer --seeds would fit")
+  needs, space = [estimates[p.name].bytes for p in parts if p.name not in done], int(memory.MARGIN * memory.free())
+  if max(needs, default=0) > space:
+    raise UserError(f"a part needs {max(needs) / 2**30:.1f} GiB, {space / 2**30:.1f} GiB may be used; fewer --seeds would fit")
+  jobs = workers.number(args.jobs, needs, space)
   try:
     out.mkdir(parents=True, exist_ok=True)
   except OSError as e:
@@ -483,7 +486,7 @@ def do_bench(args: Bench) -> None:
     say(line)
   for name in bench.take(out, parts, args.merge):
     say(f"{name}: taken over")
-  value = bench.execute(suite, out, parts, estimates, say, RunDisplay)
+  value = bench.execute(suite, out, parts, estimates, say, RunDisplay, jobs=jobs)
   if args.publish:
     bench.publish(out, suite.parts, args.publish)
   if args.json:
@@ -849,32 +852,44 @@ def parse(argv: list[str] | None):
     raise UserError(re.sub(r"\s+", " ", " ".join(words)) or "wrong arguments; see mjx-cl --help") from None
 
 
-def main(argv: list[str] | None = None) -> int:
-  """Entry point of `mjx-cl`."""
+def attempt(do, again=lambda: "") -> int:
+  """Exit status of `do()`; what goes wrong becomes one line on standard error, an interrupt one that ends in `again()`."""
   def stop(*_):
     raise KeyboardInterrupt
   signal.signal(signal.SIGTERM, stop)
-  command = None
   try:
-    command = parse(argv)
-    if not isinstance(command, (Plot, Query, Report)):
-      from mjx_cl import runtime
-      runtime.setup()
-    DO[type(command)](command)
+    do()
     return 0
   except UserError as e:
     say(f"mjx-cl: {' '.join(str(e).split())}")
     return e.exit_code
   except KeyboardInterrupt:
-    kind = type(command) if command else None
-    say("mjx-cl: interrupted" + ("; what was saved can be resumed with --resume" if kind in (Run, Train) else
-                                 "; the same command goes on where it stopped" if kind in (Record, Bench) else ""))
+    say(f"mjx-cl: interrupted{again()}")
     return 130
   except BrokenPipeError:
     return 0
   except OSError as e:
     say(f"mjx-cl: {e.strerror or e}{f': {e.filename}' if e.filename else ''}")
     return FileError.exit_code
+
+
+def main(argv: list[str] | None = None) -> int:
+  """Entry point of `mjx-cl`."""
+  command = None
+
+  def do():
+    nonlocal command
+    command = parse(argv)
+    if not isinstance(command, (Plot, Query, Report)):
+      from mjx_cl import runtime
+      runtime.setup()
+    DO[type(command)](command)
+
+  def again():
+    kind = type(command) if command else None
+    return "; what was saved can be resumed with --resume" if kind in (Run, Train) else \
+           "; the same command goes on where it stopped" if kind in (Record, Bench) else ""
+  return attempt(do, again)
 
 
 if __name__ == "__main__":

@@ -103,6 +103,8 @@ class TrainConfig:
     shake: probability that a stretch of 16 control steps is driven by one random action, on `shake_share` of the robots: stumbles and falls
       to learn from. 0: never, as the authors.
     shake_share: share of the robots that are shaken; the return of the others is the one reported.
+    fault, severity: domain randomisation: each episode of each robot draws a target of this fault and a severity, uniform in [0, `severity`], anew.
+      None: healthy robots.
   """
   envs: int = 16
   updates: int = 500_000
@@ -121,10 +123,12 @@ class TrainConfig:
   pure: int = 6000
   shake: float = 0.0
   shake_share: float = 0.5
+  fault: str | None = None
+  severity: float = 1.0
 
   def __post_init__(self):
     positive(self, "envs", "updates", "ratio", "capacity", "repeat")
-    fraction(self, "demo_share", "clone_until", "shake", "shake_share")
+    fraction(self, "demo_share", "clone_until", "shake", "shake_share", "severity")
     if self.demonstrator and self.clone + self.fade + self.pure > self.updates:
       raise UserError(f"clone + fade + pure = {self.clone + self.fade + self.pure} exceeds updates = {self.updates}")
 

@@ -299,10 +299,10 @@ def experiments(results: pathlib.Path) -> str:
       (heads[name] if not k else "", *line, own[name] if not k else "") for name, k, line in rows])
 
 
-def arms(results: pathlib.Path) -> str:
-  """The arms of the paper's suite side by side: recovery, what it is worth, what it cost."""
+def arms(results: pathlib.Path, suite: str = "paper") -> str:
+  """The arms of a suite side by side, of the paper's: recovery, what it is worth, what it cost."""
   rows, pairs = [], []
-  for part, entry in load(results / "paper" / "bench.json")["entries"].items():
+  for part, entry in load(results / suite / "bench.json")["entries"].items():
     scores = entry["scores"]
     for k, (arm, own) in enumerate(entry["arms"].items()):
       back, worth = scores["recovery"][arm], (scores["normalised"] or {}).get(arm)
@@ -321,8 +321,57 @@ def arms(results: pathlib.Path) -> str:
   return text + "\n\n" + grid(("experiment", "arm", "recovered", "median [steps]", "restricted mean [steps]", "normalised recovery", "updates", "falls"), rows)
 
 
+def other_arms(results: pathlib.Path) -> str:
+  """`arms` of the suite of that name."""
+  return arms(results, "arms")
+
+
+def stop_rule(results: pathlib.Path) -> str:
+  """When the stop rule ended finetuning, against the oracle stop; and when it would have with a signal left out."""
+  rows, without, first = [], [], None
+  for part, entry in load(results / "stop" / "bench.json")["entries"].items():
+    first = first or entry["stop_rule"]
+    for arm, own in entry["stop_rule"]["arms"].items():
+      told = sum(own[k] for k in ("aborted_unrecoverable", "aborted_recoverable", "ended_unrecoverable"))
+      rows.append((f"`{part}`", arm, f"{own['ended']} of {own['adaptations']}", both(own, "steps_after_oracle_median"), f"{own['early']} of {own['ended']}",
+                   *(f"{percent(own[k], 1)} {percents(own[k + '_ci'], 1)} %" if k == "lost_share" else both(own, k, 2) for k in ("return_lost", "lost_share")),
+                   both(own, "updates_wasted_mean"), f"{own['aborted_unrecoverable']} right, {told - own['aborted_unrecoverable']} wrong"))
+    for name, own in entry["scores"]["ablation"].items():
+      without.append((f"`{part}`" if not name else "", f"`{name}`" if name else "none", f"{own['converged']} of {own['adaptations']}", str(own["aborted"]),
+                      both(own, "own_stop_steps_median"), f"{own['early']} of {own['judged']}",
+                      "-" if own["lost_share"] is None else f"{percent(own['lost_share'], 1)} {percents(own['lost_share_ci'], 1)} %"))
+  text = fill(f"""
+      The oracle stop is the earliest snapshot whose frozen episodes on the broken robot reach {percent(first['share'])} % of the best snapshot's. Medians and
+      interquartile means with 95 % bootstrap intervals over streams; an adaptation that never ended counts as later than all others. Return lost is the best
+      snapshot's reward less that of the stop, per control step, and as a share of the former: an upper bound, since the best of many noisy snapshots is the luckiest too.""")
+  more = fill("""
+      The rule lived again over the recorded signals of the adaptations that never stop, with each signal left out: how many converge, abort, and
+      when.""")
+  return "\n\n".join([text, grid(("fault", "arm", "ended", "steps after the oracle stop", "earlier than it", "return lost a step", "share of the best", "updates wasted",
+                                   "aborts and ends, by the label"), rows), more,
+                      grid(("fault", "left out", "converged", "aborted", "median stop [steps]", "earlier than the oracle", "share of the best lost"), without)])
+
+
+def again(results: pathlib.Path) -> str:
+  """A fault, its repair, the same fault once more: what each arm does at each of the three."""
+  rows, words = [], ("the fault", "its repair", "the fault again")
+  entries = load(results / "again" / "bench.json")["entries"]
+  for part, entry in entries.items():
+    for change, (what, arms_) in enumerate(zip(words, [entry["arms"], *entry["later_changes"]])):
+      for k, (arm, own) in enumerate(arms_.items()):
+        rows.append((f"`{part}`, {what}" if not k else "", arm, f"{own['alarms']} of {own['seeds']}", both(own, "latency_median_steps"),
+                     f"{own['recovered']} of {own['affected']}", both(own, "recovery_median_steps"), both(own, "reward_pre", 2), both(own, "reward_final", 2),
+                     number(own["updates_mean"])))
+  text = fill("""
+      Streams that alarm and when; affected streams (whose reward falls by a tenth; after the first change judged by the stream's own first 2,000 steps) that
+      recover and when; reward a step before the change and over the last 2,000 steps before the next one; updates a stream. Medians are censored, rewards interquartile means, with 95 %
+      bootstrap intervals over streams.""")
+  return text + "\n\n" + grid(("change", "arm", "alarm", "after [steps]", "recovered", "median [steps]", "reward before", "reward at the end", "updates"), rows)
+
+
 BLOCKS = {"run-walker": run_walker, "arl0": arl0, "leaderboard": leaderboard, "physics": physics, "dreamer": dreamer, "agents": agents,
-          "detectors": detectors, "paper": experiments, "arms": arms}
+          "detectors": detectors, "paper": experiments, "arms": arms,
+          "other-arms": other_arms, "stop-rule": stop_rule, "again": again}
 
 
 # ---- README ----------------------------------------------------------------------------------------------------------------------

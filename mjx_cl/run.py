@@ -30,7 +30,7 @@ from mjx_cl.adapt.arms import ARMS, FOREVER, NEVER, never_stops
 from mjx_cl.adapt.convergence import SIGNALS
 from mjx_cl.adapt.loop import Choices, Loop, LoopState, choices
 from mjx_cl.config import RunConfig, becomes, changes
-from mjx_cl.errors import FileError
+from mjx_cl.errors import FileError, UserError
 from mjx_cl.interrupt import Interruptible
 from mjx_cl.monitor import Monitor
 from mjx_cl.rollout import Rollout, Stream, nest, start
@@ -100,7 +100,7 @@ class Runner:
     self.breaks = np.asarray([ARMS[arm].breaks for arm, _ in self.labels])
     keys = jnp.stack([jax.random.key(seed) for _, seed in self.labels])[:, None]
     self.keys = jax.vmap(lambda k: jax.random.fold_in(k, 7))(keys[:, 0])
-    self.state = State(nest(begin, (0, 0), (0, None))(keys, jnp.asarray(self.breaks)), self.loop.init(self.trained.train, self.groups))
+    self.state = State(nest(begin, (0, 0), (0, None))(keys, jnp.asarray(self.breaks)), self._own_agents(self.loop.init(self.trained.train, self.groups)))
     self.choices = self._choices(self.state.streams)
     self.done_chunks = 0
     self.seconds = {"physics": 0.0, "acting": 0.0, "digest": 0.0, "other": 0.0}
@@ -114,6 +114,28 @@ class Runner:
     self.endless = any(never_stops(ARMS[arm]) for arm in config.arms)
     self.snapshots = Snapshots(config, self.robots[-1], agent, self.faults, self.changes, self.repeat, self.labels, self.trained.train.params,
                                self.work / "snapshots") if config.snapshots else None
+
+  def _own_agents(self, state):
+    """`state` with the weights of those arms that bring an agent of their own; `others`: their cards.
+
+    Raises:
+      UserError where there is no such agent, or it is of another size or acts at another rate.
+    """
+    self.others = {}
+    for arm in dict.fromkeys(a for a, _ in self.labels if ARMS[a].agent):
+      name = f"{self.trained.path if self.config.agent and pathlib.Path(self.config.agent).exists() else pathlib.Path(self.trained.path).name}-{ARMS[arm].agent}"
+      c, spec = self.trained.agent.config, self.env.spec
+      try:
+        other = agents.load(name, self.config.env, len(spec.obs), len(spec.act))
+      except UserError as e:
+        raise UserError(f"arm {arm!r}: {e}") from None
+      if (other.agent.config.size, other.agent.config.obs_scale, int(other.card.get("repeat", 1))) != (c.size, c.obs_scale, self.repeat):
+        raise UserError(f"arm {arm!r}: agent {name!r} differs from the run's in size, obs_scale or repeat")
+      self.others[arm] = other.card
+      own = jnp.asarray([a == arm for a, _ in self.labels])
+      put = lambda old, new: jnp.where(own.reshape((-1,) + (1,) * (old.ndim - 1)), new.astype(old.dtype), old)
+      state = state._replace(train=jax.tree.map(put, state.train, other.train), acting=jax.tree.map(put, state.acting, other.train.params))
+    return state
 
   def open(self) -> None:
     """Makes the working folder; before that nothing in `out` is touched."""
@@ -268,7 +290,7 @@ class Runner:
     """What config.json holds."""
     return {"command": "run", **json.loads(json.dumps(dataclasses.asdict(self.config))),
             "physics": "+".join(dict.fromkeys(robot.physics.name for robot in self.robots)),
-            "agent_card": self.trained.card, "agent_path": pathlib.Path(self.trained.path).name, "repeat": self.repeat,
+            "agent_card": self.trained.card, "arm_cards": self.others, "agent_path": pathlib.Path(self.trained.path).name, "repeat": self.repeat,
             "control_s": self.env.spec.control_s, **store.provenance()}
 
   def finish(self) -> dict:
@@ -393,7 +415,7 @@ class Runner:
       if arm == "none":
         drop[seed] = recovery.reward_drop(reward, onset, pre[g]) if c.fault != "none" and onset < c.steps else None
     for g, (arm, seed) in enumerate(self.labels):  # no alarm ends the window of an arm that does not listen: the same life goes on in arm `none`
-      if not ARMS[arm].trigger.listens and ("none", seed) in self.labels:
+      if not ARMS[arm].trigger.listens and not ARMS[arm].agent and ("none", seed) in self.labels:
         pre[g] = pre[self.labels.index(("none", seed))]
     for g, (arm, seed) in enumerate(self.labels):
       for change, onset in enumerate(changes[g]):
@@ -544,7 +566,6 @@ def clear(out: pathlib.Path) -> None:
 
 def check_same(out: pathlib.Path, values: dict) -> None:
   """Refuses to resume with other settings than the run began with."""
-  from mjx_cl.errors import UserError
   try:
     old = json.loads((out / "config.json").read_text())
   except ValueError:

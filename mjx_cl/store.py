@@ -200,7 +200,8 @@ def _describe(db, name: str) -> tuple[str, int, str]:
 
 
 def provenance() -> dict:
-  """Versions, machine and commit of this process, for config.json."""
+  """Versions, machine and commit of this process, for config.json; cores: those that it may use."""
+  from mjx_cl import workers
   versions = {}
   for name in PACKAGES:
     try:
@@ -208,7 +209,7 @@ def provenance() -> dict:
     except importlib.metadata.PackageNotFoundError:
       versions[name] = None
   return {"versions": versions, "python": platform.python_version(), "git_commit": _commit(),
-          "machine": {"cpu": _cpu(), "cores": os.cpu_count(), "system": platform.system(), "arch": platform.machine()}}
+          "machine": {"cpu": _cpu(), "cores": len(workers.cores()), "system": platform.system(), "arch": platform.machine()}}
 
 
 def _commit() -> str | None:

@@ -23,6 +23,7 @@ from mjx_cl.rollout import Rollout, Stream, nest, records, start
 
 CHUNK = 64  # decisions between two rounds of updates
 DEMONSTRATOR_STEPS = 8_000_000
+FAULT = 11  # folded into a stream's key for the draw of its faults
 
 
 class Learner(NamedTuple):
@@ -134,7 +135,7 @@ class Trainer:
     memory.check(dreamer.size, len(spec.obs), len(spec.act), config.envs * config.capacity, seeds, ("capacity", config.envs), dreamer.bins,
                  1 if self.mesh is None else self.mesh.size)
     self.failed: dict[int, str] = {}  # seed -> the term that was not finite, and when
-    fault = faults.make("none", env)
+    fault = faults.make(config.fault or "none", env)
     self.collect = {"pure": Rollout(env, self.plain, fault, config.repeat)}
     self.learn = {"pure": make_learn(self.plain, dreamer.batch, dreamer.length, self.mesh)}
     if self.expert:
@@ -147,12 +148,14 @@ class Trainer:
     agent, size = self.plain, self.plain.size
     train = jax.vmap(agent.init)(jax.random.split(key_init, seeds))
     keys = jax.random.split(key_stream, (seeds, config.envs))
-    streams = nest(lambda k: start(env, agent, fault, k), 0, 0)(keys)
+    self.fault = fault if config.fault else None
+    streams = nest(lambda k: start(env, agent, fault, k, plan=self._drawn(k)), 0, 0)(keys)
     empty = replay_lib.init(config.envs, config.capacity, len(spec.obs), len(spec.act), size.deter, size.stoch)
     replay = jax.tree.map(lambda x: jnp.broadcast_to(x, (seeds,) + x.shape).copy(), empty)
     self.state = self._place(Learner(train, streams, replay, key))
     self.returns = Returns((seeds, config.envs))
     self._add = jax.jit(jax.vmap(replay_lib.add), donate_argnums=0)
+    self._redraw = jax.jit(nest(self._new_fault, 0, 0))
     self.checkpoints = checkpoint.Checkpoints(self.out / "checkpoints")
 
   # ---- phases --------------------------------------------------------------------------------------------------------------------
@@ -206,6 +209,16 @@ class Trainer:
   def _enter(self, phase: str) -> None:
     self.phase, self.phase_start = phase, self.updates
 
+  def _drawn(self, key) -> faults.Plan:
+    """A severity from the stream's key, from the first step on; none without `config.fault`."""
+    return faults.plan(self.config.severity * jax.random.uniform(jax.random.fold_in(key, FAULT)) if self.config.fault else 0.0)
+
+  def _new_fault(self, stream: Stream, ended) -> Stream:
+    """`stream` with another target and severity where its episode `ended`: what it draws follows from its key and its clock."""
+    key = jax.random.fold_in(jax.random.fold_in(stream.key, FAULT), stream.t)
+    fresh = faults.begin(self.fault, key, self._drawn(key))
+    return stream._replace(injection=jax.tree.map(lambda a, b: jnp.where(ended, jnp.asarray(a, b.dtype), b), fresh, stream.injection))
+
   # ---- one chunk -----------------------------------------------------------------------------------------------------------------
 
   def step(self) -> dict:
@@ -217,6 +230,8 @@ class Trainer:
       params = jax.device_put(params, jax.devices()[0])
       kept = lambda rows: jax.device_put(records(rows), jax.tree.leaves(self.state.replay)[0].sharding)
     streams, rows = self.collect[self.phase].chunk(params, self.state.streams, CHUNK, drive, shake)
+    if self.fault is not None:
+      streams = self._redraw(streams, jnp.any(rows.terminated | rows.truncated, 0))
     replay = self._add(self.state.replay, *kept(rows))
     self.state = self.state._replace(streams=streams, replay=replay)
     expert_returns, own, each = [], [], {g: [] for g in range(self.seeds)}

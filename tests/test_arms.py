@@ -2,6 +2,7 @@
 import dataclasses
 import functools
 import json
+import shutil
 import types
 from typing import NamedTuple
 
@@ -23,10 +24,11 @@ from mjx_cl.envs.walker import Walker
 from mjx_cl.errors import UserError
 from mjx_cl.monitor import Monitor
 from mjx_cl.rollout import Row
-from mjx_cl.scoring import recovery
+from mjx_cl.scoring import normalised, recovery
 
 FOUR = ("detector", "none", "oracle", "no-fault")  # as many streams as are computed alike to the last bit, see run.Runner
-NAMES = ("detector", "none", "always", "periodic", "random", "oracle", "oracle-budget", "scratch", "world-model", "no-fault")
+NAMES = ("detector", "none", "always", "periodic", "random", "oracle", "oracle-budget", "scratch", "world-model", "randomised",
+         "no-fault")
 
 
 # ---- table ---------------------------------------------------------------------------------------------------------------------------
@@ -42,14 +44,14 @@ def test_choices_of_all_arms():
   at = {name: sorted(int(s) for s in row.at if s < FOREVER) for name, row in rows.items()}
   drawn = at.pop("random")
   assert at == {"detector": [], "none": [], "always": [1000], "periodic": [400, 800, 1200], "oracle": [1000, 1200],  # the warm-up comes first
-                "oracle-budget": [1000, 1200], "scratch": [1000, 1200], "world-model": [], "no-fault": []}
+                "oracle-budget": [1000, 1200], "scratch": [1000, 1200], "world-model": [], "randomised": [], "no-fault": []}
   assert len(drawn) == 1 and 1000 <= drawn[0] <= 1440
   on = lambda field: {name for name, row in rows.items() if getattr(row, field)}
   assert on("listens") == {"detector", "world-model", "no-fault"} and on("world_only") == {"world-model"} and on("fresh") == {"scratch"}
   assert choices([("detector", 0), ("none", 0)], c, 1500).fresh is None
   assert on("rule") == {"detector", "oracle", "scratch", "world-model", "no-fault"}
   assert {name: int(row.limit) for name, row in rows.items()} == dict.fromkeys(NAMES, 777) | {
-      "none": FOREVER, "always": FOREVER, "periodic": 30, "random": 60}
+      "none": FOREVER, "always": FOREVER, "randomised": FOREVER, "periodic": 30, "random": 60}
   assert [name for name, arm in ARMS.items() if not arm.breaks] == ["no-fault"]
 
 
@@ -188,7 +190,7 @@ def spans(story):
   return {"detector": heard, "none": [], "always": [(20, 1, None, None)], "periodic": [(80, 5, 7, END), (160, 10, 12, END), (240, 15, None, None)],
           "random": [(drawn, drawn // STEPS, over, END)], "oracle": true, "oracle-budget": [(60, 3, 9, END)],
           "scratch": [(60, 3, 8, STOP)],  # first update in chunk 5, at learning rate 0 of its warm-up: fresh heads say 0 in 4, 5 and 6
-          "world-model": heard, "no-fault": heard}
+          "world-model": heard, "randomised": [], "no-fault": heard}
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -226,7 +228,7 @@ def test_replay_and_updates(story, name):
     assert replay.count[0] == len(records), c
     np.testing.assert_array_equal(replay.data.obs[0, :len(records), 0], records)
     assert of(story.digests[c].updates, name) == total, c
-  assert (total > 0) == (name != "none")
+  assert (total > 0) == (name not in ("none", "randomised"))
 
 
 def test_the_world_model_alone_learns(story, same):
@@ -290,11 +292,13 @@ def lived(tiny, tmp_path_factory):
   patch = pytest.MonkeyPatch()
   patch.setitem(envs.ENVS, "walker", Easy)
   agent = tmp_path_factory.mktemp("arms") / "agent"
-  agents.save(agent, jax.jit(tiny.init)(jax.random.key(0)), {"env": "walker", "preset": "tiny", "repeat": 1, "dreamer": dataclasses.asdict(tiny.config)})
+  card = {"env": "walker", "preset": "tiny", "repeat": 1, "dreamer": dataclasses.asdict(tiny.config)}
+  for path, seed in ((agent, 0), (agent.with_name("agent-randomised"), 1)):
+    agents.save(path, jax.jit(tiny.init)(jax.random.key(seed)), card | {"seed": seed})
 
   @functools.cache
-  def make(arms, cut=None):
-    out, config = tmp_path_factory.mktemp("arms") / "out", RunConfig(**CONFIG, arms=arms, agent=str(agent))
+  def make(arms, cut=None, suffix=""):
+    out, config = tmp_path_factory.mktemp("arms") / "out", RunConfig(**CONFIG, arms=arms, agent=str(agent) + suffix)
     if cut is not None:  # cut off after `cut` chunks
       runner = run.Runner(config, out)
       out.mkdir(exist_ok=True)
@@ -326,7 +330,7 @@ def test_events_say_what_started_and_ended_each_arm(lived):
   out = lived(NAMES)
   drawn = int(choices([("random", SEED)], CONFIG["adapt"], LIFE).at.min())
   want = {"always": ["end of the warm-up at step 100"], "periodic": ["schedule at step 250", "schedule at step 500"], "random": [f"random time at step {drawn}"],
-          "oracle": ["true onset at step 300"], "oracle-budget": ["true onset at step 300"], "scratch": ["true onset at step 300"], "none": []}
+          "oracle": ["true onset at step 300"], "oracle-budget": ["true onset at step 300"], "scratch": ["true onset at step 300"], "none": [], "randomised": []}
   for name, reasons in want.items():
     assert [r for _, r in events(out, name, "start")] == reasons, name
   for name in ("detector", "world-model", "no-fault"):
@@ -371,8 +375,8 @@ def test_what_false_alarms_cost(lived):
     begun = [int(r.split()[-1]) for _, r in events(out, name, "start")]
     row = {k: v[0] for k, v in columns(out, "runs", name).items()}
     end = LIFE if name == "no-fault" else FAULT
-    window = min([end] + begun) if ARMS[name].trigger.listens else FAULT  # arms that do not listen have arm none's
-    source = reward if ARMS[name].trigger.listens else np.array(columns(out, "trace", "none")["reward"])
+    window = min([end] + begun) if ARMS[name].trigger.listens else FAULT  # arms that do not listen have arm none's, unless they bring an agent
+    source = reward if ARMS[name].trigger.listens or ARMS[name].agent else np.array(columns(out, "trace", "none")["reward"])
     assert row["reward_pre"] == pytest.approx(source[WARMUP:window].mean()), name
     want = (row["reward_pre"] - reward[begun[0]:end]).sum() if begun and begun[0] < end else 0.0
     assert row["return_lost_healthy"] == pytest.approx(want), name
@@ -388,12 +392,36 @@ def test_the_ledger_of_each_arm(lived):
   for name in NAMES:
     trace, row, arm = columns(out, "trace", name), {k: v[0] for k, v in columns(out, "runs", name).items()}, summary["arms"][name]
     assert row["adapted_steps"] == trace["phase"].count("adapting") and row["updates"] >= max(trace["updates"]) and row["updates"] % 1 == 0
-    assert (row["updates"] > 0) == (name != "none")
+    assert (row["updates"] > 0) == (name not in ("none", "randomised"))
     for key in ("updates", "adapted_steps", "terminations", "return_lost_healthy"):
       assert arm[f"{key}_mean"] == row[key] and arm[f"{key}_mean_ci"] is None  # one stream has no interval
   wall = {name: columns(out, "runs", name)["wall_s"][0] for name in NAMES}
   assert summary["wall_s_arms"] == wall
-  assert wall["always"] == max(wall.values()) and wall["none"] == min(wall.values())  # updates are paid by those who take them
+  assert wall["always"] == max(wall.values()) and wall["none"] == wall["randomised"] == min(wall.values())  # updates are paid by those who take them
+
+
+def test_an_arm_with_an_agent_of_its_own(lived):
+  """It lives as a run whose agent that is, the others as they do without it; the card is kept."""
+  out, whole = lived(("none", "randomised")), lived(NAMES)
+  folder = json.loads((out / "config.json").read_text())
+  assert folder["agent_card"]["seed"] == 0 and {k: v["seed"] for k, v in folder["arm_cards"].items()} == {"randomised": 1}
+  other = lived(("none",), suffix="-randomised")
+  mine, same, first = columns(out, "trace", "randomised"), columns(other, "trace", "none"), columns(out, "trace", "none")
+  # a product of one row and of two may be summed in another order, which hundreds of steps of a walker let grow
+  np.testing.assert_allclose(mine["reward"][:50], same["reward"][:50], atol=1e-3)
+  assert np.abs(np.subtract(mine["reward"][:50], first["reward"][:50])).max() > 0.02
+  assert "randomised" in {r["arm"] for r in normalised.of_folders(whole)} and len({r["reward_none"] for r in normalised.of_folders(whole)}) == 1
+  assert normalised.of_folders(whole)[0]["reward_none"] == columns(whole, "runs", "none")["reward_final"][0]
+
+
+def test_an_arm_without_its_agent_is_refused(tiny, tmp_path):
+  config = RunConfig("walker", fault="gear", steps=300, onset=200, seeds=1, arms=("randomised",))
+  with pytest.raises(UserError, match="arm 'randomised': no agent 'quadruped-randomised'; shipped: .*walker"):
+    run.Runner(dataclasses.replace(config, env="quadruped"), tmp_path)
+  agents.save(tmp_path / "walker-randomised", jax.jit(tiny.init)(jax.random.key(0)), {"env": "walker", "dreamer": dataclasses.asdict(tiny.config)})
+  shutil.copytree(agents.HERE / "walker", tmp_path / "walker")
+  with pytest.raises(UserError, match="arm 'randomised': agent .*walker-randomised' differs from the run's in size"):
+    run.Runner(dataclasses.replace(config, agent=str(tmp_path / "walker")), tmp_path / "out")
 
 
 @pytest.mark.slow  # bit for bit only where a product's rows do not depend on how many there are

@@ -188,7 +188,7 @@ def test_parts_run_once_go_on_and_merge(mjx, refused, mini, tmp_path, monkeypatc
   assert not (out / "grip/severity=0.5/summary.json").exists()
   lived = []
   monkeypatch.setattr(run.Runner, "step", lambda self: lived.append(self.done_chunks) or step(self))
-  assert mjx("bench", mini, "--out", out, "--only", "grip")[0] == 0
+  assert mjx("bench", mini, "--out", out, "--only", "grip", "--jobs", "1")[0] == 0
   assert lived == [1, 2] + [0, 1, 2]  # the part that was cut off goes on, the other begins
   del begun[:], lived[:]
 

@@ -29,6 +29,9 @@ SOURCES = {
     "detectors": ("detectors.json",),
     "paper": tuple(f"paper/{robot}/{file}" for robot in ("walker", "quadruped", "car") for file in ("config.json", "summary.json", "runs.parquet")),
     "arms": ("paper/bench.json",),
+    "other-arms": ("arms/bench.json",),
+    "stop-rule": ("stop/bench.json",),
+    "again": ("again/bench.json",),
 }
 ALL = [(name, file) for name, files in SOURCES.items() for file in files]
 
@@ -54,7 +57,7 @@ def write(path, rows):
 def results(tmp_path):
   """A copy of results/ in which no file of any block is missing: the experiments of the paper are the walker's run, the car's with two changes."""
   out = tmp_path / "results"
-  shutil.copytree(RESULTS, out, ignore=shutil.ignore_patterns("*.png", "*.html", "paper", "detectors.json"))
+  shutil.copytree(RESULTS, out, ignore=shutil.ignore_patterns("*.png", "*.html", "paper", "arms", "stop", "again", "detectors.json"))
   rows = [{"name": "cusum: 1000 streams", "value": 0.4567, "unit": "s", "goal": "<= 1", "holds": True},
           {"name": "adwin: 1000 streams", "value": 23.4, "unit": "s", "goal": "<= 20", "holds": False},
           {"name": "ewma: a sample", "value": 1234.5, "unit": "ns", "goal": None, "holds": None}]
@@ -74,7 +77,18 @@ def results(tmp_path):
   entry = {"arms": {arm: summary["arms"][arm] | {"updates_mean": 232.4, "terminations_mean": 3.21} for arm in ("detector", "none")}, "scores": {
       "normalised": {"detector": worth, "none": worth | {"normalised": 0.012}}, "recovery": {"detector": back, "none": None},
       "against_oracle": {"seeds": 8, "difference": -0.067, "difference_ci": [-0.189, 0.045], "holds_zero": True}}}
-  (out / "paper/bench.json").write_text(json.dumps({"suite": "paper", "parts": 1, "finished": 1, "entries": {"walker": entry}}))
+  both = lambda name, value: {name: value, name + "_ci": [0.9 * value, 1.1 * value]}
+  judged = {"adaptations": 9, "never_begun": 1, "ended": 8, **both("early", 3), **both("steps_after_oracle_median", 2345.0), **both("return_lost", 0.12),
+            **both("lost_share", 0.034), **both("updates_wasted_mean", 56.7), **both("aborted_unrecoverable", 2), **both("aborted_recoverable", 1),
+            **both("ended_unrecoverable", 1)}
+  left_out = {name: {"adaptations": 9, "converged": n, "aborted": 9 - n, **both("own_stop_steps_median", 6789.0 + n), "judged": 7, "early": 4,
+                     **both("lost_share", 0.056)} for n, name in enumerate(("", "reward"), 6)}
+  arms = {arm: entry["arms"][arm] | both("recovery_median_steps", 3333.0) for arm in entry["arms"]}
+  entries = {"paper": entry, "arms": entry, "again": entry | {"arms": arms, "later_changes": [arms, arms]},
+             "stop": {"stop_rule": {"share": 0.95, "arms": {"oracle": judged}}, "scores": {"ablation": left_out}}}
+  for suite, value in entries.items():
+    (out / suite).mkdir(exist_ok=True)
+    (out / suite / "bench.json").write_text(json.dumps({"suite": suite, "parts": 1, "finished": 1, "entries": {"walker": value}}))
   return out
 
 
@@ -250,6 +264,9 @@ CONSTANTS = {  # what a block says of itself: windows of the definitions, sizes 
              | {f"{e.onset:,}" for e in paper.EXPERIMENTS.values()}
              | {"16", "12", "4", "05"},  # the authors' batch, size and learning rate
     "arms": {"95", "1", "2,000", "10,000"},
+    "other-arms": {"95", "1", "2,000", "10,000"},
+    "stop-rule": {"95"},
+    "again": {"95", "2,000"},
 }
 
 

@@ -83,6 +83,35 @@ def test_resume_gives_the_same_bits(short_walker, tmp_path, same):
   assert timeless(second.rows) == timeless(whole.rows)
 
 
+def test_randomised_faults_are_drawn_anew_with_each_episode(short_walker, tmp_path, same):
+  """Targets and severities of 4 robots whose episodes last 12 of 64 steps: new ones each chunk, uniform below the given severity; the same after resume."""
+  make = lambda: train.Trainer(short_walker, DREAMER, TrainConfig(envs=40, updates=10_000, ratio=0.001, capacity=256, fault="gear", severity=0.5), tmp_path)
+  trainer, drawn = make(), []
+  severity = lambda t: np.asarray(t.state.streams.injection.plan.severity)[0, :, 0]
+  for k in range(3):
+    drawn.append(severity(trainer))
+    trainer.step()
+    if k == 1:
+      trainer.save()
+  drawn = np.array(drawn)
+  assert drawn.min() >= 0 and drawn.max() <= 0.5 and (np.diff(drawn, axis=0) != 0).all()
+  # 120 draws of a uniform: mean 0.25, its error 0.013; the largest of them below 0.45 with probability 0.9^120 = 3e-6
+  assert abs(drawn.mean() - 0.25) < 0.05 and drawn.max() > 0.45
+  assert set(np.asarray(trainer.state.streams.injection.target)[0, :, 0]) == set(range(6))  # (5 / 6)^40 = 7e-4 to miss a given joint
+  ended = np.zeros((1, 40), bool)
+  ended[0, 3] = True
+  some = trainer._redraw(trainer.state.streams, ended)
+  kept = np.arange(40) != 3
+  assert (severity(trainer)[kept] == np.asarray(some.injection.plan.severity)[0, kept, 0]).all() and severity(trainer)[3] != some.injection.plan.severity[0, 3, 0]
+  again = make()
+  again.collect, again.learn = trainer.collect, trainer.learn
+  again.resume()
+  again.step()
+  assert same(again.state, trainer.state)
+  with pytest.raises(UserError, match="unknown fault 'geer'"):
+    train.Trainer(short_walker, DREAMER, TrainConfig(fault="geer"), tmp_path)
+
+
 def test_resume_without_a_checkpoint(short_walker, tmp_path):
   with pytest.raises(FileError, match="no checkpoint"):
     make_trainer(short_walker, tmp_path).resume()

@@ -48,6 +48,7 @@ class Arm:
     world_only: the world model learns; actor, critic and all that belongs to them stay as they are.
     fresh: parameters, moments and counters are drawn anew from the stream's seed at every start. The latent that the robot carries runs on.
     breaks: the robot gets the run's faults; False: their severity is 0.
+    agent: what is joined to the name of the run's agent, after a hyphen, to give that of the arm's own; "": it is the run's.
   """
   about: str
   trigger: Trigger
@@ -55,6 +56,7 @@ class Arm:
   world_only: bool = False
   fresh: bool = False
   breaks: bool = True
+  agent: str = ""
 
 
 def _random(adapt, onsets, steps, seed):
@@ -103,5 +105,7 @@ ARMS: dict[str, Arm] = {
                          "stop is chosen afterwards", ONSET, BUDGET),
     "scratch": Arm("at the true onset all parameters are drawn anew; ends by the stop rule", ONSET, RULE, fresh=True),
     "world-model": Arm("as detector, but the world model alone learns; actor and critic stay", ALARM, RULE, world_only=True),
+    "randomised": Arm("no adaptation, an agent that was trained on randomised faults: ROBOT-randomised, or FOLDER-randomised beside an --agent FOLDER",
+                      NEVER, NO_END, agent="randomised"),
     "no-fault": Arm("as detector, on a robot that never breaks: what false alarms cost", ALARM, RULE, breaks=False),
 }

@@ -37,7 +37,7 @@ def rows(runs, expert=None, least: float = LEAST) -> list[dict]:
     None where undefined. Seeds that the expert did not live are left out.
   """
   first = [r for r in runs if not r.get("change")]
-  none = {r["seed"]: r for r in first if ARMS[r["arm"]].trigger is NEVER}
+  none = {r["seed"]: r for r in first if ARMS[r["arm"]].trigger is NEVER and not ARMS[r["arm"]].agent}
   word, reference = "reward_pre", {seed: r["reward_pre"] for seed, r in none.items()}
   if expert is not None:
     word, reference = "expert", {r["seed"]: r["reward_final"] for r in expert if not r.get("change")}

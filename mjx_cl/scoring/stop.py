@@ -207,6 +207,26 @@ def ablation(folder) -> list[dict]:
   return out
 
 
+def ablated(rows) -> dict:
+  """Aggregates of `ablation`: signal left out ("" none) -> {adaptations, converged, aborted, own_stop_steps_median, early, lost_share}.
+
+  own_stop_steps_median: of all adaptations, one that never ends counts as later than all others. early, lost_share: of those that ended and have
+  snapshots: stops before the oracle's, and IQM of the share of the best snapshot's reward that the stop gave up; each but the counts with _ci.
+  """
+  out = {}
+  for name in dict.fromkeys(r["left_out"] for r in rows):
+    own = [r for r in rows if r["left_out"] == name]
+    steps = [np.inf if r["own_stop_steps"] is None else r["own_stop_steps"] for r in own]
+    judged = [r for r in own if r["stop"] is not None and r.get("lost_share") is not None]
+    lost = [r["lost_share"] for r in judged]
+    out[name] = {"adaptations": len(own), "converged": sum(r["outcome"] == "converged" for r in own), "aborted": sum(r["outcome"] == "aborted" for r in own),
+                 "own_stop_steps_median": bootstrap.finite(bootstrap.censored_median(steps)),
+                 "own_stop_steps_median_ci": bootstrap.interval(steps, bootstrap.censored_median),
+                 "judged": len(judged), "early": sum(bool(r["early"]) for r in judged), "lost_share": float(bootstrap.iqm(lost)) if lost else None,
+                 "lost_share_ci": bootstrap.interval(lost) if lost else None}
+  return out
+
+
 def _relive(own, since, names, config):
   """Stream -> decisions (1 + 6, chunks) of the phase machine: with all signals, then with each left out."""
   import jax
