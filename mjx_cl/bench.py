@@ -5,7 +5,7 @@ AdaptConfig's, `settings` one of the detector's). A list where RunConfig takes o
 `severity = [0.25, 0.5]` with `adapt.ratio = [4, 16]` are four parts, NAME/severity=0.25,adapt.ratio=4 and so on. What is not given is RunConfig's default.
 
 OUT/suite.json holds the resolved parts; OUT/PART/ the result files of each; OUT/bench.parquet all rows of the finished parts' runs.parquet with their
-part in front, OUT/bench.json their summaries and what their arms say together (`scores`), OUT/recovery.png the Kaplan-Meier curves of recovery. Parts are independent: several machines share a suite by `shard`, and `merge` takes over what others finished.
+part in front, OUT/bench.json their summaries and what their arms say together (`scores`), OUT/recovery.png the Kaplan-Meier curves of recovery, OUT/ratio.png recovery against train ratio where a suite has several. Parts are independent: several machines share a suite by `shard`, and `merge` takes over what others finished.
 """
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from mjx_cl import store
-from mjx_cl.adapt.arms import ARMS, FOREVER
+from mjx_cl.adapt.arms import ARMS, FOREVER, ONSET
 from mjx_cl.config import AdaptConfig, RunConfig, becomes, replace
 from mjx_cl.errors import FileError, UserError
 
@@ -270,7 +270,7 @@ def publish(out: pathlib.Path, parts, to) -> list[str]:
         (to / part.name).mkdir(parents=True, exist_ok=True)
         store.atomic(to / part.name / name, lambda file, source=out / part.name / name: file.write(source.read_bytes()))
     done.append(part.name)
-  for name in ("suite.json", "bench.json", "bench.parquet", "recovery.png"):
+  for name in ("suite.json", "bench.json", "bench.parquet", "recovery.png", "ratio.png"):
     if done and (out / name).exists():
       store.atomic(to / name, lambda file, source=out / name: file.write(source.read_bytes()))
   return done
@@ -338,8 +338,17 @@ def collect(out: pathlib.Path, plan: Suite) -> dict:
     store.write_table(out / "bench.parquet", columns)
     from mjx_cl import plots
     plots.survival(out, list(value["entries"]))
+    plots.ratios(out, [p for part in plan.parts if part.name in value["entries"] for p in _points(part, value["entries"][part.name]["scores"])])
   store.write_json(out / "bench.json", value)
   return value
+
+
+def _points(part: Part, scores_: dict) -> list[dict]:
+  """What plots.ratios draws of a part: its arms that start at the true onset."""
+  c = part.config
+  return [{"line": f"{c.env}, {c.fault}" + ("" if c.severity is None else f" {c.severity:g}") + (f", {arm}" if sum(ARMS[a].trigger is ONSET for a in c.arms) > 1 else ""),
+           "ratio": c.adapt.ratio, "mean": own["restricted_mean_steps"], "ci": own["restricted_mean_steps_ci"], "n": own["n"], "recovered": own["recovered"]}
+          for arm, own in scores_["recovery"].items() if own and own["restricted_mean_steps"] is not None and ARMS[arm].trigger is ONSET]
 
 
 def write_plan(plan: Suite, out) -> None:

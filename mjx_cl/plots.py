@@ -134,3 +134,36 @@ def survival(out, parts: list[str], columns: int = 3) -> pathlib.Path | None:
   plt.close(fig)
   os.replace(tmp, out / "recovery.png")
   return out / "recovery.png"
+
+
+def ratios(out, points: list[dict]) -> pathlib.Path | None:
+  """Draws OUT/ratio.png: restricted mean time to recovery against train ratio, a line with 95 % intervals for each env, fault and severity.
+
+  Args:
+    points: {line, ratio, mean, ci (low, high) or None, n, recovered} of parts with affected streams.
+  Returns:
+    The file; None where no line has two ratios.
+  """
+  import matplotlib
+  matplotlib.use("Agg")
+  import matplotlib.pyplot as plt
+  out = pathlib.Path(out)
+  lines = {p["line"]: sorted((q for q in points if q["line"] == p["line"]), key=lambda q: q["ratio"]) for p in points}
+  if not any(len(own) > 1 for own in lines.values()):
+    return None
+  fig, axis = plt.subplots(figsize=(6, 4), constrained_layout=True)
+  for k, (line, own) in enumerate(lines.items()):
+    x, mean = np.array([p["ratio"] for p in own]) * 1.04 ** (k - (len(lines) - 1) / 2), np.array([p["mean"] for p in own])
+    ends = np.array([p["ci"] or (p["mean"], p["mean"]) for p in own], float).T
+    axis.errorbar(x, mean, np.maximum(0.0, [mean - ends[0], ends[1] - mean]), fmt="o-", capsize=3, color=f"C{k}", label=line)
+    for a, b, p in zip(x, mean, own):
+      axis.annotate(f"{p['recovered']}/{p['n']}", (a, b), textcoords="offset points", xytext=(5, 4), fontsize=7, color=f"C{k}")
+  axis.set(xscale="log", xlabel="train ratio (replayed steps per lived step)", ylabel="control steps to recovery, restricted mean", ylim=(0, None))
+  axis.set_xticks(sorted({p["ratio"] for p in points}), [f"{r:g}" for r in sorted({p["ratio"] for p in points})])
+  axis.minorticks_off()
+  axis.legend(fontsize=8)
+  tmp = out / "ratio.tmp.png"
+  fig.savefig(tmp, dpi=110)
+  plt.close(fig)
+  os.replace(tmp, out / "ratio.png")
+  return out / "ratio.png"

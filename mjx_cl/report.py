@@ -369,9 +369,29 @@ def again(results: pathlib.Path) -> str:
   return text + "\n\n" + grid(("change", "arm", "alarm", "after [steps]", "recovered", "median [steps]", "reward before", "reward at the end", "updates"), rows)
 
 
+def study(results: pathlib.Path) -> str:
+  """Recovery against train ratio and severity from a known onset."""
+  rows = []
+  plan = load(results / "study" / "suite.json")["parts"]
+  entries = load(results / "study" / "bench.json")["entries"]
+  for part, entry in sorted(entries.items(), key=lambda x: (plan[x[0]]["severity"], plan[x[0]]["adapt"]["ratio"])):
+    for arm, back in entry["scores"]["recovery"].items():
+      if not entry["arms"][arm]["updates_mean"]:
+        continue
+      own, worth = entry["arms"][arm], (entry["scores"]["normalised"] or {}).get(arm)
+      rows.append((f"{plan[part]['severity']:g}", f"{plan[part]['adapt']['ratio']:g}", str(own["seeds"]), f"{back['recovered']} of {back['n']}" if back else "none affected",
+                   both(back, "restricted_mean_steps") if back else "-",
+                   f"{both(worth, 'normalised', 2)}, {worth['seeds']} seeds" if worth and worth["seeds"] else "-", number(own["updates_mean"])))
+  done = f"{len(entries)} of {len(plan)} parts are finished." if len(entries) < len(plan) else ""
+  text = fill(f"""
+      Finetuning from the true onset for a fixed time ({', '.join(sorted({plan[p]['env'] + ', ' + plan[p]['fault'] for p in entries}))}): affected streams that recover, restricted
+      mean time to recovery, normalised recovery over the last 2,000 steps (0: no adaptation, 1: the reward before onset), updates a stream. {done}""")
+  return text + "\n\n" + grid(("severity", "train ratio", "seeds", "recovered", "restricted mean [steps]", "normalised recovery", "updates"), rows)
+
+
 BLOCKS = {"run-walker": run_walker, "arl0": arl0, "leaderboard": leaderboard, "physics": physics, "dreamer": dreamer, "agents": agents,
           "detectors": detectors, "paper": experiments, "arms": arms,
-          "other-arms": other_arms, "stop-rule": stop_rule, "again": again}
+          "other-arms": other_arms, "stop-rule": stop_rule, "again": again, "study": study}
 
 
 # ---- README ----------------------------------------------------------------------------------------------------------------------

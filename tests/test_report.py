@@ -32,6 +32,7 @@ SOURCES = {
     "other-arms": ("arms/bench.json",),
     "stop-rule": ("stop/bench.json",),
     "again": ("again/bench.json",),
+    "study": ("study/bench.json", "study/suite.json"),
 }
 ALL = [(name, file) for name, files in SOURCES.items() for file in files]
 
@@ -57,7 +58,7 @@ def write(path, rows):
 def results(tmp_path):
   """A copy of results/ in which no file of any block is missing: the experiments of the paper are the walker's run, the car's with two changes."""
   out = tmp_path / "results"
-  shutil.copytree(RESULTS, out, ignore=shutil.ignore_patterns("*.png", "*.html", "paper", "arms", "stop", "again", "detectors.json"))
+  shutil.copytree(RESULTS, out, ignore=shutil.ignore_patterns("*.png", "*.html", "paper", "arms", "stop", "again", "study", "detectors.json"))
   rows = [{"name": "cusum: 1000 streams", "value": 0.4567, "unit": "s", "goal": "<= 1", "holds": True},
           {"name": "adwin: 1000 streams", "value": 23.4, "unit": "s", "goal": "<= 20", "holds": False},
           {"name": "ewma: a sample", "value": 1234.5, "unit": "ns", "goal": None, "holds": None}]
@@ -86,6 +87,10 @@ def results(tmp_path):
   arms = {arm: entry["arms"][arm] | both("recovery_median_steps", 3333.0) for arm in entry["arms"]}
   entries = {"paper": entry, "arms": entry, "again": entry | {"arms": arms, "later_changes": [arms, arms]},
              "stop": {"stop_rule": {"share": 0.95, "arms": {"oracle": judged}}, "scores": {"ablation": left_out}}}
+  entries["study"] = entry
+  (out / "study").mkdir()
+  (out / "study/suite.json").write_text(json.dumps({"suite": "study", "parts": {"walker": {"env": "walker", "fault": "gear", "severity": 0.25,
+                                                                                            "adapt": {"ratio": 16.0}}}}))
   for suite, value in entries.items():
     (out / suite).mkdir(exist_ok=True)
     (out / suite / "bench.json").write_text(json.dumps({"suite": suite, "parts": 1, "finished": 1, "entries": {"walker": value}}))
@@ -163,7 +168,7 @@ def test_no_jax_is_imported():
 # ---- bad input -------------------------------------------------------------------------------------------------------------------
 
 @pytest.mark.parametrize("text, says", [
-    ("<!-- report:arl -->\n<!-- /report -->\n", "PAGE.md:1: unknown block 'arl'; choose from: agents, arl0,"),
+    ("<!-- report:arl -->\n<!-- /report -->\n", "PAGE.md:1: unknown block 'arl'; choose from: again, agents, arl0,"),
     ("\n<!-- report:arl0 -->\nx\n", "PAGE.md:2: block 'arl0' is not closed by <!-- /report -->"),
     ("<!-- report:arl0 -->\n<!-- report:physics -->\n<!-- /report -->\n", "PAGE.md:1: block 'arl0' is not closed"),
     ("a\n<!-- /report -->\n", "PAGE.md:2: <!-- /report --> closes nothing"),
@@ -267,6 +272,7 @@ CONSTANTS = {  # what a block says of itself: windows of the definitions, sizes 
     "other-arms": {"95", "1", "2,000", "10,000"},
     "stop-rule": {"95"},
     "again": {"95", "2,000"},
+    "study": {"1", "2,000"},
 }
 
 
