@@ -198,12 +198,13 @@ def estimates(parts) -> dict[str, Estimate]:
 
 def check(part: Part) -> None:
   """Refuses, before the suite starts, names and values that only the registries know: fault, target, detector, agent."""
-  from mjx_cl import detectors, envs, faults
+  from mjx_cl import detectors, envs, faults, run
   from mjx_cl.config import changes
   c = part.config
   try:
     detectors.make(c.detector, **c.settings)
     faults.build(changes(c), envs.make(becomes(c) or c.env, c.physics), c.onset)
+    run.arm_agents(c, envs.make(c.env, c.physics).spec)
   except UserError as e:
     raise UserError(f"part {part.name}: {e}") from None
 
@@ -316,8 +317,13 @@ def scores(folder) -> dict:
   return out
 
 
-def collect(out: pathlib.Path, plan: Suite) -> dict:
-  """Writes OUT/bench.parquet, OUT/bench.json and OUT/recovery.png from the finished parts and returns the second's value."""
+def collect(out: pathlib.Path, plan: Suite, known: dict | None = None) -> dict:
+  """Writes OUT/bench.parquet, OUT/bench.json, OUT/recovery.png and OUT/ratio.png from the finished parts and returns the second's value.
+
+  Args:
+    known: part -> scores, of those that an earlier call has read; filled here.
+  """
+  known = {} if known is None else known
   columns: dict[str, list] = {}
   value = {"suite": plan.name, "parts": len(plan.parts), "finished": 0, "entries": {}}
   for part in plan.parts:
@@ -325,7 +331,9 @@ def collect(out: pathlib.Path, plan: Suite) -> dict:
       continue
     summary = json.loads((out / part.name / "summary.json").read_text())
     value["finished"] += 1
-    value["entries"][part.name] = summary | {"scores": scores(out / part.name)}
+    if part.name not in known:
+      known[part.name] = scores(out / part.name)
+    value["entries"][part.name] = summary | {"scores": known[part.name]}
     rows = store.read_plain(out / part.name / "runs.parquet")
     count = len(next(iter(rows.values())))
     before = len(next(iter(columns.values()))) if columns else 0
@@ -376,15 +384,19 @@ def execute(plan: Suite, out, parts, estimates: dict[str, Estimate] | None = Non
     names = [p.name for p in todo]
     if estimates:
       names.sort(key=lambda name: -estimates[name].seconds)
-    over = []
+    over, known, begin = [], {}, time.monotonic()
 
     def end(name):
       over.append(name)
-      collect(out, plan)
-      tell(f"{name} finished, {len(over)} of {len(names)}")
+      collect(out, plan, known)
+      left = ""
+      if estimates and len(over) < len(names):
+        seconds = lambda which: sum(estimates[n].seconds for n in which)
+        left = f"; at most about {round((time.monotonic() - begin) * (seconds(names) / seconds(over) - 1) / 60) or 1} min left"
+      tell(f"{name} finished, {len(over)} of {len(names)}{left}")
     workers.together(out, names, min(jobs, len(names)), end, tell)
-    return collect(out, plan)
-  spent = expected = 0.0
+    return collect(out, plan, known)
+  spent, expected, known = 0.0, 0.0, {}
   for i, part in enumerate(todo):
     guess = lambda p: estimates[p.name].seconds if estimates else 0.0
     if estimates:
@@ -395,5 +407,5 @@ def execute(plan: Suite, out, parts, estimates: dict[str, Estimate] | None = Non
     with display() as progress:
       run.execute(part.config, out / part.name, resume=begun, progress=progress, save_every_s=save_every_s)
     spent, expected = spent + time.monotonic() - begin, expected + guess(part)
-    collect(out, plan)
-  return collect(out, plan)
+    collect(out, plan, known)
+  return collect(out, plan, known)

@@ -402,7 +402,7 @@ class RunDisplay:
       self.first = (now, p.step)
     rate = (p.step - self.first[1]) / max(1e-9, now - self.first[0])
     left = clock((p.steps - p.step) / rate) if rate > 0 else "?"
-    head = f"step {p.step:,}/{p.steps:,}  {clock(now - self.begin)} gone, {left} left"
+    head = p.note or f"step {p.step:,}/{p.steps:,}  {clock(now - self.begin)} gone, {left} left"
     if self.live:
       from rich.table import Table
       table = Table(title=head, title_justify="left")
@@ -411,8 +411,11 @@ class RunDisplay:
       for i, arm in enumerate(p.arms):
         table.add_row(arm, str(p.seeds[i]), PHASES[p.phase[i]], f"{p.reward[i]:.2f}", str(p.alarms[i]), str(p.updates[i]))
       self.live.update(table)
-    elif now - self.told > 15 or p.step >= p.steps:
+    elif now - self.told > 15 or p.step >= p.steps and not p.note:
       self.told = now
+      if p.note:
+        say(p.note)
+        return
       counts = ", ".join(f"{int((p.phase == i).sum())} {name}" for i, name in enumerate(PHASES) if (p.phase == i).any())
       say(f"{head}; {counts}; mean reward {p.reward.mean():.2f}")
 

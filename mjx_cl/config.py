@@ -103,8 +103,8 @@ class TrainConfig:
     shake: probability that a stretch of 16 control steps is driven by one random action, on `shake_share` of the robots: stumbles and falls
       to learn from. 0: never, as the authors.
     shake_share: share of the robots that are shaken; the return of the others is the one reported.
-    fault, severity: domain randomisation: each episode of each robot draws a target of this fault and a severity, uniform in [0, `severity`], anew.
-      None: healthy robots.
+    fault, severity: domain randomisation: each robot draws a target of this fault and a severity, uniform in [0, `severity`], at the start and at the
+      end of every chunk of 64 decisions in which one of its episodes ended. None: healthy robots.
   """
   envs: int = 16
   updates: int = 500_000

@@ -149,7 +149,7 @@ def ratios(out, points: list[dict]) -> pathlib.Path | None:
   import matplotlib.pyplot as plt
   out = pathlib.Path(out)
   lines = {p["line"]: sorted((q for q in points if q["line"] == p["line"]), key=lambda q: q["ratio"]) for p in points}
-  if not any(len(own) > 1 for own in lines.values()):
+  if not any(len({p["ratio"] for p in own}) > 1 for own in lines.values()):
     return None
   fig, axis = plt.subplots(figsize=(6, 4), constrained_layout=True)
   for k, (line, own) in enumerate(lines.items()):

@@ -88,7 +88,7 @@ def windows(replay: Replay, length: int) -> jax.Array:
   return jnp.sum(jnp.maximum(0, jnp.minimum(replay.count, capacity) - length + 1))
 
 
-def sample(replay: Replay, key: jax.Array, batch: int, length: int):
+def sample(replay: Replay, key: jax.Array, batch: int, length: int, only=None):
   """Draws windows: first those waiting in the online queue, then uniformly over all windows.
 
   The queue holds every non-overlapping window of each stream once, oldest first, so each fresh sequence is seen once promptly. `first` is
@@ -96,14 +96,16 @@ def sample(replay: Replay, key: jax.Array, batch: int, length: int):
 
   Args:
     batch, length: windows and records of each (context included).
+    only: int32 (), the one stream to draw from, as if the others held nothing; None: all.
   Returns:
     (replay', Batch with leading (batch, length), address). address = (stream (batch,), number of the first record (batch,)). The caller
     makes sure that at least one window exists.
   """
   capacity = replay.data.reward.shape[1]
+  mine = True if only is None else jnp.arange(len(replay.count)) == only
   oldest = jnp.maximum(0, replay.count - capacity)
-  queue = jnp.maximum(replay.queue, oldest)
-  waiting = jnp.maximum(0, (replay.count - queue) // length)
+  queue = jnp.where(mine, jnp.maximum(replay.queue, oldest), replay.queue)
+  waiting = jnp.where(mine, jnp.maximum(0, (replay.count - queue) // length), 0)
   ends = jnp.cumsum(waiting)
   slot = jnp.arange(batch)
   from_queue = slot < ends[-1]
@@ -112,7 +114,7 @@ def sample(replay: Replay, key: jax.Array, batch: int, length: int):
   q_start = queue[q_stream] + rank * length
   taken = jnp.clip(batch - (ends - waiting), 0, waiting)
 
-  valid = jnp.maximum(0, replay.count - oldest - length + 1)
+  valid = jnp.where(mine, jnp.maximum(0, replay.count - oldest - length + 1), 0)
   valid_ends = jnp.cumsum(valid)
   draw = jax.random.randint(key, (batch,), 0, jnp.maximum(1, valid_ends[-1]))
   u_stream = jnp.minimum(jnp.searchsorted(valid_ends, draw, side="right"), len(ends) - 1)

@@ -332,10 +332,10 @@ def stop_rule(results: pathlib.Path) -> str:
   for part, entry in load(results / "stop" / "bench.json")["entries"].items():
     first = first or entry["stop_rule"]
     for arm, own in entry["stop_rule"]["arms"].items():
-      told = sum(own[k] for k in ("aborted_unrecoverable", "aborted_recoverable", "ended_unrecoverable"))
       rows.append((f"`{part}`", arm, f"{own['ended']} of {own['adaptations']}", both(own, "steps_after_oracle_median"), f"{own['early']} of {own['ended']}",
                    *(f"{percent(own[k], 1)} {percents(own[k + '_ci'], 1)} %" if k == "lost_share" else both(own, k, 2) for k in ("return_lost", "lost_share")),
-                   both(own, "updates_wasted_mean"), f"{own['aborted_unrecoverable']} right, {told - own['aborted_unrecoverable']} wrong"))
+                   both(own, "updates_wasted_mean"), f"{own['aborted_unrecoverable']} / {own['aborted_recoverable']}",
+                   str(own["ended_unrecoverable"])))
     for name, own in entry["scores"]["ablation"].items():
       without.append((f"`{part}`" if not name else "", f"`{name}`" if name else "none", f"{own['converged']} of {own['adaptations']}", str(own["aborted"]),
                       both(own, "own_stop_steps_median"), f"{own['early']} of {own['judged']}",
@@ -347,8 +347,8 @@ def stop_rule(results: pathlib.Path) -> str:
   more = fill("""
       The rule lived again over the recorded signals of the adaptations that never stop, with each signal left out: how many converge, abort, and
       when.""")
-  return "\n\n".join([text, grid(("fault", "arm", "ended", "steps after the oracle stop", "earlier than it", "return lost a step", "share of the best", "updates wasted",
-                                   "aborts and ends, by the label"), rows), more,
+  return "\n\n".join([text, grid(("fault", "arm", "ended", "steps after the oracle stop", "earlier than it", "return lost a step", "share of the best", "updates wasted (mean)",
+                                   "aborts right / wrong", "ended on a lost fault"), rows), more,
                       grid(("fault", "left out", "converged", "aborted", "median stop [steps]", "earlier than the oracle", "share of the best lost"), without)])
 
 

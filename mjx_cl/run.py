@@ -50,7 +50,7 @@ class State(NamedTuple):
 
 
 class Progress(NamedTuple):
-  """What a display needs after each chunk: arrays over streams."""
+  """What a display needs after each chunk: arrays over streams; `note`: what else is under way."""
   step: int
   steps: int
   seconds: float
@@ -60,6 +60,7 @@ class Progress(NamedTuple):
   reward: np.ndarray
   alarms: np.ndarray
   updates: np.ndarray
+  note: str = ""
 
 
 class Runner:
@@ -79,6 +80,7 @@ class Runner:
     self.trained = agents.load(config.agent, config.env, len(spec.obs), len(spec.act), lr=config.adapt.lr,
                                last_starts=config.adapt.last_starts, batch=config.adapt.batch)
     agent, self.repeat = self.trained.agent, int(self.trained.card.get("repeat", 1))
+    self.others = arm_agents(config, spec)
     self.changes = changes(config)
     self.faults, plan, target = faults.build(self.changes, self.robots[-1], config.onset)
     detector = detectors.make(config.detector, robot=getattr(type(self.env), "agents_of", None) or config.env, **config.settings)
@@ -116,22 +118,8 @@ class Runner:
                                self.work / "snapshots") if config.snapshots else None
 
   def _own_agents(self, state):
-    """`state` with the weights of those arms that bring an agent of their own; `others`: their cards.
-
-    Raises:
-      UserError where there is no such agent, or it is of another size or acts at another rate.
-    """
-    self.others = {}
-    for arm in dict.fromkeys(a for a, _ in self.labels if ARMS[a].agent):
-      name = f"{self.trained.path if self.config.agent and pathlib.Path(self.config.agent).exists() else pathlib.Path(self.trained.path).name}-{ARMS[arm].agent}"
-      c, spec = self.trained.agent.config, self.env.spec
-      try:
-        other = agents.load(name, self.config.env, len(spec.obs), len(spec.act))
-      except UserError as e:
-        raise UserError(f"arm {arm!r}: {e}") from None
-      if (other.agent.config.size, other.agent.config.obs_scale, int(other.card.get("repeat", 1))) != (c.size, c.obs_scale, self.repeat):
-        raise UserError(f"arm {arm!r}: agent {name!r} differs from the run's in size, obs_scale or repeat")
-      self.others[arm] = other.card
+    """`state` with the weights of those arms that bring an agent of their own."""
+    for arm, other in self.others.items():
       own = jnp.asarray([a == arm for a, _ in self.labels])
       put = lambda old, new: jnp.where(own.reshape((-1,) + (1,) * (old.ndim - 1)), new.astype(old.dtype), old)
       state = state._replace(train=jax.tree.map(put, state.train, other.train), acting=jax.tree.map(put, state.acting, other.train.params))
@@ -290,10 +278,10 @@ class Runner:
     """What config.json holds."""
     return {"command": "run", **json.loads(json.dumps(dataclasses.asdict(self.config))),
             "physics": "+".join(dict.fromkeys(robot.physics.name for robot in self.robots)),
-            "agent_card": self.trained.card, "arm_cards": self.others, "agent_path": pathlib.Path(self.trained.path).name, "repeat": self.repeat,
+            "agent_card": self.trained.card, **({"arm_cards": {arm: other.card for arm, other in self.others.items()}} if self.others else {}), "agent_path": pathlib.Path(self.trained.path).name, "repeat": self.repeat,
             "control_s": self.env.spec.control_s, **store.provenance()}
 
-  def finish(self) -> dict:
+  def finish(self, tell=lambda text: None) -> dict:
     """Writes trace, events, runs, summary and figure, of an arm that never stops also signals, snapshots and stop; removes the working files.
 
     Returns summary.json's value.
@@ -322,7 +310,7 @@ class Runner:
     taken = self.snapshots.taken(trace, self.chunk_steps) if self.snapshots else []
     if taken:
       last = self.state.streams if self.other is None else self.state.streams.after
-      columns, summary["wall_s_snapshots"] = self.snapshots.evaluate(taken, np.asarray(last.injection.target)[:, 0])
+      columns, summary["wall_s_snapshots"] = self.snapshots.evaluate(taken, np.asarray(last.injection.target)[:, 0], tell)
       store.write_table(self.out / "snapshots.parquet", columns)
       judged = stop.of_folder(self.out)
       store.write_table(self.out / "stop.parquet", {k: [r[k] for r in judged] for k in stop.COLUMNS})
@@ -476,6 +464,28 @@ class Runner:
     return out
 
 
+def arm_agents(config: RunConfig, spec) -> dict[str, agents.Trained]:
+  """Arm -> its own agent, of the arms that bring one: the run's with the arm's word behind its name, or beside the folder that --agent gives.
+
+  Raises:
+    UserError where there is no such agent, or it differs from the run's in size, obs_scale or repeat.
+  """
+  out = {}
+  for arm in (a for a in config.arms if ARMS[a].agent):
+    trained = agents.load(config.agent, config.env, len(spec.obs), len(spec.act))
+    given = config.agent and pathlib.Path(config.agent).exists()
+    name = f"{trained.path if given else pathlib.Path(trained.path).name}-{ARMS[arm].agent}"
+    try:
+      other = agents.load(name, config.env, len(spec.obs), len(spec.act))
+    except UserError as e:
+      raise UserError(f"arm {arm!r}: {e}") from None
+    same = lambda t: (t.agent.config.size, t.agent.config.obs_scale, int(t.card.get("repeat", 1)))
+    if same(other) != same(trained):
+      raise UserError(f"arm {arm!r}: agent {name!r} differs from the run's in size, obs_scale or repeat")
+    out[arm] = other
+  return out
+
+
 def spared(plan: faults.Plan, breaks) -> faults.Plan:
   """`plan` for a robot that breaks, bool (); without any severity for one that does not."""
   return plan._replace(severity=jnp.where(breaks, plan.severity, 0.0))
@@ -539,8 +549,10 @@ def execute(config: RunConfig, out, resume: bool = False, overwrite: bool = Fals
     store.write_json(out / "config.json", values)
   saved = time.monotonic()
   with Interruptible() as interrupt:
+    last = None
     while not runner.done:
-      progress(runner.step())
+      last = runner.step()
+      progress(last)
       try:
         interrupt.check()
       except KeyboardInterrupt:
@@ -549,7 +561,7 @@ def execute(config: RunConfig, out, resume: bool = False, overwrite: bool = Fals
       if time.monotonic() - saved > save_every_s:
         runner.save()
         saved = time.monotonic()
-  return runner.finish()
+  return runner.finish(lambda text: last and progress(last._replace(note=text)))
 
 
 RESULTS = ("config.json", "trace.parquet", "events.parquet", "runs.parquet", "residuals.parquet", "summary.json", "figure.png", "metrics.parquet",

@@ -127,7 +127,7 @@ class Snapshots:
     begins = [self.config.onset + c.after for c in self.changes]
     return [c.severity if begin <= since and (not c.duration or since < begin + c.duration) else 0.0 for c, begin in zip(self.changes, begins)]
 
-  def evaluate(self, wanted: list[Snapshot], targets) -> tuple[dict[str, np.ndarray], float]:
+  def evaluate(self, wanted: list[Snapshot], targets, tell=lambda text: None) -> tuple[dict[str, np.ndarray], float]:
     """Lives EPISODES episodes with each snapshot: weights frozen, the stream's own fault in full force from step 0, whatever its schedule.
 
     All snapshots of a seed meet the same keys: the same starts, the same noise. Up to BATCH of them share one program, their weights and faults
@@ -135,6 +135,7 @@ class Snapshots:
 
     Args:
       targets: int (groups, F), of each stream's faults.
+      tell: called with a line after each batch.
     Returns:
       (columns of snapshots.parquet, seconds that it took).
     """
@@ -156,6 +157,7 @@ class Snapshots:
           self._write(path, part)
           interrupt.check()
         parts.append(part)
+        tell(f"snapshots evaluated: {min(first + size, len(wanted))} of {len(wanted)}")
     returns, steps = (np.concatenate([p[k] for p in parts]) for k in ("returns", "steps"))
     return self._columns(wanted, returns, steps), float(sum(p["seconds"] for p in parts))
 

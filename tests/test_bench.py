@@ -4,15 +4,16 @@ import dataclasses
 import json
 import pathlib
 
+import numpy as np
 import pyarrow.parquet
 import pytest
 from test_cli import content, mjx, refused  # noqa: F401  fixtures
 from test_transfer import agent, saved  # noqa: F401  fixtures: a tiny agent of the car, whose programs hold no callback and are cached
 
-from mjx_cl import bench, run, store
-from mjx_cl.adapt.arms import ARMS
+from mjx_cl import bench, plots, run, store
+from mjx_cl.adapt.arms import ARMS, NEVER
 from mjx_cl.config import AdaptConfig, RunConfig
-from mjx_cl.errors import UserError
+from mjx_cl.errors import FileError, UserError
 
 MINI = """
 name = "mini"
@@ -153,7 +154,7 @@ def test_updates_of_the_plan():
   for arm in ARMS:
     own = RunConfig("walker", steps=20_000, onset=2000, seeds=1, arms=(arm,))
     steps = bench.adapting_steps(own, arm)
-    assert 0 <= steps <= 19_000 and (steps == 0) == (arm in ("none", "no-fault"))
+    assert 0 <= steps <= 19_000 and (steps == 0) == (ARMS[arm].trigger is NEVER or not ARMS[arm].breaks)
   slow, quick = (bench.estimate(bench.Part("a", c), rate).seconds - bench.COMPILE_S for rate in (1e11, 2e11))
   assert slow == pytest.approx(2 * quick)
 
@@ -214,6 +215,32 @@ def test_parts_run_once_go_on_and_merge(mjx, refused, mini, tmp_path, monkeypatc
   before = content(out)
   assert "steps" in refused(2, "bench", mini, "--out", out)
   assert content(out) == before
+
+
+@pytest.mark.parametrize("spoil", [
+    lambda d: d._replace(skipped=np.asarray(d.skipped) + [0, 1]), lambda d: d._replace(signals=np.asarray(d.signals) * [[1.0], [np.nan]])], ids=["skipped", "nan"])
+def test_a_loss_that_is_not_finite_ends_a_run_in_one_line(mini, tmp_path, spoil):  # noqa: F811
+  """An update that was skipped, or a signal that is no number: the stream is named, and what was saved before stays."""
+  (part,) = bench.pick(bench.suite(str(mini)).parts, ("healthy",))
+  runner = run.Runner(part.config, tmp_path / "out")
+  runner.open()
+  runner.step()
+  runner.save()
+  digest = runner.loop.digest
+
+  def broken(*given):
+    state, value = digest(*given)
+    return state, spoil(value)
+  runner.loop.digest = broken
+  with pytest.raises(FileError, match=r"^numeric failure at step 128 in stream \('none', 1\): a loss is not finite; the last checkpoint is intact$"):
+    runner.step()
+  runner.checkpoints.close()
+  again = run.Runner(part.config, tmp_path / "out")
+  again.open()
+  again.resume()
+  assert again.done_chunks == 1
+  again.step()
+  again.checkpoints.close()
 
 
 def test_a_table_of_unlike_parts_has_nulls(tmp_path):
@@ -278,3 +305,14 @@ def test_arms_alone_say_nothing_together(tmp_path):
   store.write_table(tmp_path / "runs.parquet", {k: [v] for k, v in lived(0, "detector", None, 0.9, affected=None).items()})
   store.write_json(tmp_path / "config.json", {"arms": ["detector"], "steps": 10_000})
   assert bench.scores(tmp_path) == {"normalised": None, "against_oracle": None, "recovery": {"detector": None}}
+
+
+def test_recovery_against_the_ratio_is_drawn_where_a_suite_has_several(tmp_path):
+  adapt = lambda ratio: AdaptConfig(ratio=ratio)
+  parts = [bench.Part(f"{ratio}", RunConfig("walker", severity=0.25, arms=("none", "oracle"), adapt=adapt(ratio))) for ratio in (4.0, 16.0)]
+  back = {"n": 5, "recovered": 3, "restricted_mean_steps": 4000.0, "restricted_mean_steps_ci": [3000.0, 5000.0]}
+  points = [p for part in parts for p in bench._points(part, {"recovery": {"none": back, "oracle": back}})]
+  assert points == [{"line": "walker, gear 0.25", "ratio": ratio, "mean": 4000.0, "ci": [3000.0, 5000.0], "n": 5, "recovered": 3} for ratio in (4.0, 16.0)]
+  assert bench._points(parts[0], {"recovery": {"none": back, "oracle": None}}) == []
+  assert plots.ratios(tmp_path, points[:1] * 2) is None and not list(tmp_path.iterdir())
+  assert plots.ratios(tmp_path, points + [points[0] | {"line": "other", "ci": None}]).read_bytes()[:4] == b"\x89PNG" and len(list(tmp_path.iterdir())) == 1

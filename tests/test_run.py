@@ -17,7 +17,7 @@ import numpy as np
 import pyarrow.parquet
 import pytest
 
-from mjx_cl import agents, cli, envs, plots, run, store
+from mjx_cl import agents, cli, envs, plots, run, store, workers
 from mjx_cl.config import RunConfig
 from mjx_cl.dreamer.agent import Agent
 from mjx_cl.envs.walker import Walker
@@ -106,7 +106,7 @@ def test_config_tells_how_it_was_made(whole, saved):
   config = json.loads((whole[0] / "config.json").read_text())
   assert [config[k] for k in ("command", "env", "severity", "onset", "arms")] == ["run", "walker", 0.5, ONSET, ["detector", "none"]]
   assert config["settings"] == {"window": 100, "warmup": 30} and config["adapt"]["patience"] == 4 and config["physics"] in ("native", "mjx")
-  assert config["versions"]["jax"] == jax.__version__ and config["machine"]["cores"] == os.cpu_count() and "git_commit" in config
+  assert config["versions"]["jax"] == jax.__version__ and config["machine"]["cores"] == len(workers.cores()) and "git_commit" in config
   assert config["agent_card"] == json.loads((saved / "card.json").read_text())
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pyarrow.parquet
 import pytest
 
-from mjx_cl import agents, envs, faults, run, snapshots, store
+from mjx_cl import agents, bench, envs, faults, run, snapshots, store
 from mjx_cl.adapt import phase as phase_lib
 from mjx_cl.adapt.arms import ARMS, never_stops, stops
 from mjx_cl.adapt.loop import Loop
@@ -275,6 +275,18 @@ def test_the_rule_without_a_signal(lived):
   assert {k: rows[0][k] for k in ("seed", "stop", "outcome", "reason")} == {k: span[k] for k in ("seed", "stop", "outcome", "reason")}
   shared = ("own_stop_steps", "oracle_stop_steps", "steps_after_oracle", "early", "reward_stop", "return_lost", "lost_share")
   assert {k: rows[0][k] for k in shared} == {k: judged[k] for k in shared}
+  assert bench.scores(out)["ablation"] == stop.ablated(rows) and list(stop.ablated(rows)) == [r["left_out"] for r in rows]
+
+
+def test_aggregates_of_the_ablation_by_hand():
+  """Four adaptations without the reward: stops at 100 and 300, an abort at 500, one that never ends; three of them have snapshots."""
+  row = lambda outcome, at, early, lost: {"left_out": "reward", "outcome": outcome, "stop": at, "own_stop_steps": at, "early": early, "lost_share": lost}
+  rows = [row("converged", 100, True, 0.2), row("converged", 300, False, 0.0), row("aborted", 500, True, 0.1), row("adapting", None, None, None)]
+  got = stop.ablated(rows + [dict(rows[0], left_out="")])
+  assert list(got) == ["reward", ""] and got["reward"]["adaptations"] == 4 and (got["reward"]["converged"], got["reward"]["aborted"]) == (2, 1)
+  assert got["reward"]["own_stop_steps_median"] == 300 and got["reward"]["own_stop_steps_median_ci"][1] is None  # of 100, 300, 500 and never
+  assert (got["reward"]["judged"], got["reward"]["early"]) == (3, 2) and got["reward"]["lost_share"] == pytest.approx(0.1)
+  assert got[""]["lost_share"] == 0.2 and stop.ablated([dict(rows[3], left_out="")])[""]["lost_share"] is None
 
 
 def test_evaluation_that_is_cut_off_goes_on(config, folder, lived, monkeypatch):

@@ -84,7 +84,7 @@ def test_resume_gives_the_same_bits(short_walker, tmp_path, same):
 
 
 def test_randomised_faults_are_drawn_anew_with_each_episode(short_walker, tmp_path, same):
-  """Targets and severities of 4 robots whose episodes last 12 of 64 steps: new ones each chunk, uniform below the given severity; the same after resume."""
+  """Targets and severities of 40 robots whose episodes last 12 of 64 steps: new ones each chunk, uniform below the given severity; the same after resume."""
   make = lambda: train.Trainer(short_walker, DREAMER, TrainConfig(envs=40, updates=10_000, ratio=0.001, capacity=256, fault="gear", severity=0.5), tmp_path)
   trainer, drawn = make(), []
   severity = lambda t: np.asarray(t.state.streams.injection.plan.severity)[0, :, 0]
@@ -100,7 +100,8 @@ def test_randomised_faults_are_drawn_anew_with_each_episode(short_walker, tmp_pa
   assert set(np.asarray(trainer.state.streams.injection.target)[0, :, 0]) == set(range(6))  # (5 / 6)^40 = 7e-4 to miss a given joint
   ended = np.zeros((1, 40), bool)
   ended[0, 3] = True
-  some = trainer._redraw(trainer.state.streams, ended)
+  later = trainer.state.streams._replace(t=trainer.state.streams.t + 1)  # what is drawn follows from the clock
+  some = trainer._redraw(later, ended)
   kept = np.arange(40) != 3
   assert (severity(trainer)[kept] == np.asarray(some.injection.plan.severity)[0, kept, 0]).all() and severity(trainer)[3] != some.injection.plan.severity[0, 3, 0]
   again = make()

@@ -240,19 +240,23 @@ class Loop:
 
   def _learn(self, train: TrainState, replay, keys, number, world_only):
     """`number` (groups,) updates for each stream. Nested loops with their own trip counts: the carry is changed in place, so a stream
-    without an update costs neither arithmetic nor a copy (`vmap` would compute all, `lax.map` would copy all)."""
+    without an update costs neither arithmetic nor a copy (`vmap` would compute all, `lax.map` would copy all). All streams lie in one replay,
+    of which an update reads and writes its own windows: taken out of it, a stream's would be copied twice for each update."""
     c = self.agent.config
+    shapes = jax.tree.map(lambda x: x.shape, replay)
+    together = jax.tree.map(lambda x: x.reshape((-1,) + x.shape[2:]), replay)  # (groups, 1, ..) -> (groups, ..)
 
     def stream(g, state):
       def update(i, state):
         train, replay = state
         key_sample, key_update = jax.random.split(jax.random.fold_in(keys[g], i))
-        own, data, address = replay_lib.sample(take(replay, g), key_sample, c.batch, c.length + 1)
+        replay, data, address = replay_lib.sample(replay, key_sample, c.batch, c.length + 1, only=g)
         before = take(train, g)
         learnt, _, latents = self.agent.update(before, data, key_update)
-        return put(train, g, keep_behaviour(world_only[g], before, learnt)), put(replay, g, replay_lib.refresh(own, address, latents))
+        return put(train, g, keep_behaviour(world_only[g], before, learnt)), replay_lib.refresh(replay, address, latents)
       return jax.lax.fori_loop(0, number[g], update, state)
-    return jax.lax.fori_loop(0, number.shape[0], stream, (train, replay))
+    train, together = jax.lax.fori_loop(0, number.shape[0], stream, (train, together))
+    return train, jax.tree.map(lambda x, shape: x.reshape(shape), together, shapes, is_leaf=lambda x: isinstance(x, jax.Array))
 
   def _refit(self, detector, past, stop):
     fresh = jax.tree.map(lambda x: jnp.broadcast_to(x, (stop.shape[0],) + x.shape), self.detector.init())
