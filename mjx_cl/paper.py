@@ -61,7 +61,7 @@ EXPERIMENTS: dict[str, Experiment] = {
     "paper/car-transfer": Experiment("car", 0, 10_000, "simulator to car", "1 run", "a simulated four-wheel car in place of the real one", (
         Statement("alarm after transfer", "\"quickly\"", "IV-C", "latency"),
         Statement("reward back after transfer", "40,000 steps (driving stable after 10,000)", "IV-C, V-C", "recovery", 40_000),
-        Statement("finetuning ends after", "shortly after step 50,000, that is 40,000 steps", "IV-C", "stop", 40_000),
+        Statement("first finetuning ends after", "shortly after step 50,000, that is 40,000 steps", "IV-C", "stop", 40_000),
     )),
     "paper/car-socks": Experiment(
         "car", 1, 10_000, "rear friction cut, as by socks", "1 run",
@@ -122,9 +122,11 @@ def recovery(rows: list[dict]) -> Measured:
 
 
 def stop(rows: list[dict]) -> Measured:
-  """Steps from the change to the end of a finetuning that converged; whatever else happened is censored."""
+  """Steps from the change to the end of the first finetuning that converged after it; a stream without one is censored. Says how many alarmed again."""
   met = [r for r in rows if r["onset"] is not None]
-  return times([r["adapt_stop"] - r["onset"] if r["outcome"] == "converged" and r["adapt_stop"] >= r["onset"] else np.inf for r in met], "streams")
+  own = times([np.inf if r["first_stop"] is None else r["first_stop"] - r["onset"] for r in met], "streams")
+  again = sum(r["first_stop"] is not None and r["restarts"] > 0 for r in met)
+  return own._replace(text=own.text + (f", {again} of them alarmed again later" if again else ""))
 
 
 def last_stop(rows: list[dict]) -> Measured:
@@ -181,10 +183,23 @@ def setup(experiment: Experiment, config: dict) -> list[str]:
   return words + ([experiment.robot] if experiment.robot else [])
 
 
-def compare(name: str, config: dict, runs: list[dict]) -> list[tuple[str, str, str, str]]:
-  """Rows (what, paper, mjx_cl, difference) of one experiment, arm `detector` alone."""
+def with_stops(runs: list[dict], events: list[dict]) -> list[dict]:
+  """Rows of runs.parquet with `first_stop`, control step of the first end of a finetuning that converged between the row's change and the next one, None
+  without, and `restarts`, how many finetunings began after it."""
+  out = []
+  for r in runs:
+    later = [q["onset"] for q in runs if q["stream"] == r["stream"] and q["onset"] is not None and r["onset"] is not None and q["onset"] > r["onset"]]
+    end = min(later, default=np.inf)
+    own = [e for e in events if r["onset"] is not None and e["stream"] == r["stream"] and r["onset"] <= e["step"] < end]
+    first = next((e["step"] for e in own if e["kind"] == "stop"), None)
+    out.append(r | {"first_stop": first, "restarts": 0 if first is None else sum(e["kind"] == "start" and e["step"] > first for e in own)})
+  return out
+
+
+def compare(name: str, config: dict, runs: list[dict], events: list[dict]) -> list[tuple[str, str, str, str]]:
+  """Rows (what, paper, mjx_cl, difference) of one experiment, arm `detector` alone, from the rows of runs.parquet and events.parquet."""
   experiment = EXPERIMENTS[name]
-  rows = [r for r in runs if r["arm"] == "detector" and r.get("change", 0) == experiment.change]
+  rows = [r for r in with_stops(runs, events) if r["arm"] == "detector" and r.get("change", 0) == experiment.change]
   if not rows:
     raise FileError(f"{name}: runs.parquet holds no row of arm `detector` with change {experiment.change}")
   out = []

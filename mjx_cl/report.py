@@ -283,9 +283,10 @@ def experiments(results: pathlib.Path) -> str:
       absent.append(f"`{name}`")
       continue
     config, summary, runs = load(folder / "config.json"), load(folder / "summary.json"), table(folder / "runs.parquet")
+    events = table(folder / "events.parquet")
     heads[name] = f"`{name}`: {experiment.protocol}; paper {experiment.runs}, here {summary['arms']['detector']['seeds']} seeds"
     differs[name] = paper.setup(experiment, config)
-    rows += [(name, k, line) for k, line in enumerate(paper.compare(name, config, runs))]
+    rows += [(name, k, line) for k, line in enumerate(paper.compare(name, config, runs, events))]
   if not rows:
     raise FileError(f"{results / 'paper'} holds no experiment; run mjx-cl bench paper --publish {results / 'paper'}")
   common = [words for words in next(iter(differs.values())) if all(words in other for other in differs.values())]

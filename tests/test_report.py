@@ -27,7 +27,8 @@ SOURCES = {
     "agents": ("walker_agent/eval.json", "walker_agent/curve.parquet", "car_agent/eval.json", "car_agent/eval_car_real.json",
                "car_agent/curve.parquet", "quadruped_agent/eval.json", "quadruped_agent/curve.parquet"),
     "detectors": ("detectors.json",),
-    "paper": tuple(f"paper/{robot}/{file}" for robot in ("walker", "quadruped", "car") for file in ("config.json", "summary.json", "runs.parquet")),
+    "paper": tuple(f"paper/{robot}/{file}" for robot in ("walker", "quadruped", "car") for file in ("config.json", "summary.json", "runs.parquet"))
+             + ("paper/car/events.parquet",),
     "arms": ("paper/bench.json",),
     "other-arms": ("arms/bench.json",),
     "stop-rule": ("stop/bench.json",),
@@ -66,10 +67,10 @@ def results(tmp_path):
   runs = parquet.read_table(out / "walker_gear/runs.parquet").to_pylist()
   for robot in ("walker", "quadruped", "car"):
     (out / "paper" / robot).mkdir(parents=True)
-    for file in ("config.json", "summary.json"):
+    for file in ("config.json", "summary.json", "events.parquet"):
       shutil.copy(out / "walker_gear" / file, out / "paper" / robot)
-    later = [r | {"change": 1, "onset": 9000, "reward_drop": r["reward_drop"] + 0.1,
-                  "recovery_step": r["recovery_step"] and r["recovery_step"] + 5000} for r in runs]
+    later = [r | {"change": 1, "onset": 15_000, "reward_drop": r["reward_drop"] + 0.1,
+                  "recovery_step": r["recovery_step"] and r["recovery_step"] + 10_000} for r in runs]
     write(out / "paper" / robot / "runs.parquet", [r | {"change": 0} for r in runs] + (later if robot == "car" else []))
   summary = json.loads((out / "walker_gear/summary.json").read_text())
   back = {"n": 6, "recovered": 5, "median_steps": 4321.0, "median_steps_ci": [1234.0, None], "restricted_mean_steps": 5432.1,
@@ -366,7 +367,7 @@ def test_missed_goals_are_said(results):
 def run_row(seed, **other):
   return {"stream": seed, "arm": "detector", "seed": seed, "change": 0, "onset": 5000, "latency_steps": 100, "adapt_start": 5110,
           "adapt_stop": 12_000, "outcome": "converged", "affected": True, "recovery_step": 9000,
-          "reward_pre": 1.0, "reward_drop": 0.3, "reward_final": 0.9} | other
+          "reward_pre": 1.0, "reward_drop": 0.3, "reward_final": 0.9, "first_stop": 12_000, "restarts": 0} | other
 
 
 CONFIG = json.loads((RESULTS / "walker_gear/config.json").read_text())
@@ -375,7 +376,7 @@ CONFIG = json.loads((RESULTS / "walker_gear/config.json").read_text())
 def test_medians_and_intervals_are_those_of_the_summary(results):
   summary = json.loads((results / "paper/walker/summary.json").read_text())
   runs = parquet.read_table(results / "paper/walker/runs.parquet").to_pylist()
-  lines = {what: (own, gap) for what, _, own, gap in paper.compare("paper/walker", CONFIG, runs)}
+  lines = {what: (own, gap) for what, _, own, gap in paper.compare("paper/walker", CONFIG, runs, [])}
   low, high = summary["recovery_median_steps_ci"]
   assert lines["reward back after onset"] == (f"5,092 [{low:,.0f}, {high:,.0f}] steps, 6 of 6 affected streams", "-4,908 steps")
   low, high = summary["latency_median_steps_ci"]
@@ -383,12 +384,13 @@ def test_medians_and_intervals_are_those_of_the_summary(results):
 
 
 def test_each_measure_by_hand():
-  calm = run_row(1, latency_steps=None, adapt_start=None, adapt_stop=None, outcome="nominal", recovery_step=None, reward_drop=0.0, affected=False)
-  lost = run_row(2, latency_steps=300, adapt_stop=20_000, outcome="aborted_by_rule", recovery_step=None, reward_final=0.5)
-  rows = [run_row(0), calm, lost, run_row(3, reward_final=1.0)]
+  calm = run_row(1, latency_steps=None, adapt_start=None, adapt_stop=None, first_stop=None, outcome="nominal", recovery_step=None, reward_drop=0.0, affected=False)
+  lost = run_row(2, latency_steps=300, adapt_stop=20_000, outcome="aborted_by_rule", recovery_step=None, reward_final=0.5, first_stop=None)
+  rows = [run_row(0), calm, lost, run_row(3, reward_final=1.0, restarts=2)]
   measured = {name: f(rows) for name, f in paper.MEASURES.items()}
   assert {name: m.value for name, m in measured.items()} == {
       "latency": 100, "recovery": 4000, "stop": 7000, "last_stop": 20_000, "outcomes": 0.5, "kept": pytest.approx(0.8), "drop": pytest.approx(0.3)}
+  assert measured["stop"].text.endswith("2 of 4 streams, 1 of them alarmed again later")
   assert measured["recovery"].text.endswith("2 of 3 affected streams") and measured["latency"].text.endswith("3 of 4 streams")
   assert measured["outcomes"].text == "converged 2 of 4 [0.6, 3.4], aborted 1, still adapting 0, never alarmed 1"
   assert measured["last_stop"].text == "20,000, 3 streams that ended one, a maximum has no interval"
@@ -415,13 +417,17 @@ def test_differences():
 def test_each_change_of_the_car_has_rows_of_its_own():
   later = {"change": 1, "onset": 47_000, "reward_drop": 0.25, "latency_steps": None}
   runs = [run_row(k) for k in range(4)] + [run_row(k, recovery_step=50_000 + k, **later) for k in range(4)]
-  first, second = (dict((line[0], line[2:]) for line in paper.compare(name, CONFIG, runs)) for name in ("paper/car-transfer", "paper/car-socks"))
+  event = lambda stream, step, kind: {"stream": stream, "step": step, "kind": kind}
+  events = [event(k, 5100, "start") for k in range(4)] + [event(k, 12_000 + k, "stop") for k in range(3)] + [event(2, 13_000, "start"), event(2, 14_000, "stop")]
+  events += [event(3, 46_000, "abort"), event(3, 48_000, "stop")]  # the latter is of the second change
+  first, second = (dict((line[0], line[2:]) for line in paper.compare(name, CONFIG, runs, events)) for name in ("paper/car-transfer", "paper/car-socks"))
   assert first["reward back after transfer"][0].startswith("4,000 [") and second["reward back after the socks"][0].startswith("3,001 [")
   assert second["reward lost at first"] == ("25 [25, 25] %, 4 streams", "+5 points")
   assert second["alarm after the socks"][0] == "- [-, -] steps, 0 of 4 streams"
-  assert first["finetuning ends after"] == ("7,000 [7,000, 7,000] steps, 4 of 4 streams", "-33,000 steps")
+  assert first["first finetuning ends after"] == ("7,001 [7,000, -] steps, 3 of 4 streams, 1 of them alarmed again later", "-32,999 steps")
+  assert [r["first_stop"] for r in paper.with_stops(runs, events)] == [12_000, 12_001, 12_002, None, None, None, None, 48_000]
   with pytest.raises(FileError, match="paper/car-socks: runs.parquet holds no row of arm `detector` with change 1"):
-    paper.compare("paper/car-socks", CONFIG, runs[:4])
+    paper.compare("paper/car-socks", CONFIG, runs[:4], events)
 
 
 def test_what_differs_from_the_papers_setup():
