@@ -334,7 +334,7 @@ def stop_rule(results: pathlib.Path) -> str:
     first = first or entry["stop_rule"]
     for arm, own in entry["stop_rule"]["arms"].items():
       rows.append((f"`{part}`", arm, f"{own['ended']} of {own['adaptations']}", both(own, "steps_after_oracle_median"), f"{own['early']} of {own['ended']}",
-                   *(f"{percent(own[k], 1)} {percents(own[k + '_ci'], 1)} %" if k == "lost_share" else both(own, k, 2) for k in ("return_lost", "lost_share")),
+                   both(own, "return_lost"), f"{percent(own['lost_share'], 1)} {percents(own['lost_share_ci'], 1)} %",
                    both(own, "updates_wasted_mean"), f"{own['aborted_unrecoverable']} / {own['aborted_recoverable']}",
                    str(own["ended_unrecoverable"])))
     for name, own in entry["scores"]["ablation"].items():
@@ -344,11 +344,11 @@ def stop_rule(results: pathlib.Path) -> str:
   text = fill(f"""
       The oracle stop is the earliest snapshot whose frozen episodes on the broken robot reach {percent(first['share'])} % of the best snapshot's. Medians and
       interquartile means with 95 % bootstrap intervals over streams; an adaptation that never ended counts as later than all others. Return lost is the best
-      snapshot's reward less that of the stop, per control step, and as a share of the former: an upper bound, since the best of many noisy snapshots is the luckiest too.""")
+      snapshot's reward less that of the stop, over {number(first['horizon_steps'])} control steps, and as a share of the former: an upper bound, since the best of many noisy snapshots is the luckiest too.""")
   more = fill("""
       The rule lived again over the recorded signals of the adaptations that never stop, with each signal left out: how many converge, abort, and
       when.""")
-  return "\n\n".join([text, grid(("fault", "arm", "ended", "steps after the oracle stop", "earlier than it", "return lost a step", "share of the best", "updates wasted (mean)",
+  return "\n\n".join([text, grid(("fault", "arm", "ended", "steps after the oracle stop", "earlier than it", "return lost", "share of the best", "updates wasted (mean)",
                                    "aborts right / wrong", "ended on a lost fault"), rows), more,
                       grid(("fault", "left out", "converged", "aborted", "median stop [steps]", "earlier than the oracle", "share of the best lost"), without)])
 

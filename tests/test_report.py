@@ -80,14 +80,14 @@ def results(tmp_path):
       "normalised": {"detector": worth, "none": worth | {"normalised": 0.012}}, "recovery": {"detector": back, "none": None},
       "against_oracle": {"seeds": 8, "difference": -0.067, "difference_ci": [-0.189, 0.045], "holds_zero": True}}}
   both = lambda name, value: {name: value, name + "_ci": [0.9 * value, 1.1 * value]}
-  judged = {"adaptations": 9, "never_begun": 1, "ended": 8, **both("early", 3), **both("steps_after_oracle_median", 2345.0), **both("return_lost", 0.12),
+  judged = {"adaptations": 9, "never_begun": 1, "ended": 8, **both("early", 3), **both("steps_after_oracle_median", 2345.0), **both("return_lost", 123.4),
             **both("lost_share", 0.034), **both("updates_wasted_mean", 56.7), **both("aborted_unrecoverable", 2), **both("aborted_recoverable", 1),
             **both("ended_unrecoverable", 1)}
   left_out = {name: {"adaptations": 9, "converged": n, "aborted": 9 - n, **both("own_stop_steps_median", 6789.0 + n), "judged": 7, "early": 4,
                      **both("lost_share", 0.056)} for n, name in enumerate(("", "reward"), 6)}
   arms = {arm: entry["arms"][arm] | both("recovery_median_steps", 3333.0) for arm in entry["arms"]}
   entries = {"paper": entry, "arms": entry, "again": entry | {"arms": arms, "later_changes": [arms, arms]},
-             "stop": {"stop_rule": {"share": 0.95, "arms": {"oracle": judged}}, "scores": {"ablation": left_out}}}
+             "stop": {"stop_rule": {"share": 0.95, "horizon_steps": 10_000, "arms": {"oracle": judged}}, "scores": {"ablation": left_out}}}
   entries["study"] = entry
   (out / "study").mkdir()
   (out / "study/suite.json").write_text(json.dumps({"suite": "study", "parts": {"walker": {"env": "walker", "fault": "gear", "severity": 0.25,
