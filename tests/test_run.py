@@ -359,7 +359,7 @@ class Stub:
   config_dict = lambda self: {}
   open = lambda self: None
   save = lambda self: self.notes.append("save")
-  finish = lambda self: self.notes.append("finish")
+  finish = lambda self, tell: self.notes.append("finish")
 
 
 @pytest.mark.parametrize("signals, want", [(0, ["step 4", "step 5", "finish"]), (1, ["save"]), (2, None)])

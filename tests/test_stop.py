@@ -194,11 +194,11 @@ def lived(config, folder):
     acted[progress.step - 1] = jax.tree.map(lambda x: np.array(x[3]), {k: self.state.loop.acting[k] for k in snapshots.ACTS})
     return progress
 
-  def kept(self, wanted, targets):
+  def kept(self, wanted, targets, tell):
     acted["files"] = {s.step: self._read(s) for s in wanted}
     acted["names"] = sorted(p.name for p in self.folder.iterdir())
     acted["targets"] = targets
-    return evaluate(self, wanted, targets)
+    return evaluate(self, wanted, targets, tell)
   patch.setattr(run.Runner, "step", watched)
   patch.setattr(Snapshots, "evaluate", kept)
   run.execute(config, out)
