@@ -100,7 +100,7 @@ def together(out, names: list[str], jobs: int, finished: Callable[[str], None], 
   Args:
     finished: called with the name of each part as it ends.
   Raises:
-    UserError, FileError as soon as one fails; KeyboardInterrupt on a signal. In both cases the others have saved first.
+    UserError, FileError as soon as one fails; KeyboardInterrupt on a signal. Before either is raised the others have saved what they had lived and ended.
   """
   out, waiting, running = pathlib.Path(out), list(names), []
   all_cores = cores()
