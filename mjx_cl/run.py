@@ -28,6 +28,7 @@ from mjx_cl import agents, checkpoint, detectors, envs, faults, memory, store
 from mjx_cl.adapt import phase as phase_lib
 from mjx_cl.adapt.arms import ARMS, FOREVER, NEVER, never_stops
 from mjx_cl.adapt.convergence import SIGNALS
+from mjx_cl.adapt.crew import Crew
 from mjx_cl.adapt.loop import Choices, Loop, LoopState, choices
 from mjx_cl.config import RunConfig, becomes, changes
 from mjx_cl.errors import FileError, UserError
@@ -44,9 +45,9 @@ OUTCOMES = ("nominal", "adapting", "converged", "aborted_by_rule", "aborted_by_r
 
 
 class State(NamedTuple):
-  """All arrays of a run: the robots and everything else."""
+  """All arrays of a run: the robots and everything else, in blocks of streams, see crew.py."""
   streams: Stream | Moving
-  loop: LoopState
+  loop: list[LoopState]
 
 
 class Progress(NamedTuple):
@@ -95,14 +96,16 @@ class Runner:
     self.chunks = -(-config.steps // self.chunk_steps)
     capacity = (self.chunks + 1) * CHUNK + config.steps // min(r.spec.episode_steps for r in self.robots) + CHUNK
     memory.check(agent.config.size, len(spec.obs), len(spec.act), capacity, len(config.arms) * config.seeds, ("steps", 1), agent.config.bins)
-    self.loop = Loop(agent, monitor, detector, spec, config.adapt, self.repeat, capacity=capacity)
     self.seeds = [config.first_seed + i for i in range(config.seeds)]
     self.labels = [(arm, seed) for arm in config.arms for seed in self.seeds]
     self.groups = len(self.labels)
+    self.crew = Crew(Loop(agent, monitor, detector, spec, config.adapt, self.repeat, capacity=capacity), self.groups)
     self.breaks = np.asarray([ARMS[arm].breaks for arm, _ in self.labels])
     keys = jnp.stack([jax.random.key(seed) for _, seed in self.labels])[:, None]
     self.keys = jax.vmap(lambda k: jax.random.fold_in(k, 7))(keys[:, 0])
-    self.state = State(nest(begin, (0, 0), (0, None))(keys, jnp.asarray(self.breaks)), self._own_agents(self.loop.init(self.trained.train, self.groups)))
+    trains = [self.others[arm].train if arm in self.others else self.trained.train for arm, _ in self.labels]
+    self.state = State(nest(begin, (0, 0), (0, None))(keys, jnp.asarray(self.breaks)), self.crew.init(trains))
+    self.acting = self.crew.acting(self.state.loop)
     self.choices = self._choices(self.state.streams)
     self.done_chunks = 0
     self.seconds = {"physics": 0.0, "acting": 0.0, "digest": 0.0, "other": 0.0}
@@ -117,14 +120,6 @@ class Runner:
     self.snapshots = Snapshots(config, self.robots[-1], agent, self.faults, self.changes, self.repeat, self.labels, self.trained.train.params,
                                self.work / "snapshots") if config.snapshots else None
 
-  def _own_agents(self, state):
-    """`state` with the weights of those arms that bring an agent of their own."""
-    for arm, other in self.others.items():
-      own = jnp.asarray([a == arm for a, _ in self.labels])
-      put = lambda old, new: jnp.where(own.reshape((-1,) + (1,) * (old.ndim - 1)), new.astype(old.dtype), old)
-      state = state._replace(train=jax.tree.map(put, state.train, other.train), acting=jax.tree.map(put, state.acting, other.train.params))
-    return state
-
   def open(self) -> None:
     """Makes the working folder; before that nothing in `out` is touched."""
     self.checkpoints = checkpoint.Checkpoints(self.work / "checkpoints")
@@ -135,17 +130,19 @@ class Runner:
     """Lives one chunk and logs it."""
     begin = time.perf_counter()
     physics = self._physics_seconds()
-    streams, rows = self.rollout.chunk(self.state.loop.acting, self.state.streams, CHUNK)
+    streams, rows = self.rollout.chunk(self.acting, self.state.streams, CHUNK)
     rows = jax.block_until_ready(rows)
     acted = time.perf_counter()
     physics = self._physics_seconds() - physics
     now = (self.done_chunks + 1) * self.chunk_steps
     if self.other is not None:
       self.choices = self._choices(streams)  # robots have changed in this chunk
-    loop, digest = self.loop.digest(self.state.loop, rows, jnp.int32(now), self.choices, self.keys, self._acceptance(streams, now))
-    digest = jax.tree.map(np.asarray, jax.block_until_ready(digest))
+    loop, digest = self.crew.digest(self.state.loop, rows, jnp.int32(now), self.choices, self.keys, self._acceptance(streams, now))
     digested = time.perf_counter()
     self.state = State(streams, loop)
+    changed = (digest.updates != self._updates) | (digest.decision > 0)  # weights are what they were in every other stream
+    if changed.any():
+      self.acting = self.crew.acting(loop)
     before = self._phase
     self._log(rows, digest)
     updates = digest.updates - self._updates
@@ -156,7 +153,7 @@ class Runner:
       bad = [self.labels[g] for g in np.flatnonzero(broken)]
       raise FileError(f"numeric failure at step {now} in stream {bad[0]}: a loss is not finite; the last checkpoint is intact")
     if self.snapshots:
-      self.snapshots.take(loop.acting, before, digest, now, self.chunk_steps)
+      self.snapshots.take(self.acting, before, digest, now, self.chunk_steps)
     if self.done_chunks > 1:  # the first chunk compiles
       self.seconds["physics"] += physics
       self.seconds["acting"] += acted - begin - physics
@@ -249,7 +246,7 @@ class Runner:
     self.seconds["other"] += time.perf_counter() - begin
     meta = {"seconds": self.seconds, "quiet": self.quiet, "stream_seconds": self.stream_seconds.tolist(), "updates": self._updates.tolist(),
             "alarms": self._alarms.tolist(), "phase": self._phase.tolist()}
-    self.checkpoints.save(number, self.state, meta)
+    self.checkpoints.save(number, State(self.state.streams, self.crew.join(self.state.loop)), meta)
     for old in sorted(self.work.glob("trace-*.npz"))[:-2]:
       old.unlink()
 
@@ -261,7 +258,9 @@ class Runner:
     number = self.checkpoints.latest()
     if number is None:
       return
-    self.state, meta = self.checkpoints.load(self.state)
+    (streams, loop), meta = self.checkpoints.load(State(self.state.streams, self.crew.join(self.state.loop)))
+    self.state = State(streams, self.crew.split(loop))
+    self.acting = self.crew.acting(self.state.loop)
     with np.load(self.work / f"trace-{number:06d}.npz", allow_pickle=False) as z:
       self.parts = [{k: z[k] for k in z.files}]
     self.done_chunks = number

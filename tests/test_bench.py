@@ -226,12 +226,12 @@ def test_a_loss_that_is_not_finite_ends_a_run_in_one_line(mini, tmp_path, spoil)
   runner.open()
   runner.step()
   runner.save()
-  digest = runner.loop.digest
+  digest = runner.crew.digest
 
   def broken(*given):
     state, value = digest(*given)
     return state, spoil(value)
-  runner.loop.digest = broken
+  runner.crew.digest = broken
   with pytest.raises(FileError, match=r"^numeric failure at step 128 in stream \('none', 1\): a loss is not finite; the last checkpoint is intact$"):
     runner.step()
   runner.checkpoints.close()

@@ -191,7 +191,7 @@ def lived(config, folder):
 
   def watched(self):
     progress = step(self)
-    acted[progress.step - 1] = jax.tree.map(lambda x: np.array(x[3]), {k: self.state.loop.acting[k] for k in snapshots.ACTS})
+    acted[progress.step - 1] = jax.tree.map(lambda x: np.array(x[3]), {k: self.acting[k] for k in snapshots.ACTS})
     return progress
 
   def kept(self, wanted, targets, tell):

@@ -171,6 +171,7 @@ class Agent:
     params = self.prepare(params)
     tokens = self._encode(params, batch.obs[:, 1:].swapaxes(0, 1))
     uniform = jax.random.uniform(key, (length, rows, self.size.stoch))
+    wide = lambda x, axis: jnp.repeat(x, 2, axis) if rows == 1 else x  # on a CPU the product of a single row takes twice the time of that of two
 
     def step(state, x):
       deter, stoch = state
@@ -178,11 +179,11 @@ class Agent:
       keep = 1.0 - first[:, None]
       deter = self._core(params, deter * keep, stoch * keep, action * keep)
       logits = self._apply(params, "dyn", deter, tokens, method="posterior")
-      stoch = rssm.sample(logits, uniform).reshape(rows, -1)
-      return (deter, stoch), (deter, stoch, logits)
-    start = (batch.deter[:, 0].astype(jnp.float32), self.hot(batch.stoch[:, 0]))
+      stoch = rssm.sample(logits, uniform).reshape(deter.shape[0], -1)
+      return (deter, stoch), (deter[:rows], stoch[:rows], logits[:rows])
+    start = (wide(batch.deter[:, 0].astype(jnp.float32), 0), wide(self.hot(batch.stoch[:, 0]), 0))
     xs = (batch.action[:, :-1].swapaxes(0, 1), batch.first[:, 1:].swapaxes(0, 1).astype(jnp.float32), tokens, uniform)
-    return jax.lax.scan(step, start, xs)[1]
+    return jax.lax.scan(step, start, jax.tree.map(lambda x: wide(x, 1), xs))[1]
 
   def imagine(self, params, deter, stoch, key: jax.Array, steps: int):
     """Policy and prior from rows (N, D), (N, S), no gradient.
