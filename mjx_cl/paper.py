@@ -65,7 +65,7 @@ EXPERIMENTS: dict[str, Experiment] = {
     )),
     "paper/car-socks": Experiment(
         "car", 1, 10_000, "rear friction cut, as by socks", "1 run",
-        "a simulated four-wheel car in place of the real one, whose friction under a sock is a guess", (
+        "a simulated four-wheel car in place of the real one; friction under its socks chosen, on other seeds, to cost the paper's 20 %", (
         Statement("reward lost at first", "20 %", "IV-C", "drop", 0.2),
         Statement("alarm after the socks", "OPR nearly blind", "IV-C", "latency"),
         Statement("reward back after the socks", "10,000 steps", "V-C", "recovery", 10_000),

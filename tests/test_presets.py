@@ -6,7 +6,7 @@ import pytest
 from mjx_cl import config, envs, fault_presets, faults
 from mjx_cl.config import RunConfig
 from mjx_cl.errors import UserError
-from mjx_cl.fault_presets import PRESETS, Change
+from mjx_cl.fault_presets import PRESETS, SOCKS_GRIP, Change
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +46,7 @@ def test_the_papers_presets_have_the_papers_figures(robots):
   env = robots["car_real"]
   grip = after(env, "car/socks", "mj.geom_friction")[:, 0]
   rear, front = (list(dict(env.spec.feet)[k]) for k in ("rear", "front"))
-  np.testing.assert_allclose(grip[rear], 0.30, rtol=1e-5)  # float32
+  np.testing.assert_allclose(grip[rear], SOCKS_GRIP, rtol=1e-5)  # float32
   np.testing.assert_allclose(grip[front], 0.65, rtol=1e-5)
 
 

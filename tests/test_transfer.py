@@ -15,7 +15,7 @@ from mjx_cl.dreamer.agent import Agent
 from mjx_cl.envs.car import Car
 from mjx_cl.envs.car_real import CarReal
 from mjx_cl.errors import UserError
-from mjx_cl.fault_presets import SOCKS, Change, Preset
+from mjx_cl.fault_presets import SOCKS, SOCKS_GRIP, Change, Preset
 from mjx_cl.rollout import Rollout, nest, start
 from mjx_cl.transfer import Moving, Transfer
 
@@ -215,7 +215,7 @@ def test_a_fault_of_the_second_robot_follows(lived, transfer, params, keys):
   assert all((rows.obs[at:, g] != lived[1].obs[at:, g]).any() for g in range(SEEDS)) and (rows.severity[at:] == 1).all()
   grip = both.after._drive(jax.tree.map(lambda x: x[0, 0], streams.after), jax.random.key(0), jnp.zeros(2))[1].model.mj["geom_friction"][:, 0]
   feet = dict(both.after.env.spec.feet)
-  np.testing.assert_allclose(grip[jnp.asarray(feet["rear"])], 0.30, rtol=1e-5)
+  np.testing.assert_allclose(grip[jnp.asarray(feet["rear"])], SOCKS_GRIP, rtol=1e-5)
   np.testing.assert_allclose(grip[jnp.asarray(feet["front"])], 0.65, rtol=1e-5)
 
 
