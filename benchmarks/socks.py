@@ -23,7 +23,7 @@ import numpy as np  # noqa: E402
 from mjx_cl import bench, cli, envs, faults, store  # noqa: E402
 from mjx_cl.interrupt import Interruptible  # noqa: E402
 from mjx_cl.rollout import Rollout, nest, start  # noqa: E402
-from mjx_cl.run import Runner  # noqa: E402
+from mjx_cl.run import Runner, check_same  # noqa: E402
 from mjx_cl.scoring import bootstrap  # noqa: E402
 
 GRIPS = (0.65, 0.61, 0.60, 0.59, 0.58, 0.575, 0.57, 0.56, 0.55, 0.50, 0.45, 0.40, 0.35, 0.30)
@@ -35,6 +35,11 @@ def adapted(work: pathlib.Path, seeds: list[int], steps: int):
   """A Runner that has lived the car part of suite `paper` without its socks, for `steps` control steps."""
   (part,) = bench.pick(bench.suite("paper").parts, ("car",))
   runner = Runner(dataclasses.replace(part.config, seeds=len(seeds), first_seed=seeds[0], steps=steps, arms=("detector",), fault="car/sim-to-real"), work)
+  work.mkdir(parents=True, exist_ok=True)
+  if (work / "config.json").exists():
+    check_same(work, runner.config_dict())
+  else:
+    store.write_json(work / "config.json", runner.config_dict())
   runner.open()
   runner.resume()
   saved = time.monotonic()

@@ -220,9 +220,8 @@ def finished(out: pathlib.Path, part: Part) -> bool:
   folder = out / part.name
   if not (folder / "config.json").exists():
     return False
-  from mjx_cl.run import check_same
-  wanted = {k: v for k, v in json.loads(json.dumps(dataclasses.asdict(part.config))).items() if k != "physics"}
-  check_same(folder, wanted)
+  from mjx_cl.run import check_same, identity
+  check_same(folder, {k: v for k, v in identity(part.config).items() if k != "physics"})
   return (folder / "summary.json").exists()
 
 

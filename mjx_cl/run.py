@@ -68,7 +68,7 @@ class Runner:
   """Runs one RunConfig into the folder `out`.
 
   Streams are ordered arm by arm, seed by seed. A stream's keys come from its seed alone, so the same seed lives the same life in
-  every arm until an alarm is acted on. That is so bit for bit where XLA computes all streams alike, as it does with up to 4. With 10 or 20 the
+  every arm until an alarm is acted on. That is so bit for bit where XLA lets all streams act alike, as it does with up to 4. With 10 or 20 the
   last few of them are left over from its vector registers and are rounded otherwise, and a robot that walks makes much of a last bit.
   """
 
@@ -108,6 +108,7 @@ class Runner:
     self.acting = self.crew.acting(self.state.loop)
     self.choices = self._choices(self.state.streams)
     self.done_chunks = 0
+    self.compiled = False  # the first chunk of this process compiles
     self.seconds = {"physics": 0.0, "acting": 0.0, "digest": 0.0, "other": 0.0}
     self.quiet: list[float] = []  # digest time of chunks without an update
     self.parts: list[dict] = []
@@ -141,7 +142,7 @@ class Runner:
     digested = time.perf_counter()
     self.state = State(streams, loop)
     changed = (digest.updates != self._updates) | (digest.decision > 0)  # weights are what they were in every other stream
-    if changed.any():
+    if changed.any() or len(loop) == 1:  # the only block's own arrays, which its next digest uses up
       self.acting = self.crew.acting(loop)
     before = self._phase
     self._log(rows, digest)
@@ -154,7 +155,7 @@ class Runner:
       raise FileError(f"numeric failure at step {now} in stream {bad[0]}: a loss is not finite; the last checkpoint is intact")
     if self.snapshots:
       self.snapshots.take(self.acting, before, digest, now, self.chunk_steps)
-    if self.done_chunks > 1:  # the first chunk compiles
+    if self.compiled:
       self.seconds["physics"] += physics
       self.seconds["acting"] += acted - begin - physics
       self.seconds["digest"] += digested - acted
@@ -162,6 +163,7 @@ class Runner:
         self.quiet.append(digested - acted)
     else:
       self.seconds["other"] += digested - begin
+      self.compiled = True
     learning = max(0.0, digested - acted - float(np.median(self.quiet))) if self.quiet and updates.sum() else 0.0
     self.stream_seconds += (digested - begin - learning) / self.groups + learning * updates / max(1, updates.sum())
     self.seconds["other"] += time.perf_counter() - digested
@@ -258,7 +260,9 @@ class Runner:
     number = self.checkpoints.latest()
     if number is None:
       return
-    (streams, loop), meta = self.checkpoints.load(State(self.state.streams, self.crew.join(self.state.loop)))
+    like = State(self.state.streams, self.crew.shapes(self.state.loop))
+    self.state = self.acting = None  # what the run began with need not lie beside what it goes on with
+    (streams, loop), meta = self.checkpoints.load(like)
     self.state = State(streams, self.crew.split(loop))
     self.acting = self.crew.acting(self.state.loop)
     with np.load(self.work / f"trace-{number:06d}.npz", allow_pickle=False) as z:
@@ -275,7 +279,7 @@ class Runner:
 
   def config_dict(self) -> dict:
     """What config.json holds."""
-    return {"command": "run", **json.loads(json.dumps(dataclasses.asdict(self.config))),
+    return {"command": "run", **identity(self.config),
             "physics": "+".join(dict.fromkeys(robot.physics.name for robot in self.robots)),
             "agent_card": self.trained.card, **({"arm_cards": {arm: other.card for arm, other in self.others.items()}} if self.others else {}), "agent_path": pathlib.Path(self.trained.path).name, "repeat": self.repeat,
             "control_s": self.env.spec.control_s, **store.provenance()}
@@ -533,7 +537,7 @@ def execute(config: RunConfig, out, resume: bool = False, overwrite: bool = Fals
   out = pathlib.Path(out)
   state = store.claim_folder(out, resume, overwrite)
   if state == "done":
-    check_same(out, {k: v for k, v in json.loads(json.dumps(dataclasses.asdict(config))).items() if k != "physics"})  # `auto` is resolved there
+    check_same(out, {k: v for k, v in identity(config).items() if k != "physics"})  # `auto` is resolved there
     return json.loads((out / "summary.json").read_text())
   runner = Runner(config, out)  # refuses wrong names and broken agents before anything of an earlier run is removed
   values = runner.config_dict()
@@ -575,6 +579,11 @@ def clear(out: pathlib.Path) -> None:
     shutil.rmtree(out / name, ignore_errors=True)
 
 
+def identity(config: RunConfig) -> dict:
+  """What makes a run what it is, as config.json holds it: its settings, and `changes`, what a preset's name stood for when it began."""
+  return json.loads(json.dumps({**dataclasses.asdict(config), "changes": [dataclasses.asdict(change) for change in changes(config)]}))
+
+
 def check_same(out: pathlib.Path, values: dict) -> None:
   """Refuses to resume with other settings than the run began with."""
   try:
@@ -583,6 +592,6 @@ def check_same(out: pathlib.Path, values: dict) -> None:
     raise FileError(f"{out / 'config.json'} is not a run's; give --overwrite or another --out") from None
   skip = ("git_commit", "machine", "python")
   default = {f.name: f.default for f in dataclasses.fields(RunConfig)}  # of a setting that did not exist when the run began
-  changed = [k for k in values if k not in skip and old.get(k, default.get(k)) != values[k]]
+  changed = [k for k in values if k not in skip and (k in old or k in default) and old.get(k, default.get(k)) != values[k]]
   if changed:
     raise UserError(f"--resume: {out} was begun with another {', '.join(changed)}; give the same settings or --overwrite")

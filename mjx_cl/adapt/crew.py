@@ -1,9 +1,8 @@
 """The streams of a run side by side on the cores: each block of them is a Loop of its own, taken by whichever thread is free.
 
-A Loop treats each of its streams alone, so how they are cut into blocks changes nothing but the time. One large program does not keep two cores busy: only the
-products within it are shared out, a few at a time. On a CPU a block is one stream: a program that is compiled once for every number of seeds and arms, a stream that
-learns does not hold up those that only watch, and what it computes depends neither on its neighbours nor on how many cores there are. On an accelerator all
-streams are one block.
+A Loop treats each of its streams alone, so how they are cut into blocks changes nothing but the time, and the last digits of a float. One large program does not keep
+two cores busy: only the products within it are shared out, a few at a time. On a CPU a block is one stream: a program that is compiled once for every number of seeds,
+a stream that learns does not hold up those that only watch, and what it computes does not depend on its neighbours. On an accelerator all streams are one block.
 """
 from __future__ import annotations
 
@@ -50,6 +49,9 @@ class Crew:
   def digest(self, states: list[LoopState], rows, now, choices: Choices, keys, acceptance=None) -> tuple[list[LoopState], Digest]:
     """One chunk of all streams; arguments as of Loop._digest, `states` is used up. The Digest is NumPy."""
     host = lambda tree: jax.tree.map(np.asarray, tree)
+    if len(self.blocks) == 1:
+      state, digest = self.loop.digest(states[0], rows, now, choices, keys, acceptance)
+      return [jax.block_until_ready(state)], host(digest)
     rows, choices, acceptance = host(rows), host(choices), host(acceptance)
 
     def one(i):
@@ -70,10 +72,16 @@ class Crew:
     return [state for state, _ in done], glue([digest for _, digest in done], ROWS)
 
   def acting(self, states: list[LoopState]) -> Any:
-    """What each stream acts by, leading (groups,)."""
+    """What each stream acts by, leading (groups,). Of a single block these are its own arrays: the next digest uses them up."""
     if len(states) == 1:
       return states[0].acting
     return jax.tree.map(lambda *x: jnp.asarray(np.concatenate([np.asarray(y) for y in x])), *[state.acting for state in states])
+
+  def shapes(self, states: list[LoopState]) -> LoopState:
+    """What `join` gives, without its numbers and without their memory."""
+    wide = lambda x, axis: np.broadcast_to(np.zeros((), x.dtype), x.shape[:axis] + (self.groups,) + x.shape[axis + 1:])
+    field = lambda name: jax.tree.map(lambda x: wide(x, int(name in LATER)), getattr(states[0], name))
+    return LoopState(*(field(name) for name in LoopState._fields))
 
   def join(self, states: list[LoopState]) -> LoopState:
     """One LoopState of all streams, NumPy: what a checkpoint holds."""

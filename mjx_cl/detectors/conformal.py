@@ -16,11 +16,11 @@ LOW, WIDTH = -2.0, 0.25  # left edge and width of the bins [warm-up std]: fine w
 
 class ConformalState(NamedTuple):
   """Attributes:
-    warm: scale of the stream. counts: int32 (bins,), samples so far in each bin of nonconformity or above it. seen: int32 (), their number. evidence: float32 (bets,), see
-    e_detector.accumulate. key: uint32 (2,), of the tie-breaking; its second word counts samples.
+    warm: scale of the stream. upwards: int32 (bins,), samples so far in each bin of nonconformity or above it. seen: int32 (), their number.
+    evidence: float32 (bets,), see e_detector.accumulate. key: uint32 (2,), of the tie-breaking; its second word counts samples.
   """
   warm: Warm
-  counts: jax.Array
+  upwards: jax.Array
   seen: jax.Array
   evidence: jax.Array
   key: jax.Array
@@ -75,7 +75,7 @@ def conformal(threshold: float = 9.2104, bets: tuple[float, ...] = (0.1, 0.3, 0.
     mine = jnp.floor(jnp.clip(a / WIDTH, 0, bins - 1)).astype(jnp.int32)
     # each sample has a key of its own: one cipher call, not two
     u = 1 - jax.random.uniform(jax.random.wrap_key_data(state.key, impl="threefry2x32"))  # in (0, 1], so that ln p is finite
-    upwards = jnp.append(state.counts, 0)
+    upwards = jnp.append(state.upwards, 0)
     more = upwards[mine + 1]
     equal = upwards[mine] - more + 1
     p = (more + u * equal) / (state.seen + 1)
@@ -83,7 +83,7 @@ def conformal(threshold: float = 9.2104, bets: tuple[float, ...] = (0.1, 0.3, 0.
     evidence, score = accumulate(state.evidence, np.log(power) + (power - 1) * jnp.log(p), form)
     fired = ready & (score > threshold)
     counted = ready & ((state.seen < freeze) | (freeze == 0))
-    new = ConformalState(warm, state.counts + (counted & (place <= mine)), state.seen + counted, jnp.where(ready & ~fired, evidence, 0.0),
+    new = ConformalState(warm, state.upwards + (counted & (place <= mine)), state.seen + counted, jnp.where(ready & ~fired, evidence, 0.0),
                          state.key + jnp.where(ready, jnp.array([0, 1], jnp.uint32), jnp.uint32(0)))
     return new, Alarm(fired, jnp.where(ready, score, jnp.nan))
 
