@@ -68,16 +68,6 @@ def batch(agent, key):
                jax.random.randint(keys[3], shape + (agent.size.stoch,), 0, agent.size.classes), jnp.zeros(shape + (agent.act_size,)), none)
 
 
-def side_by_side(seeds: int, last_starts: int = 0):
-  """A function that takes one update of each of `seeds` seeds as train.make_side_by_side does: each in a call of its own, as many at a time as there are cores."""
-  import concurrent.futures
-  from mjx_cl import workers
-  runs = [updater("size1m", last_starts) for _ in range(seeds)]
-  runs[0]()
-  pool = concurrent.futures.ThreadPoolExecutor(len(workers.cores()))
-  return lambda: list(pool.map(lambda run: run(), runs))
-
-
 def updater(size: str, last_starts: int = 0, seeds: int = 0, how: str = "map", **options):
   """A function that takes one update (of each of `seeds` seeds) and blocks."""
   import jax
@@ -230,11 +220,8 @@ def main() -> None:
     row(f"monitor, {STREAMS} streams, {what}, per control step", times[name] / 64 * 1e3, "ms")
     row(f"monitor, {STREAMS} streams, {what}, share of the matrix rate", GFLOP["monitor"] / (times[name] / 64) / clock.rate, "", ">= 0.45")
   if not args.quick:
-    times = clock.measure({"one": updater("size1m", 16), "side": side_by_side(10, 16)}, 8)
-    row("ten seeds side by side, 256 starts, per seed / one seed alone", times["side"] / 10 / times["one"], "ratio", "<= 0.9")
-    times = clock.measure({"one": updater("size1m"), "side": side_by_side(10)} | {how: updater("size1m", seeds=10, how=how) for how in ("map", "pairs", "vmap")}, 8)
-    row("ten seeds side by side, per seed / one seed alone", times["side"] / 10 / times["one"], "ratio", "<= 0.9")
-    row("ten seeds in one program (lax.map), per seed / one seed alone", times["map"] / 10 / times["one"], "ratio")
+    times = clock.measure({"one": updater("size1m")} | {how: updater("size1m", seeds=10, how=how) for how in ("map", "pairs", "vmap")}, 8)
+    row("ten seeds in one program (lax.map), per seed / one seed alone", times["map"] / 10 / times["one"], "ratio", "<= 0.9")
     row("ten seeds in pairs, per seed / one seed alone", times["pairs"] / 10 / times["one"], "ratio")
     row("ten seeds by vmap, per seed / one seed alone", times["vmap"] / 10 / times["one"], "ratio")
     times = clock.measure({"x": updater("size12m")}, 5)

@@ -1,7 +1,6 @@
 """Pretraining: a host loop of collect (acting and physics) and learn (updates), resumable at any chunk."""
 from __future__ import annotations
 
-import concurrent.futures
 import dataclasses
 import functools
 import json
@@ -15,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_cl import checkpoint, demonstrator, faults, memory, replay as replay_lib, workers
+from mjx_cl import checkpoint, demonstrator, faults, memory, replay as replay_lib
 from mjx_cl.config import DreamerConfig, TrainConfig
 from mjx_cl.dreamer.agent import Agent, TrainState, Weights
 from mjx_cl.errors import FileError, UserError
@@ -28,10 +27,10 @@ FAULT = 11  # folded into a stream's key for the draw of its faults
 
 
 class Learner(NamedTuple):
-  """Arrays of a pretraining run, all with a leading seeds axis but `key`; `replay` is a list of such, one for each seed, where seeds learn side by side."""
+  """Arrays of a pretraining run, all with a leading seeds axis but `key`."""
   train: TrainState
   streams: Stream
-  replay: replay_lib.Replay | list[replay_lib.Replay]
+  replay: replay_lib.Replay
   key: jax.Array
 
 
@@ -69,32 +68,6 @@ def make_learn(agent: Agent, batch: int, length: int, mesh=None):
       body = jax.shard_map(body, mesh=mesh, in_specs=(mine, mine, mine, all_, mine), out_specs=mine, check_vma=False)
     return body(train, replay, jax.random.split(key, seeds), weights, active)
   return learn
-
-
-def make_side_by_side(learn, seeds: int):
-  """`learn` of `make_learn` for seeds whose replays lie apart, in a list: each by itself, as many at a time as there are cores.
-
-  One update keeps two cores busy for less than two thirds of its time; ten seeds on two cores take 0.7 of what they take one after another (results/dreamer_update.json).
-  The numbers are those of a seed alone.
-  """
-  split = jax.jit(lambda tree: [jax.tree.map(lambda x: x[g:g + 1], tree) for g in range(seeds)])
-  stack = jax.jit(lambda parts: jax.tree.map(lambda *x: jnp.concatenate(x), *parts))
-  compiled: set[int] = set()
-
-  def every(train, replays, key, weights, active, updates):
-    trains, keys = split(train), jax.random.split(key, seeds)
-    one = lambda g: jax.block_until_ready(learn(trains[g], replays[g], keys[g], weights, active[g:g + 1], updates))
-    at_work = [int(g) for g in np.flatnonzero(active)]
-    first = [] if updates in compiled else at_work[:1]  # compiles; threads that came at the same time would all compile
-    out = {g: one(g) for g in first}
-    compiled.add(updates)
-    with concurrent.futures.ThreadPoolExecutor(len(workers.cores())) as pool:
-      rest = [g for g in at_work if g not in out]
-      out |= dict(zip(rest, pool.map(one, rest)))
-    nothing = jax.tree.map(np.zeros_like, next(iter(out.values()))[2])
-    of = lambda g: out.get(g, (trains[g], replays[g], nothing))
-    return stack([of(g)[0] for g in range(seeds)]), [of(g)[1] for g in range(seeds)], stack([of(g)[2] for g in range(seeds)])
-  return every
 
 
 def seeds_mesh(seeds: int):
@@ -159,19 +132,16 @@ class Trainer:
     spec = env.spec
     self.plain = Agent(dreamer, len(spec.obs), len(spec.act))
     self.mesh = seeds_mesh(seeds)
-    self.apart = seeds > 1 and self.mesh is None and jax.default_backend() == "cpu"  # each seed has a replay, and learns, by itself
     memory.check(dreamer.size, len(spec.obs), len(spec.act), config.envs * config.capacity, seeds, ("capacity", config.envs), dreamer.bins,
                  1 if self.mesh is None else self.mesh.size)
     self.failed: dict[int, str] = {}  # seed -> the term that was not finite, and when
     fault = faults.make(config.fault or "none", env)
     self.collect = {"pure": Rollout(env, self.plain, fault, config.repeat)}
-    learner = lambda agent: make_learn(agent, dreamer.batch, dreamer.length, self.mesh)
-    learner = (lambda agent, whole=learner: make_side_by_side(whole(agent), seeds)) if self.apart else learner
-    self.learn = {"pure": learner(self.plain)}
+    self.learn = {"pure": make_learn(self.plain, dreamer.batch, dreamer.length, self.mesh)}
     if self.expert:
       cloning = Agent(dreamer, len(spec.obs), len(spec.act), clone_std=config.clone_std)
       rollout = Rollout(env, cloning, fault, config.repeat, expert=self.expert, expert_noise=config.demo_noise)
-      learn = learner(cloning)
+      learn = make_learn(cloning, dreamer.batch, dreamer.length, self.mesh)
       self.collect |= {"clone": rollout, "fade": rollout}
       self.learn |= {"clone": learn, "fade": learn}
     key_init, key_stream, key = jax.random.split(jax.random.key(seed), 3)
@@ -181,8 +151,7 @@ class Trainer:
     self.fault = fault if config.fault else None
     streams = nest(lambda k: start(env, agent, fault, k, plan=self._drawn(k)), 0, 0)(keys)
     empty = replay_lib.init(config.envs, config.capacity, len(spec.obs), len(spec.act), size.deter, size.stoch)
-    filled = lambda n: jax.tree.map(lambda x: jnp.broadcast_to(x, (n,) + x.shape).copy(), empty)
-    replay = [filled(1) for _ in range(seeds)] if self.apart else filled(seeds)
+    replay = jax.tree.map(lambda x: jnp.broadcast_to(x, (seeds,) + x.shape).copy(), empty)
     self.state = self._place(Learner(train, streams, replay, key))
     self.returns = Returns((seeds, config.envs))
     self._add = jax.jit(jax.vmap(replay_lib.add), donate_argnums=0)
@@ -197,18 +166,6 @@ class Trainer:
       return state
     spread = jax.sharding.NamedSharding(self.mesh, jax.sharding.PartitionSpec("seeds"))
     return state._replace(train=jax.device_put(state.train, spread), replay=jax.device_put(state.replay, spread))
-
-  def _replays(self, each) -> replay_lib.Replay | list[replay_lib.Replay]:
-    """each(replay, its seeds as a slice), for all seeds at once or one by one."""
-    if not self.apart:
-      return each(self.state.replay, slice(None))
-    return [each(replay, slice(g, g + 1)) for g, replay in enumerate(self.state.replay)]
-
-  def _joined(self) -> Learner:
-    """The state with one replay, as a checkpoint holds it."""
-    if not self.apart:
-      return self.state
-    return self.state._replace(replay=jax.tree.map(lambda *x: np.concatenate([np.asarray(y) for y in x]), *self.state.replay))
 
   @property
   def updates(self) -> int:
@@ -247,8 +204,7 @@ class Trainer:
         self._enter("fade")
     elif self.phase == "fade" and (done - self.phase_start >= c.fade or c.updates - done <= c.pure):
       self._enter("pure")
-      clear = jax.jit(replay_lib.clear, donate_argnums=0)
-      self.state = self.state._replace(replay=self._replays(lambda replay, own: clear(replay)))
+      self.state = self.state._replace(replay=jax.jit(replay_lib.clear, donate_argnums=0)(self.state.replay))
 
   def _enter(self, phase: str) -> None:
     self.phase, self.phase_start = phase, self.updates
@@ -276,8 +232,7 @@ class Trainer:
     streams, rows = self.collect[self.phase].chunk(params, self.state.streams, CHUNK, drive, shake)
     if self.fault is not None:
       streams = self._redraw(streams, jnp.any(rows.terminated | rows.truncated, 0))
-    new = kept(rows)
-    replay = self._replays(lambda replay, own: self._add(replay, *jax.tree.map(lambda x: x[own], new)))
+    replay = self._add(self.state.replay, *kept(rows))
     self.state = self.state._replace(streams=streams, replay=replay)
     expert_returns, own, each = [], [], {g: [] for g in range(self.seeds)}
     for at, value in self.returns.add(rows):
@@ -295,8 +250,7 @@ class Trainer:
     if self.seeds > 1:
       row |= {f"return/{g}": float(np.mean(values)) if values else None for g, values in each.items()}
     size = self.dreamer.batch * self.dreamer.length
-    windows = jax.vmap(lambda r: replay_lib.windows(r, self.dreamer.length + 1))
-    enough = int(min(np.min(n) for n in jax.tree.leaves(self._replays(lambda replay, own: windows(replay))))) >= size
+    enough = int(np.min(jax.vmap(lambda r: replay_lib.windows(r, self.dreamer.length + 1))(self.state.replay))) >= size
     if enough:
       self.owed += CHUNK * self.config.envs * self.config.ratio / size
       kept = 0 if self.phase == "pure" else self.config.pure  # the last phase gets its updates in full
@@ -342,7 +296,7 @@ class Trainer:
             "sums": self.returns.sums.tolist(), "seconds": self.seconds, "failed": {str(g): why for g, why in self.failed.items()}}
     self.write_metrics()  # first: a kill in between leaves rows too many, which resume cuts off
     if self.checkpoints.latest() != self.chunks:
-      self.checkpoints.save(self.chunks, self._joined(), meta)
+      self.checkpoints.save(self.chunks, self.state, meta)
 
   def write_metrics(self) -> None:
     import pyarrow
@@ -357,12 +311,7 @@ class Trainer:
   def resume(self) -> None:
     """Goes on from the newest checkpoint."""
     import pyarrow.parquet
-    if self.apart:  # empty replays need not lie beside those that are read
-      wide = lambda x: np.broadcast_to(np.zeros((), x.dtype), (self.seeds,) + x.shape[1:])
-      self.state = self.state._replace(replay=jax.tree.map(wide, self.state.replay[0]))
     state, meta = self.checkpoints.load(self.state)
-    if self.apart:
-      state = state._replace(replay=[jax.tree.map(lambda x: jnp.asarray(x[g:g + 1]), state.replay) for g in range(self.seeds)])
     self.state = self._place(state)
     self.failed = {int(g): why for g, why in meta.get("failed", {}).items()}
     self.phase, self.phase_start, self.owed, self.own = meta["phase"], meta["phase_start"], meta["owed"], meta["own"]
@@ -436,11 +385,11 @@ def run(trainer: Trainer, progress=lambda row: None, save_every_s: float = 240.0
   saved = time.monotonic()
   with Interruptible() as interrupt:
     while not trainer.done:
-      progress(trainer.step())
       try:
+        progress(trainer.step())
         interrupt.check()
       except KeyboardInterrupt:
-        trainer.save()  # between two chunks; a second signal, in the middle of one, leaves nothing whole to save
+        trainer.save()
         raise
       if time.monotonic() - saved > save_every_s:
         trainer.save()
