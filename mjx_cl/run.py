@@ -591,7 +591,7 @@ def check_same(out: pathlib.Path, values: dict) -> None:
   except ValueError:
     raise FileError(f"{out / 'config.json'} is not a run's; give --overwrite or another --out") from None
   skip = ("git_commit", "machine", "python")
-  default = {f.name: f.default for f in dataclasses.fields(RunConfig)}  # of a setting that did not exist when the run began
-  changed = [k for k in values if k not in skip and (k in old or k in default) and old.get(k, default.get(k)) != values[k]]
+  default = {f.name: f.default for f in dataclasses.fields(RunConfig)}  # of a setting that did not exist when the run began; nor did `changes` always
+  changed = [k for k in values if k not in skip and old.get(k, default.get(k, values[k] if k == "changes" else None)) != values[k]]
   if changed:
     raise UserError(f"--resume: {out} was begun with another {', '.join(changed)}; give the same settings or --overwrite")

@@ -347,8 +347,8 @@ def story():
 
 
 def test_blocks_of_streams_live_as_all_in_one_program(story):
-  """Blocks of two streams and of one: the same decisions, alarms, phases and updates. Numbers differ by rounding alone, since XLA rounds a product by its shape;
-  a tiny net's updates make up to 1e-3 of 1e-7 (measured 2e-4)."""
+  """Blocks of two streams and of one: the same decisions, alarms, phases and updates. Numbers differ by rounding alone, since XLA rounds a product by its shape,
+  which a dozen updates make larger: 1e-3 of a signal, a twentieth of the largest step that an array of weights has taken."""
   begin, told = story
   again, blocks = tell(Agent, block=2)
   jax.tree.map(np.testing.assert_array_equal, begin, again)

@@ -30,7 +30,7 @@ def test_as_many_as_cores_and_memory_allow(monkeypatch, asked, needs, space, wan
 
 @pytest.mark.parametrize("need, measured", [(0.8, 5.2), (1.1, 5.5), (1.5, 10.4), (1.8, 12.0)])
 def test_a_process_takes_more_than_its_replays(need, measured):
-  assert workers.resident(int(need * GB)) == pytest.approx(measured * 1e9, rel=0.6)  # the one that is off most is over
+  assert measured * 1e9 <= workers.resident(int(need * GB)) <= 1.6 * measured * 1e9  # never less than what was seen
 
 
 @pytest.mark.parametrize("asked, words", [(0, "1..4"), (5, "1..4"), (3, "2 would")])
