@@ -39,6 +39,8 @@ class DreamerConfig:
     last_starts: imagination starts are the last k states of each sequence; 0 means all.
     horizon: the discount is 1 - 1 / horizon.
     lr, warmup: learning rate and updates of its linear warm-up.
+    policy_lr: factor on the policy's steps; 1, as the authors'. Below 1 the world model keeps ahead of the policy (the quadruped's at 1 runs to
+      where the model promises too much, and its return falls).
     bins: classes of the two-hot heads.
     entropy: weight of the policy's entropy.
     obs_scale: one number per observation variable that it is divided by before encoder and decoder loss, `spec`: the robot's typical deviations
@@ -53,6 +55,7 @@ class DreamerConfig:
   horizon: int = 333
   lam: float = 0.95
   lr: float = 4e-5
+  policy_lr: float = 1.0
   warmup: int = 1000
   agc: float = 0.3
   bins: int = 255
@@ -72,7 +75,7 @@ class DreamerConfig:
         raise UserError(f"obs_scale needs numbers above 0; got {self.obs_scale}")
     elif self.obs_scale not in (None, "spec"):
       raise UserError(f"obs_scale is `spec`, numbers above 0, or none; got {self.obs_scale!r}")
-    positive(self, "batch", "length", "imagine", "horizon", "lr", "bins")
+    positive(self, "batch", "length", "imagine", "horizon", "lr", "policy_lr", "bins")
     if self.context != 1:
       raise UserError(f"context must be 1, as in the authors' code; got {self.context}")
     if not 0 <= self.last_starts <= self.length:

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_cl.config import DreamerConfig
+from mjx_cl.config import DreamerConfig, replace
 from mjx_cl.dreamer import nets, rssm
 from mjx_cl.dreamer.agent import Agent, Batch, Weights, parameter_count
 
@@ -353,6 +353,20 @@ def test_learning_rate_factor_scales_the_step(plain):
   middle = jax.tree.map(lambda a, b: (a + b) / 2, state.params, full_step.params)
   assert gap(half_step.params, middle) < 1e-6  # float32 rounding of gains near 1
   assert gap(full_step.params, half_step.params) > 1e-6
+
+
+def test_policy_lr_scales_the_steps_of_the_policy_alone(plain):
+  agent, update, state = plain
+  slow = Agent(replace(agent.config, policy_lr=0.25), agent.obs_size, agent.act_size)
+  assert agent.config.policy_lr == 1.0
+  state, _, _ = update(state, make_batch(), KEY)
+  full, _, _ = update(state, make_batch(1), KEY)
+  quarter, _, _ = jax.jit(slow.update)(state, make_batch(1), KEY, jax.tree.map(jnp.float32, Weights()))
+  wanted = jax.tree.map(lambda a, b: 0.75 * a + 0.25 * b, state.params["pol"], full.params["pol"])
+  assert gap(quarter.params["pol"], wanted) < 1e-6  # float32 rounding of gains near 1
+  assert gap(full.params["pol"], quarter.params["pol"]) > 1e-6
+  rest = lambda tree: {k: v for k, v in tree.items() if k != "pol"}
+  assert gap(rest(quarter.params), rest(full.params)) < 1e-6
 
 
 def trained(update, state, steps=3, **kwargs):

@@ -295,6 +295,8 @@ class Agent:
     grads, (metrics, range_, deter, stoch) = grad(state.params, state.slow, state.range, batch, key, weights)
     steps, opt = self.optimizer.update(grads, state.opt, state.params)
     steps = jax.tree.map(lambda x: weights.lr * x, steps)
+    if self.config.policy_lr != 1.0:
+      steps = {**steps, "pol": jax.tree.map(lambda x: self.config.policy_lr * x, steps["pol"])}
     params = optax.apply_updates(state.params, steps)
     slow = jax.tree.map(lambda s, p: (1.0 - self.config.slow_rate) * s + self.config.slow_rate * p, state.slow, params["val"])
     metrics["opt/grad_norm"] = optax.global_norm(grads)
