@@ -144,6 +144,7 @@ class AdaptConfig:
     ratio: replayed steps per post-alarm record, 16 in the paper.
     start_windows: windows that the post-alarm replay must hold before the first update.
     lr: learning rate while adapting, None: the agent's own.
+    policy_lr: factor on the policy's steps while adapting, None: the agent's own.
     batch: sequences of one update while adapting, None: the agent's own 16. At the same train ratio fewer sequences mean more updates: 4 give
       four updates every 64 steps. Right hip's gear halved, seeds 100 to 103, mean reward 4,000 to 8,000 steps after onset, two agents that
       differ in nothing but their training: 0.73 with 4 sequences at 1e-4, 0.68 with 16 at 2e-4, 0.58 with 4 at 2e-4 (an agent whose training
@@ -174,6 +175,7 @@ class AdaptConfig:
   ratio: float = 16.0
   start_windows: int = 1024
   lr: float | None = 1e-4
+  policy_lr: float | None = None
   batch: int | None = 4
   last_starts: int | None = 0
   average: float = 0.1
@@ -201,7 +203,7 @@ class AdaptConfig:
       raise UserError(f"patience must be at least 4 chunks; got {self.patience}")
     if self.period_steps >= self.period:
       raise UserError(f"period_steps must be below period={self.period}; got {self.period_steps}")
-    positive(self, *(name for name in ("lr", "batch") if getattr(self, name) is not None))
+    positive(self, *(name for name in ("lr", "policy_lr", "batch") if getattr(self, name) is not None))
 
 
 @dataclass(frozen=True)

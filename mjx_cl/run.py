@@ -30,7 +30,7 @@ from mjx_cl.adapt.arms import ARMS, FOREVER, NEVER, never_stops
 from mjx_cl.adapt.convergence import SIGNALS
 from mjx_cl.adapt.crew import Crew
 from mjx_cl.adapt.loop import Choices, Loop, LoopState, choices
-from mjx_cl.config import RunConfig, becomes, changes
+from mjx_cl.config import AdaptConfig, RunConfig, becomes, changes
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.interrupt import Interruptible
 from mjx_cl.monitor import Monitor
@@ -78,7 +78,7 @@ class Runner:
     self.other = envs.make(becomes(config), config.physics) if becomes(config) else None  # what the robot becomes
     self.robots = [self.env] + [self.other] * (self.other is not None)
     spec = self.env.spec
-    self.trained = agents.load(config.agent, config.env, len(spec.obs), len(spec.act), lr=config.adapt.lr,
+    self.trained = agents.load(config.agent, config.env, len(spec.obs), len(spec.act), lr=config.adapt.lr, policy_lr=config.adapt.policy_lr,
                                last_starts=config.adapt.last_starts, batch=config.adapt.batch)
     agent, self.repeat = self.trained.agent, int(self.trained.card.get("repeat", 1))
     self.others = arm_agents(config, spec)
@@ -591,6 +591,8 @@ def check_same(out: pathlib.Path, values: dict) -> None:
   except ValueError:
     raise FileError(f"{out / 'config.json'} is not a run's; give --overwrite or another --out") from None
   skip = ("git_commit", "machine", "python")
+  if isinstance(old.get("adapt"), dict):
+    old["adapt"] = {**dataclasses.asdict(AdaptConfig()), **old["adapt"]}
   default = {f.name: f.default for f in dataclasses.fields(RunConfig)}  # of a setting that did not exist when the run began; nor did `changes` always
   changed = [k for k in values if k not in skip and old.get(k, default.get(k, values[k] if k == "changes" else None)) != values[k]]
   if changed:

@@ -377,6 +377,14 @@ def test_a_run_begun_before_there_were_snapshots_goes_on(tmp_path):
     run.check_same(tmp_path, {"env": "walker", "snapshots": 5})
 
 
+def test_a_setting_of_adapt_that_did_not_exist_when_the_run_began(tmp_path):
+  now = dataclasses.asdict(AdaptConfig())
+  store.write_json(tmp_path / "config.json", {"adapt": {k: v for k, v in now.items() if k != "policy_lr"}})
+  run.check_same(tmp_path, {"adapt": now})
+  with pytest.raises(UserError, match="another adapt"):
+    run.check_same(tmp_path, {"adapt": {**now, "policy_lr": 0.5}})
+
+
 def test_a_fault_that_is_not_there_yet_is_not_evaluated(config, tmp_path):
   make = lambda **kw: Snapshots.severities.__get__(type("S", (), kw)())
   of = make(config=dataclasses.replace(config, onset=500), changes=run.changes(dataclasses.replace(config, duration=200)))
