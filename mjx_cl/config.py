@@ -94,6 +94,7 @@ class TrainConfig:
     ratio: replayed steps per collected record (1,024 = one update per record at batch 16 x 64).
     capacity: records kept per robot.
     repeat: control steps for which an action is held.
+    episode: control steps after which a training episode is cut off, None: the robot's own. Short ones show more of how an episode starts.
     lr_end: learning rate at the last update, reached linearly over the last `pure` updates (None: constant).
     demonstrator: path of a demonstrator policy, `reference` (the robot's own driver that knows its state), or None.
     demo_share: share of the robots that the demonstrator drives until the pure phase.
@@ -114,6 +115,7 @@ class TrainConfig:
   ratio: float = 1024.0
   capacity: int = 62_500
   repeat: int = 1
+  episode: int | None = None
   lr_end: float | None = None
   demonstrator: str | None = None
   demo_share: float = 0.5
@@ -130,7 +132,7 @@ class TrainConfig:
   severity: float = 1.0
 
   def __post_init__(self):
-    positive(self, "envs", "updates", "ratio", "capacity", "repeat")
+    positive(self, "envs", "updates", "ratio", "capacity", "repeat", *(("episode",) if self.episode is not None else ()))
     fraction(self, "demo_share", "clone_until", "shake", "shake_share", "severity")
     if self.demonstrator and self.clone + self.fade + self.pure > self.updates:
       raise UserError(f"clone + fade + pure = {self.clone + self.fade + self.pure} exceeds updates = {self.updates}")

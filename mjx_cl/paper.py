@@ -4,6 +4,7 @@ The paper: F. Domberg and G. Schildbach, arXiv 2603.04029. Each statement carrie
 """
 from __future__ import annotations
 
+import dataclasses
 from typing import NamedTuple
 
 import numpy as np
@@ -171,9 +172,12 @@ def difference(paper: float | None, own: Measured) -> str:
 def setup(experiment: Experiment, config: dict) -> list[str]:
   """What differs from the paper's set-up: the settings that config.json holds against the authors' defaults, then what the robot differs in."""
   card, adapt, author = config["agent_card"], config["adapt"], DreamerConfig()
-  own = lambda name: adapt[name] if adapt[name] is not None else card["dreamer"][name]
+  dreamer = {**dataclasses.asdict(author), **card["dreamer"]}  # a card older than a setting has its default
+  own = lambda name: adapt[name] if adapt.get(name) is not None else dreamer[name]
   pairs = [(card["dreamer"]["size"], author.size, "{} in place of {}"), (own("batch"), author.batch, "{} sequences an update in place of {}"),
-           (own("lr"), author.lr, "learning rate {:g} in place of {:g}"), (adapt["ratio"], RATIO, "train ratio {:g} in place of {:g}"),
+           (own("lr"), author.lr, "learning rate {:g} in place of {:g}"),
+           (own("policy_lr"), author.policy_lr, "the policy's own steps {:g} times as long"),
+           (dreamer["horizon"], author.horizon, "horizon {} in place of {}"), (adapt["ratio"], RATIO, "train ratio {:g} in place of {:g}"),
            (config["onset"], experiment.onset, "onset {:,} in place of {:,}")]
   words = [text.format(ours, theirs) for ours, theirs, text in pairs if ours != theirs]
   if config["detector"] != "rolling_sigma_plain":

@@ -1,6 +1,7 @@
 """Pretraining: a host loop of collect (acting and physics) and learn (updates), resumable at any chunk."""
 from __future__ import annotations
 
+import copy
 import dataclasses
 import functools
 import json
@@ -92,6 +93,15 @@ def expert(env, name: str):
   return lambda stream: policy(stream.obs)
 
 
+def cut(env, steps: int | None):
+  """The environment with episodes of `steps` control steps; itself for None."""
+  if steps is None:
+    return env
+  env = copy.copy(env)
+  env.spec = env.spec._replace(episode_steps=steps)
+  return env
+
+
 class Returns:
   """Returns of finished episodes, per stream, from chunks of rewards."""
 
@@ -120,6 +130,7 @@ class Trainer:
 
   def __init__(self, env, dreamer: DreamerConfig, config: TrainConfig, out, seed: int = 0, seeds: int = 1):
     self.env, self.dreamer, self.config, self.out = env, dreamer, config, pathlib.Path(out)
+    env = cut(env, config.episode)
     self.seeds = seeds
     self.expert = expert(env, config.demonstrator) if config.demonstrator else None
     self.expert_return = 0.0

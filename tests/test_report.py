@@ -440,6 +440,8 @@ def test_what_differs_from_the_papers_setup():
   same["agent_card"] = {"dreamer": {"size": "size12m", "batch": 16, "lr": 4e-5}}
   assert paper.setup(dog, same) == ["MuJoCo in place of Isaac Lab"]
   assert paper.setup(walker, same) == ["onset 9,000 in place of 5,000"]
+  same["agent_card"]["dreamer"] |= {"horizon": 33, "policy_lr": 0.5}
+  assert paper.setup(dog, same) == ["the policy's own steps 0.5 times as long", "horizon 33 in place of 333", "MuJoCo in place of Isaac Lab"]
 
 
 def test_the_papers_block_names_every_experiment(results):
