@@ -107,6 +107,8 @@ class TrainConfig:
     shake: probability that a stretch of 16 control steps is driven by one random action, on `shake_share` of the robots: stumbles and falls
       to learn from. 0: never, as the authors.
     shake_share: share of the robots that are shaken; the return of the others is the one reported.
+    jitter: deviation of white noise on the actions of those same robots, in every phase: the last of them gets all of it, the others equal steps
+      less. What an action does shows in the data only as far as actions differ from what the policy would have done there.
     fault, severity: domain randomisation: each robot draws a target of this fault and a severity, uniform in [0, `severity`], at the start and at the
       end of every chunk of 64 decisions in which one of its episodes ended. None: healthy robots.
   """
@@ -128,12 +130,15 @@ class TrainConfig:
   pure: int = 6000
   shake: float = 0.0
   shake_share: float = 0.5
+  jitter: float = 0.0
   fault: str | None = None
   severity: float = 1.0
 
   def __post_init__(self):
     positive(self, "envs", "updates", "ratio", "capacity", "repeat", *(("episode",) if self.episode is not None else ()))
     fraction(self, "demo_share", "clone_until", "shake", "shake_share", "severity")
+    if not (math.isfinite(self.jitter) and self.jitter >= 0):
+      raise UserError(f"jitter must be 0 or above; got {self.jitter}")
     if self.demonstrator and self.clone + self.fade + self.pure > self.updates:
       raise UserError(f"clone + fade + pure = {self.clone + self.fade + self.pure} exceeds updates = {self.updates}")
 

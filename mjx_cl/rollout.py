@@ -103,7 +103,7 @@ class Rollout:
     self.deterministic, self.expert, self.expert_noise = deterministic, expert, expert_noise
     self.chunk = functools.partial(jax.jit, static_argnames=("length",))(self._chunk)
 
-  def _decide(self, params, stream: Stream, drive, shake):
+  def _decide(self, params, stream: Stream, drive, shake, jitter):
     key = jax.random.fold_in(stream.key, stream.t)
     key_act, key_expert = jax.random.split(jax.random.fold_in(key, 0))
     carry, action = self.agent.act(params, stream.agent, stream.obs, key_act, self.deterministic)
@@ -117,6 +117,9 @@ class Rollout:
       key_stretch, key_push = jax.random.split(jax.random.fold_in(jax.random.fold_in(stream.key, stream.t // STRETCH), 3))
       push = jax.random.uniform(key_push, action.shape, minval=-1.0, maxval=1.0)
       action = jnp.where(jax.random.uniform(key_stretch) < shake, push, action)
+      carry = carry._replace(action=action)
+    if jitter is not None:
+      action = action + jitter * jax.random.normal(jax.random.fold_in(key, 1), action.shape)
       carry = carry._replace(action=action)
     return carry, action, demo, has_demo
 
@@ -133,7 +136,7 @@ class Rollout:
     ports = faults_lib.Ports(self.model, ctrl=action, first=stream.first)
     return faults_lib.drive(self.fault, stream.injection, stream.t, jax.random.fold_in(now, 1), ports)
 
-  def _chunk(self, params, streams: Stream, length: int, drive=None, shake=None):
+  def _chunk(self, params, streams: Stream, length: int, drive=None, shake=None, jitter=None):
     """`length` decisions.
 
     Args:
@@ -142,17 +145,19 @@ class Rollout:
       drive: bool (groups, members), the expert acts; used only where there is one.
       shake: float32 (groups, members), probability that a stretch of STRETCH control steps is driven by one random action, uniform in
         [-1, 1], in place of the policy's; None: never.
+      jitter: float32 (groups, members), deviation of white noise on the action; None: none.
     Returns:
       (streams', Row with leading (length, groups, members)).
     """
     if drive is None:
       drive = jnp.zeros(streams.t.shape, bool)
-    decide = nest(self._decide, (0, 0, 0, None if shake is None else 0), (None, 0, 0, None if shake is None else 0))
+    disturbed = tuple(None if x is None else 0 for x in (shake, jitter))
+    decide = nest(self._decide, (0, 0, 0) + disturbed, (None, 0, 0) + disturbed)
     control = nest(self._control, (0, 0), (0, 0))
     params = jax.vmap(self.agent.prepare)(params)
 
     def step(streams: Stream, _):
-      carry, action, demo, has_demo = decide(params, streams, drive, shake)
+      carry, action, demo, has_demo = decide(params, streams, drive, shake, jitter)
       before = streams
       streams, out, severity = control(streams, action)
       rewards = [out.reward]

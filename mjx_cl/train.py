@@ -197,6 +197,15 @@ class Trainer:
     shake[:, self.config.envs - round(self.config.shake_share * self.config.envs):] = self.config.shake
     return shake
 
+  def _jitter(self):
+    """Deviation of the noise on each robot's actions, or None."""
+    if not self.config.jitter:
+      return None
+    count = round(self.config.shake_share * self.config.envs)
+    jitter = np.zeros((self.seeds, self.config.envs), np.float32)
+    jitter[:, self.config.envs - count:] = self.config.jitter * np.arange(1, count + 1) / max(1, count)
+    return jitter
+
   def _weights(self) -> Weights:
     done, c = self.updates, self.config
     left = c.updates - done
@@ -235,12 +244,12 @@ class Trainer:
   def step(self) -> dict:
     """Collects one chunk, takes the updates that it pays for, returns a row of metrics."""
     begin = time.monotonic()
-    drive, shake = self._drive(), self._shake()
+    drive, shake, jitter = self._drive(), self._shake(), self._jitter()
     params, kept = self.state.train.params, records
     if self.mesh is not None:
       params = jax.device_put(params, jax.devices()[0])
       kept = lambda rows: jax.device_put(records(rows), jax.tree.leaves(self.state.replay)[0].sharding)
-    streams, rows = self.collect[self.phase].chunk(params, self.state.streams, CHUNK, drive, shake)
+    streams, rows = self.collect[self.phase].chunk(params, self.state.streams, CHUNK, drive, shake, jitter)
     if self.fault is not None:
       streams = self._redraw(streams, jnp.any(rows.terminated | rows.truncated, 0))
     replay = self._add(self.state.replay, *kept(rows))
@@ -249,7 +258,7 @@ class Trainer:
     for at, value in self.returns.add(rows):
       if drive[at]:
         expert_returns.append(value)
-      elif shake is None or not shake[at]:
+      elif (shake is None or not shake[at]) and (jitter is None or not jitter[at]):
         own.append(value)
         each[at[0]].append(value)
     self.own = (self.own + own)[-200:]
