@@ -269,6 +269,25 @@ def test_returns_are_sums_over_episodes(short_walker, tmp_path):
   np.testing.assert_allclose(row["return"], np.mean([np.sum(r) for e in episodes for r in e]), rtol=1e-5)  # float32 rewards
 
 
+def test_training_episodes_may_be_cut_and_some_robots_jittered(short_walker, tmp_path):
+  """Episodes end after `episode` steps, the robot's own length stands; the last half of the robots is jittered more and more and not reported."""
+  trainer = train.Trainer(short_walker, DREAMER, TrainConfig(envs=ENVS, updates=10_000, ratio=1.0, capacity=256, episode=8, jitter=0.4), tmp_path)
+  counted(trainer)
+  np.testing.assert_allclose(trainer._jitter(), [[0.0] * (ENVS // 2) + [0.4 * k / (ENVS // 2) for k in range(1, ENVS // 2 + 1)]], rtol=1e-6)
+  row = trainer.step()
+  data = jax.tree.map(lambda x: np.asarray(x)[0], trainer.state.replay.data)
+  for e in range(ENVS):
+    assert np.all(np.diff(np.flatnonzero(data.last[e])) == 9)  # 8 decisions and the final observation
+  assert row["episodes"] == ENVS // 2 * (train.CHUNK // 8)
+  quiet = np.concatenate([r[:9] for e in range(ENVS // 2) for r in np.split(data.reward[e], np.flatnonzero(data.last[e]) + 1)[:-1]]).sum()
+  np.testing.assert_allclose(row["return"], quiet / row["episodes"], rtol=1e-5)  # float32 rewards
+  assert trainer.env.spec.episode_steps == short_walker.spec.episode_steps == 12
+  with pytest.raises(UserError, match="episode must be above 0"):
+    TrainConfig(episode=0)
+  with pytest.raises(UserError, match="jitter must be 0 or above"):
+    TrainConfig(jitter=-0.1)
+
+
 def test_a_metric_that_is_not_finite_stops_the_run(short_walker, tmp_path):
   trainer = make_trainer(short_walker, tmp_path)
   counted(trainer, metric=float("nan"))
