@@ -33,7 +33,8 @@ MERGED = (*PUBLISHED, "trace.parquet", "residuals.parquet", "signals.parquet")
 RATE = 440e9
 WATCH_S, ACT_S = 0.25e-3, 0.11e-3      # monitor; acting: per stream and control step, size1m
 PHYSICS_S = {"walker": 0.05e-3, "quadruped": 0.06e-3, "car": 0.0, "car_real": 0.06e-3}  # car: within acting; car_real: results/physics.json
-UPDATE_S = 0.07 / (4 * 64)             # per replayed step that an update trains on, size1m, every state an imagination start
+UPDATE_S = 0.045 / (4 * 64)            # per replayed step that an update trains on, size1m, every state an imagination start, several streams side by side;
+                                       # results/study: 0.087 s an update on one core
 COMPILE_S = 35.0                       # programs of one part
 ADAPTS = 7_000                         # control steps that an adaptation with a stop rule lasted on walkers (results/walker_gear)
 

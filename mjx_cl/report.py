@@ -390,9 +390,27 @@ def study(results: pathlib.Path) -> str:
   return text + "\n\n" + grid(("severity", "train ratio", "seeds", "recovered", "restricted mean [steps]", "normalised recovery", "updates"), rows)
 
 
+def gradient(results: pathlib.Path) -> str:
+  """What the imagined policy gradient promises, and what the robot earns along it."""
+  agents_ = load(results / "policy_gradient.json")["agents"]
+  rows = []
+  for own in agents_:
+    still = next(r for r in own["rows"] if r["step"] == 0)
+    for r in sorted(own["rows"], key=lambda r: r["step"]):
+      if r["step"]:
+        low, high = r["gain_ci"]
+        rows.append((f"`{own['name']}`", f"{r['step']:+.2f}", f"{r['dreamt_return']:+.2f}", f"{r['gain']:+.4f} [{low:+.4f}, {high:+.4f}]",
+                     f"{still['terminations']} -> {r['terminations']}"))
+  kinds = joined(sorted({f"{own['robots']} robots and {number(own['steps'])} control steps, gradient of {own['batches']} batches" for own in agents_}))
+  text = fill(f"""
+      A step is the root mean square change of the policy's mean action; what the dream promises is the discounted return of an imagined stretch and the critic
+      behind it; the gain is in reward per control step on the healthy robot, with 95 % bootstrap intervals over {kinds}, common keys.""")
+  return text + "\n\n" + grid(("agent", "step along the gradient", "the dream promises", "the robot gains", "terminations"), rows)
+
+
 BLOCKS = {"run-walker": run_walker, "arl0": arl0, "leaderboard": leaderboard, "physics": physics, "dreamer": dreamer, "agents": agents,
           "detectors": detectors, "paper": experiments, "arms": arms,
-          "other-arms": other_arms, "stop-rule": stop_rule, "again": again, "study": study}
+          "other-arms": other_arms, "stop-rule": stop_rule, "again": again, "study": study, "gradient": gradient}
 
 
 # ---- README ----------------------------------------------------------------------------------------------------------------------

@@ -34,6 +34,7 @@ SOURCES = {
     "stop-rule": ("stop/bench.json",),
     "again": ("again/bench.json",),
     "study": ("study/bench.json", "study/suite.json"),
+    "gradient": ("policy_gradient.json",),
 }
 ALL = [(name, file) for name, files in SOURCES.items() for file in files]
 
@@ -59,11 +60,13 @@ def write(path, rows):
 def results(tmp_path):
   """A copy of results/ in which no file of any block is missing: the experiments of the paper are the walker's run, the car's with two changes."""
   out = tmp_path / "results"
-  shutil.copytree(RESULTS, out, ignore=shutil.ignore_patterns("*.png", "*.html", "paper", "arms", "stop", "again", "study", "detectors.json"))
+  shutil.copytree(RESULTS, out, ignore=shutil.ignore_patterns("*.png", "*.html", "paper", "arms", "stop", "again", "study", "detectors.json", "policy_gradient.json"))
   rows = [{"name": "cusum: 1000 streams", "value": 0.4567, "unit": "s", "goal": "<= 1", "holds": True},
           {"name": "adwin: 1000 streams", "value": 23.4, "unit": "s", "goal": "<= 20", "holds": False},
           {"name": "ewma: a sample", "value": 1234.5, "unit": "ns", "goal": None, "holds": None}]
   (out / "detectors.json").write_text(json.dumps(rows))
+  steps = [{"step": s, "dreamt_return": 5 * s, "gain": s / 9, "gain_ci": [s / 9 - 0.011, s / 9 + 0.013], "terminations": 3 + round(100 * abs(s))} for s in (0.0, 0.07, -0.07)]
+  (out / "policy_gradient.json").write_text(json.dumps({"agents": [{"name": "walker", "robots": 48, "steps": 1024, "batches": 32, "rows": steps}]}))
   runs = parquet.read_table(out / "walker_gear/runs.parquet").to_pylist()
   for robot in ("walker", "quadruped", "car"):
     (out / "paper" / robot).mkdir(parents=True)
@@ -274,6 +277,7 @@ CONSTANTS = {  # what a block says of itself: windows of the definitions, sizes 
     "stop-rule": {"95"},
     "again": {"95", "2,000"},
     "study": {"1", "2,000"},
+    "gradient": {"95"},
 }
 
 
