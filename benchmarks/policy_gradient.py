@@ -119,7 +119,7 @@ def main(args) -> None:
   if args.json:
     print(json.dumps(value))
     return
-  print(f"{value["name"]}: squared length of the gradient against the noise of one batch {value['signal_to_noise']:.2f}")
+  print(f"{value['name']}: squared length of the gradient against the noise of one batch {value['signal_to_noise']:.2f}")
   print(f"{'step':>7} {'dream promises':>15} {'robot earns':>12} {'gain a control step [95 %]':>34} {'terminations':>13}")
   for r in value["rows"]:
     print(f"{r['step']:7.3f} {r['dreamt_return']:15.3f} {r['reward']:12.4f} {r['gain']:12.4f} [{r['gain_ci'][0]:.4f}, {r['gain_ci'][1]:.4f}] {r['terminations']:13d}")
