@@ -4,6 +4,10 @@ The gradient of the policy loss, averaged over many batches of the agent's own d
 dreams from the same replayed states and drives the same robots (common keys). Where the dream promises more and the robot earns less, the policy runs to where
 the world model is wrong, and finetuning with this model does harm.
 
+What the dream promises is the return of an imagined stretch under the moved policy, and the critic of the unmoved one behind it, less the same of the unmoved
+policy, over the length of the stretch: the mean advantage per control step. By the performance difference lemma (Kakade and Langford, ICML 2002) that is what
+the reward per control step should gain, as far as the moved policy visits the same states.
+
 A step is measured by how far it moves the policy's mean action, root mean square over replayed states. Differences of reward are per control step, with 95 %
 bootstrap intervals over robots, against the policy as it is; the entropy bonus is left out of the gradient.
 """
@@ -52,7 +56,7 @@ def own_data(env, trained, robots: int, steps: int, jitter: float, seed: int = 1
 
 
 def ascent(agent: Agent, train, held: replay.Replay, batches: int):
-  """The mean gradient of the policy's objective, and the share of its squared length that is not sampling noise of one batch."""
+  """The mean gradient of the policy's objective, and its squared length over the sampling noise of one batch."""
   @jax.jit
   def gradient(key):
     key_sample, key_update = jax.random.split(key)
@@ -88,7 +92,7 @@ def measure(args) -> dict:
 
   @jax.jit
   def dream(pol, key):
-    """Discounted return of 15 imagined steps and the critic behind them, mean over starts."""
+    """Discounted return of the imagined steps and the critic behind them, mean over starts."""
     deters, stochs, _ = agent.imagine({**params, "pol": pol}, flat(deter), flat(stoch), key, agent.config.imagine)
     _, reward = agent.predict(params, deters[1:], stochs[1:])
     value = nets.two_hot_mean(agent.value(params["val"], deters[-1], stochs[-1]), agent.bins)
@@ -107,7 +111,7 @@ def measure(args) -> dict:
   rows = []
   for i, factor in enumerate(FACTORS):
     gain = earned[i] - earned[0]
-    rows.append({"step": factor * args.size, "dreamt_return": promised[i] - promised[0], "reward": float(earned[i].mean()), "gain": float(gain.mean()),
+    rows.append({"step": factor * args.size, "promise": (promised[i] - promised[0]) / agent.config.imagine, "reward": float(earned[i].mean()), "gain": float(gain.mean()),
                  "gain_ci": bootstrap.interval(gain, np.mean), "terminations": int(ends[i])})
   at = {r["step"]: r for r in rows}
   return {"env": args.env, "name": args.agent or args.env, "robots": args.robots, "steps": args.steps, "batches": args.batches, "jitter": args.jitter,
@@ -122,7 +126,7 @@ def main(args) -> None:
   print(f"{value['name']}: squared length of the gradient against the noise of one batch {value['signal_to_noise']:.2f}")
   print(f"{'step':>7} {'dream promises':>15} {'robot earns':>12} {'gain a control step [95 %]':>34} {'terminations':>13}")
   for r in value["rows"]:
-    print(f"{r['step']:7.3f} {r['dreamt_return']:15.3f} {r['reward']:12.4f} {r['gain']:12.4f} [{r['gain_ci'][0]:.4f}, {r['gain_ci'][1]:.4f}] {r['terminations']:13d}")
+    print(f"{r['step']:7.3f} {r['promise']:15.4f} {r['reward']:12.4f} {r['gain']:12.4f} [{r['gain_ci'][0]:.4f}, {r['gain_ci'][1]:.4f}] {r['terminations']:13d}")
 
 
 if __name__ == "__main__":

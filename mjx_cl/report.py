@@ -399,12 +399,12 @@ def gradient(results: pathlib.Path) -> str:
     for r in sorted(own["rows"], key=lambda r: r["step"]):
       if r["step"]:
         low, high = r["gain_ci"]
-        rows.append((f"`{own['name']}`", f"{r['step']:+.2f}", f"{r['dreamt_return']:+.2f}", f"{r['gain']:+.4f} [{low:+.4f}, {high:+.4f}]",
+        rows.append((f"`{own['name']}`", f"{r['step']:+.2f}", f"{r['promise']:+.4f}", f"{r['gain']:+.4f} [{low:+.4f}, {high:+.4f}]",
                      f"{still['terminations']} -> {r['terminations']}"))
   kinds = joined(sorted({f"{own['robots']} robots and {number(own['steps'])} control steps, gradient of {own['batches']} batches" for own in agents_}))
   text = fill(f"""
-      A step is the root mean square change of the policy's mean action; what the dream promises is the discounted return of an imagined stretch and the critic
-      behind it; the gain is in reward per control step on the healthy robot, with 95 % bootstrap intervals over {kinds}, common keys.""")
+      A step is the root mean square change of the policy's mean action; promise (the mean imagined advantage) and gain are in reward per control step on the healthy
+      robot, the gain with 95 % bootstrap intervals over {kinds}, common keys.""")
   return text + "\n\n" + grid(("agent", "step along the gradient", "the dream promises", "the robot gains", "terminations"), rows)
 
 

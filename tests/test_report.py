@@ -65,7 +65,7 @@ def results(tmp_path):
           {"name": "adwin: 1000 streams", "value": 23.4, "unit": "s", "goal": "<= 20", "holds": False},
           {"name": "ewma: a sample", "value": 1234.5, "unit": "ns", "goal": None, "holds": None}]
   (out / "detectors.json").write_text(json.dumps(rows))
-  steps = [{"step": s, "dreamt_return": 5 * s, "gain": s / 9, "gain_ci": [s / 9 - 0.011, s / 9 + 0.013], "terminations": 3 + round(100 * abs(s))} for s in (0.0, 0.07, -0.07)]
+  steps = [{"step": s, "promise": 5 * s, "gain": s / 9, "gain_ci": [s / 9 - 0.011, s / 9 + 0.013], "terminations": 3 + round(100 * abs(s))} for s in (0.0, 0.07, -0.07)]
   (out / "policy_gradient.json").write_text(json.dumps({"agents": [{"name": "walker", "robots": 48, "steps": 1024, "batches": 32, "rows": steps}]}))
   runs = parquet.read_table(out / "walker_gear/runs.parquet").to_pylist()
   for robot in ("walker", "quadruped", "car"):
