@@ -41,6 +41,9 @@ class DreamerConfig:
     lr, warmup: learning rate and updates of its linear warm-up.
     policy_lr: factor on the policy's steps; 1, as the authors'. Below 1 the world model keeps ahead of the policy (the quadruped's at 1 runs to
       where the model promises too much, and its return falls).
+    anchor: weight of -log policy(a | s) for the mean of the policy, over the actions that the robot itself took, in replayed states; 0: off, as the
+      authors. The policy reads the latents of the world model; where learning moves those under it, this makes it follow.
+    min_std: least deviation of the policy's actions, of 1 at most; 0.1, as the authors'. What the robot does is drawn with it, in tests too.
     bins: classes of the two-hot heads.
     entropy: weight of the policy's entropy.
     obs_scale: one number per observation variable that it is divided by before encoder and decoder loss, `spec`: the robot's typical deviations
@@ -56,6 +59,8 @@ class DreamerConfig:
   lam: float = 0.95
   lr: float = 4e-5
   policy_lr: float = 1.0
+  anchor: float = 0.0
+  min_std: float = 0.1
   warmup: int = 1000
   agc: float = 0.3
   bins: int = 255
@@ -76,6 +81,10 @@ class DreamerConfig:
     elif self.obs_scale not in (None, "spec"):
       raise UserError(f"obs_scale is `spec`, numbers above 0, or none; got {self.obs_scale!r}")
     positive(self, "batch", "length", "imagine", "horizon", "lr", "policy_lr", "bins")
+    if not (math.isfinite(self.anchor) and self.anchor >= 0):
+      raise UserError(f"anchor must be 0 or above; got {self.anchor}")
+    if not 0 < self.min_std < 1:
+      raise UserError(f"min_std must lie between 0 and 1; got {self.min_std}")
     if self.context != 1:
       raise UserError(f"context must be 1, as in the authors' code; got {self.context}")
     if not 0 <= self.last_starts <= self.length:
@@ -109,6 +118,8 @@ class TrainConfig:
     shake_share: share of the robots that are shaken; the return of the others is the one reported.
     jitter: deviation of white noise on the actions of those same robots, in every phase: the last of them gets all of it, the others equal steps
       less. What an action does shows in the data only as far as actions differ from what the policy would have done there.
+    hold: updates of the pure phase, from its start, without the policy's own gradient: critic and model learn what the robots do by themselves,
+      held by `anchor`, before the policy climbs on them. A critic that saw a demonstrator's data too tells the two apart by their posture.
     fault, severity: domain randomisation: each robot draws a target of this fault and a severity, uniform in [0, `severity`], at the start and at the
       end of every chunk of 64 decisions in which one of its episodes ended. None: healthy robots.
   """
@@ -131,14 +142,16 @@ class TrainConfig:
   shake: float = 0.0
   shake_share: float = 0.5
   jitter: float = 0.0
+  hold: int = 0
   fault: str | None = None
   severity: float = 1.0
 
   def __post_init__(self):
     positive(self, "envs", "updates", "ratio", "capacity", "repeat", *(("episode",) if self.episode is not None else ()))
     fraction(self, "demo_share", "clone_until", "shake", "shake_share", "severity")
-    if not (math.isfinite(self.jitter) and self.jitter >= 0):
-      raise UserError(f"jitter must be 0 or above; got {self.jitter}")
+    for name in ("jitter", "hold"):
+      if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
+        raise UserError(f"{name} must be 0 or above; got {getattr(self, name)}")
     if self.demonstrator and self.clone + self.fade + self.pure > self.updates:
       raise UserError(f"clone + fade + pure = {self.clone + self.fade + self.pure} exceeds updates = {self.updates}")
 
@@ -152,6 +165,7 @@ class AdaptConfig:
     start_windows: windows that the post-alarm replay must hold before the first update.
     lr: learning rate while adapting, None: the agent's own.
     policy_lr: factor on the policy's steps while adapting, None: the agent's own.
+    anchor: weight while adapting of the actions that the robot took (DreamerConfig.anchor), None: the agent's own.
     batch: sequences of one update while adapting, None: the agent's own 16. At the same train ratio fewer sequences mean more updates: 4 give
       four updates every 64 steps. Right hip's gear halved, seeds 100 to 103, mean reward 4,000 to 8,000 steps after onset, two agents that
       differ in nothing but their training: 0.73 with 4 sequences at 1e-4, 0.68 with 16 at 2e-4, 0.58 with 4 at 2e-4 (an agent whose training
@@ -183,6 +197,7 @@ class AdaptConfig:
   start_windows: int = 1024
   lr: float | None = 1e-4
   policy_lr: float | None = None
+  anchor: float | None = None
   batch: int | None = 4
   last_starts: int | None = 0
   average: float = 0.1
@@ -211,6 +226,8 @@ class AdaptConfig:
     if self.period_steps >= self.period:
       raise UserError(f"period_steps must be below period={self.period}; got {self.period_steps}")
     positive(self, *(name for name in ("lr", "policy_lr", "batch") if getattr(self, name) is not None))
+    if self.anchor is not None and not (math.isfinite(self.anchor) and self.anchor >= 0):
+      raise UserError(f"anchor must be 0 or above; got {self.anchor}")
 
 
 @dataclass(frozen=True)

@@ -110,7 +110,7 @@ def _template(env):
   return running_statistics.init_state(specs.Array((size,), jnp.float32)), net.policy_network.init(key), net.value_network.init(key)
 
 
-def _latest(out: pathlib.Path, env) -> tuple[list[dict], tuple]:
+def latest(out: pathlib.Path, env) -> tuple[list[dict], tuple]:
   """The curve and the networks that a run in `out` left behind."""
   from flax import serialization
   try:
@@ -139,7 +139,7 @@ def train(env, out: str | os.PathLike, steps: int, seed: int = 0, evals: int = 1
   from brax.training.agents.ppo import networks, train as ppo
   out = pathlib.Path(out)
   out.mkdir(parents=True, exist_ok=True)
-  rows, params = _latest(out, env) if resume else ([], None)
+  rows, params = latest(out, env) if resume else ([], None)
   done, before = (rows[-1]["step"], rows[-1]["seconds"]) if rows else (0, 0.0)
   if done >= steps:
     return rows

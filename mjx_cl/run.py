@@ -79,7 +79,7 @@ class Runner:
     self.robots = [self.env] + [self.other] * (self.other is not None)
     spec = self.env.spec
     self.trained = agents.load(config.agent, config.env, len(spec.obs), len(spec.act), lr=config.adapt.lr, policy_lr=config.adapt.policy_lr,
-                               last_starts=config.adapt.last_starts, batch=config.adapt.batch)
+                               anchor=config.adapt.anchor, last_starts=config.adapt.last_starts, batch=config.adapt.batch)
     agent, self.repeat = self.trained.agent, int(self.trained.card.get("repeat", 1))
     self.others = arm_agents(config, spec)
     self.changes = changes(config)

@@ -148,9 +148,11 @@ class Trainer:
     self.failed: dict[int, str] = {}  # seed -> the term that was not finite, and when
     fault = faults.make(config.fault or "none", env)
     self.collect = {"pure": Rollout(env, self.plain, fault, config.repeat)}
+    if dreamer.anchor and (config.shake or config.jitter):
+      raise UserError("anchor holds the policy to the actions taken; shake and jitter put random ones among them: set both to 0")
     self.learn = {"pure": make_learn(self.plain, dreamer.batch, dreamer.length, self.mesh)}
     if self.expert:
-      cloning = Agent(dreamer, len(spec.obs), len(spec.act), clone_std=config.clone_std)
+      cloning = Agent(dataclasses.replace(dreamer, anchor=0.0), len(spec.obs), len(spec.act), clone_std=config.clone_std)
       rollout = Rollout(env, cloning, fault, config.repeat, expert=self.expert, expert_noise=config.demo_noise)
       learn = make_learn(cloning, dreamer.batch, dreamer.length, self.mesh)
       self.collect |= {"clone": rollout, "fade": rollout}
@@ -214,7 +216,7 @@ class Trainer:
       return Weights(c.clone_weight, 0.0, lr)
     if self.phase == "fade":
       return Weights(c.clone_weight * max(0.0, 1.0 - (done - self.phase_start) / c.fade), 1.0, lr)
-    return Weights(0.0, 1.0, lr)
+    return Weights(0.0, float(done - self.phase_start >= c.hold), lr)
 
   def _advance_phase(self) -> None:
     c, done = self.config, self.updates

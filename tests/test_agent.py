@@ -399,6 +399,45 @@ def test_clone_term_without_labels_is_zero(cloning):
   assert metrics["loss/clone"] == 0.0
 
 
+def test_anchor_is_the_likelihood_of_the_actions_taken_and_moves_the_mean_alone(plain):
+  """-log N(a; mean, std) by a loop, without the last states of episodes; its gradient reaches the policy's mean, not its deviation, and nothing else."""
+  agent, _, state = plain
+  held = Agent(replace(agent.config, anchor=0.5, min_std=0.05), agent.obs_size, agent.act_size)
+  params, batch = shake(state.params), make_batch(ends=True)
+  loose = Agent(replace(held.config, anchor=0.0), agent.obs_size, agent.act_size)
+  grad = lambda a: jax.jit(jax.value_and_grad(a.loss, has_aux=True))(params, state.slow, jnp.zeros(2), batch, KEY)
+  ((total, (metrics, _, _, _)), with_it), ((without, (rest, _, _, _)), plain_grads) = grad(held), grad(loose)
+  assert "loss/anchor" not in rest
+  np.testing.assert_allclose(total - without, 0.5 * metrics["loss/anchor"], rtol=1e-3)  # difference of two float32 sums
+  deter, stoch, _ = held.observe(params, batch, jax.random.split(KEY)[0])
+  raw = [np.asarray(x, np.float64) for x in held.pol.apply({"params": params["pol"]}, deter, stoch)]
+  mean, std = np.tanh(raw[0]), 0.05 + 0.95 / (1 + np.exp(-raw[1] - 2))
+  action, last = (np.asarray(x)[:, 1:].swapaxes(0, 1) for x in (batch.action, batch.last))
+  terms = [sum(0.5 * ((action[t, b, i] - mean[t, b, i]) / std[t, b, i]) ** 2 + np.log(std[t, b, i]) + 0.5 * np.log(2 * np.pi) for i in range(ACT))
+           for t in range(LENGTH) for b in range(ROWS) if not last[t, b]]
+  assert last.any() and len(terms) < LENGTH * ROWS
+  np.testing.assert_allclose(metrics["loss/anchor"], np.mean(terms), rtol=1e-4)  # float32 through the network
+  for name in params:
+    same_ = gap(with_it[name], plain_grads[name]) < 1e-5
+    assert same_ == (name != "pol"), name
+  assert gap(with_it["pol"]["std"], plain_grads["pol"]["std"]) < 1e-6 < gap(with_it["pol"]["mean"], plain_grads["pol"]["mean"])
+
+
+def test_least_deviation_of_the_actions(plain):
+  """With raw deviations far below 0 the actions scatter by min_std, in acting as in the dream."""
+  agent, _, state = plain
+  params = {**state.params, "pol": {**state.params["pol"], "std": {"kernel": 0.0 * state.params["pol"]["std"]["kernel"], "bias": jnp.full(ACT, -50.0)}}}
+  for least in (0.1, 0.02):
+    own = Agent(replace(agent.config, min_std=least), agent.obs_size, agent.act_size)
+    draw = lambda key, fixed: own.act(params, own.carry(), jnp.zeros(OBS), key, fixed)[1]
+    keys = jax.random.split(KEY, 400)
+    sampled, fixed = (np.asarray(jax.vmap(draw, (0, None))(keys, f)) for f in (False, True))
+    assert 0.8 * least < np.std(sampled - fixed) < 1.2 * least  # 400 draws: 3.5 % standard error
+    states = jnp.zeros((400, own.size.deter)), jnp.zeros((400, own.stoch_size))
+    noise = jax.random.normal(KEY, (400, ACT))
+    np.testing.assert_allclose(own.choose(params, *states, noise) - own.choose(params, *states, 0 * noise), least * noise, atol=1e-6)  # float32
+
+
 def test_vmap_over_seeds_equals_a_loop(plain):
   agent, update, _ = plain
   keys = jax.random.split(jax.random.key(3), 2)

@@ -288,6 +288,24 @@ def test_training_episodes_may_be_cut_and_some_robots_jittered(short_walker, tmp
     TrainConfig(jitter=-0.1)
 
 
+def test_the_policy_is_held_at_the_start_of_the_pure_phase(short_walker, tmp_path):
+  """Without its own gradient for the first `hold` updates; the anchor takes the robots' own actions for right, so no random ones may be among them."""
+  trainer = make_trainer(short_walker, tmp_path, replace(DREAMER, anchor=0.5), hold=20)
+  learn = counted(trainer)
+  while trainer.updates < 40:
+    trainer.step()
+  before = np.cumsum([0] + [n for n, _ in learn.calls])[:-1]
+  assert [w.policy for _, w in learn.calls] == [float(u >= 20) for u in before] and before[-1] > 20
+  with pytest.raises(UserError, match="hold must be 0 or above"):
+    TrainConfig(hold=-1)
+  with pytest.raises(UserError, match="anchor must be 0 or above"):
+    replace(DREAMER, anchor=-0.5)
+  with pytest.raises(UserError, match="set both to 0"):
+    make_trainer(short_walker, tmp_path, replace(DREAMER, anchor=0.5), shake=0.1)
+  with pytest.raises(UserError, match="min_std must lie between 0 and 1"):
+    replace(DREAMER, min_std=0.0)
+
+
 def test_a_metric_that_is_not_finite_stops_the_run(short_walker, tmp_path):
   trainer = make_trainer(short_walker, tmp_path)
   counted(trainer, metric=float("nan"))

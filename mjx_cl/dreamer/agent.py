@@ -159,7 +159,7 @@ class Agent:
     deter = self._core(params, carry.deter[None], carry.stoch[None], carry.action[None])
     logits = self._apply(params, "dyn", deter, self._encode(params, obs[None]), method="posterior")
     stoch = rssm.sample(logits, jax.random.uniform(key_z, (1, self.size.stoch))).reshape(1, -1)
-    mean, std = nets.normal(*self._apply(params, "pol", deter, stoch))
+    mean, std = nets.normal(*self._apply(params, "pol", deter, stoch), self.config.min_std)
     action = mean if deterministic else mean + std * jax.random.normal(key_a, mean.shape)
     return Carry(deter[0], stoch[0], action[0]), action[0]
 
@@ -209,7 +209,7 @@ class Agent:
 
   def choose(self, params, deter, stoch, noise):
     """The policy's action (N, A) for standard normal `noise`."""
-    mean, std = nets.normal(*self._apply(params, "pol", deter, stoch))
+    mean, std = nets.normal(*self._apply(params, "pol", deter, stoch), self.config.min_std)
     return mean + std * noise
 
   def latent(self, params, deter, stoch) -> Latent:
@@ -272,6 +272,9 @@ class Agent:
     if self.clone_std is not None:
       terms["clone"] = self._clone_loss(params, sg(deter), sg(stoch), batch)
       total = total + weights.clone * terms["clone"]
+    if c.anchor:
+      terms["anchor"] = self._anchor_loss(params, sg(deter), sg(stoch), batch)
+      total = total + c.anchor * terms["anchor"]
     metrics = {f"loss/{k}": v for k, v in terms.items()} | img.metrics | {
         "opt/loss": total, "dyn_ent": categorical_entropy(prior), "rep_ent": categorical_entropy(logits)}
     stoch = jnp.argmax(stoch.reshape(length, rows, self.size.stoch, self.size.classes), -1)
@@ -279,11 +282,22 @@ class Agent:
 
   def _clone_loss(self, params, deter, stoch, batch):
     """Mean over labelled replayed states of KL(N(demo, clone_std^2) || policy) [nats]."""
-    mean, std = nets.normal(*self._apply(params, "pol", deter, stoch))
+    mean, std = nets.normal(*self._apply(params, "pol", deter, stoch), self.config.min_std)
     demo, has = batch.demo[:, 1:].swapaxes(0, 1), batch.has_demo[:, 1:].swapaxes(0, 1).astype(jnp.float32)
     var = self.clone_std ** 2
     kl = jnp.sum(jnp.log(std / self.clone_std) + (var + jnp.square(mean - demo)) / (2 * jnp.square(std)) - 0.5, -1)
     return jnp.sum(kl * has) / jnp.maximum(1.0, jnp.sum(has))
+
+  def _anchor_loss(self, params, deter, stoch, batch):
+    """Mean over replayed states of -log policy(action taken) [nats], for the policy's mean alone; at an episode's last state none was taken.
+
+    The deviation is held: fitted to actions that were drawn from it, it would take in the error of the mean, and grow with every round.
+    """
+    mean, std = nets.normal(*self._apply(params, "pol", deter, stoch), self.config.min_std)
+    std = sg(std)
+    taken = 1.0 - batch.last[:, 1:].swapaxes(0, 1).astype(jnp.float32)
+    logp = nets.normal_logp(mean, std, batch.action[:, 1:].swapaxes(0, 1))
+    return -jnp.sum(logp * taken) / jnp.maximum(1.0, jnp.sum(taken))
 
   def update(self, state: TrainState, batch: Batch, key: jax.Array, weights: Weights = Weights()):
     """One gradient step. Where a loss or the gradient is not finite nothing changes, the counter included; the metrics tell.

@@ -1,0 +1,118 @@
+"""Benchmarks that measure a learner: what they hand to others' code, and that what they learn moves the right way."""
+import argparse
+import importlib.util
+import json
+import pathlib
+import types
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from flax import serialization
+
+from mjx_cl import demonstrator, envs
+from mjx_cl.errors import UserError
+
+FOLDER = pathlib.Path(__file__).parent.parent / "benchmarks"
+
+
+def load(name):
+  spec = importlib.util.spec_from_file_location(f"benchmark_{name}", FOLDER / f"{name}.py")
+  module = importlib.util.module_from_spec(spec)
+  spec.loader.exec_module(module)
+  return module
+
+
+@pytest.fixture(scope="module")
+def ppo():
+  return load("ppo_finetune")
+
+
+@pytest.fixture(scope="module")
+def tiny_net():
+  """brax's networks for 3 observations and 1 action, with parameters."""
+  from brax.training.acme import running_statistics, specs
+  from brax.training.agents.ppo import networks
+  net = networks.make_ppo_networks(3, 1, running_statistics.normalize, policy_hidden_layer_sizes=(16,), value_hidden_layer_sizes=(16,))
+  normaliser = running_statistics.init_state(specs.Array((3,), jnp.float32))
+  return net, {"normaliser": normaliser, "policy": net.policy_network.init(jax.random.key(0)), "value": net.value_network.init(jax.random.key(1))}
+
+
+def rows_of(net, params, key, steps=64):
+  obs = jax.random.normal(key, (steps, 3))
+  logits = net.policy_network.apply(params["normaliser"], params["policy"], obs)
+  raw = net.parametric_action_distribution.sample_no_postprocessing(logits, jax.random.fold_in(key, 1))
+  action = jnp.tanh(raw)
+  none = jnp.zeros(steps, bool)
+  reward = -jnp.square(action[:, 0] - 0.5)
+  return types.SimpleNamespace(obs=obs, action=action, reward=reward, terminated=none, truncated=none.at[-1].set(True),
+                               final_obs=jnp.roll(obs, -1, 0)), raw, logits
+
+
+def test_ppo_transitions_recover_what_the_policy_drew(ppo, tiny_net):
+  net, params = tiny_net
+  rows, raw, logits = rows_of(net, params, jax.random.key(3))
+  out = ppo.transitions(net, params, rows)
+  extras = out.extras["policy_extras"]
+  assert np.ptp(np.asarray(raw)) > 1.0
+  np.testing.assert_allclose(extras["raw_action"], raw, atol=1e-4)  # float32 tanh and back, |raw| < 3
+  np.testing.assert_allclose(extras["log_prob"], net.parametric_action_distribution.log_prob(logits, raw), atol=1e-3)
+  assert out.extras["state_extras"]["truncation"].sum() == 1 and (out.discount == 1).all()
+  rows.terminated = rows.terminated.at[5].set(True)
+  rows.truncated = rows.truncated.at[5].set(True)
+  out = ppo.transitions(net, params, rows)
+  assert out.discount[5] == 0 and out.extras["state_extras"]["truncation"][5] == 0  # a fall at the time limit is a fall
+
+
+def test_ppo_update_climbs(ppo, tiny_net):
+  """A reward of -(a - 0.5)^2 draws the actions to 0.5; the normaliser stays."""
+  net, params = tiny_net
+  settings = {"entropy_cost": 0.0, "discounting": 0.0, "reward_scaling": 1.0}
+  init, update = ppo.make_update(net, settings, 3e-3, 4, 2)
+  state = (params, init(params))
+  earned = []
+  for i in range(15):
+    parts = [rows_of(net, state[0], jax.random.fold_in(jax.random.key(7), 10 * i + j))[0] for j in range(4)]
+    earned.append(float(np.mean([p.reward for p in parts])))
+    data = jax.tree.map(lambda *x: jnp.stack(x), *[ppo.transitions(net, state[0], p) for p in parts])
+    state = jax.jit(update)(*state, data, jax.random.key(i))
+  assert earned[0] < -0.3 and np.mean(earned[-3:]) > 0.6 * earned[0]
+  same = jax.tree.map(lambda a, b: bool(jnp.all(a == b)), state[0]["normaliser"], params["normaliser"])
+  assert jax.tree.all(same)
+
+
+@pytest.fixture(scope="module")
+def policy(tmp_path_factory):
+  """What a training of the walker's demonstrator leaves, untrained."""
+  out = tmp_path_factory.mktemp("ppo")
+  (out / "latest.msgpack").write_bytes(serialization.to_bytes(demonstrator._template(envs.make("walker", "native"))))
+  (out / "curve.json").write_text(json.dumps([{"step": 0, "return": 10.0, "seconds": 0.0}]))
+  return out
+
+
+def test_ppo_finetunes_from_the_onset_on_and_the_other_arm_not(ppo, policy, tmp_path):
+  args = ppo.parser().parse_args(["walker", "--policy", str(policy), "--fault", "walker/gear-half", "--onset", "1088", "--steps", "1400", "--seeds", "2", "--horizon", "128",
+                                  "--minibatches", "2", "--epochs", "2", "--lr", "0.001", "--keep", str(tmp_path / "r.parquet")])
+  value = ppo.measure(args)
+  table = pq.read_table(tmp_path / "r.parquet").to_pydict()
+  of = lambda arm, seed: np.asarray([r for r, a, s in zip(table["reward"], table["arm"], table["seed"]) if (a, s) == (arm, seed)])
+  first = 1088 + 128  # control step after which the first update acts
+  for seed in (0, 1):
+    a, b = of("ppo", seed), of("ppo-none", seed)
+    assert len(a) == 1400
+    np.testing.assert_array_equal(a[:first], b[:first])
+    assert not np.array_equal(a[first:], b[first:])
+  assert not np.array_equal(of("ppo", 0), of("ppo", 1))
+  assert value["arms"]["ppo"]["updates"] == 2 * 2 * 2 and value["arms"]["ppo-none"]["updates"] == 0
+  rows = {(r["arm"], r["seed"]): r for r in value["rows"]}
+  assert rows["ppo", 0]["reward_pre"] == pytest.approx(of("ppo-none", 0)[1000:1088].mean())
+  assert json.loads(json.dumps(value))["policy"]["step" + "s"] == 0
+
+
+@pytest.mark.parametrize("words, message", [
+    (["--horizon", "100"], "multiple of 64 x minibatches"), (["--lr", "0"], "lr must be above 0"), (["--fault", "nonsense"], "nonsense")])
+def test_ppo_bad_input_is_one_line(ppo, policy, words, message):
+  with pytest.raises(UserError, match=message):
+    ppo.measure(ppo.parser().parse_args(["walker", "--policy", str(policy), *words]))
