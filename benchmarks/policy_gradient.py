@@ -81,7 +81,7 @@ def measure(args) -> dict:
   _, batch, _ = replay.sample(held, jax.random.key(5), agent.config.batch, agent.config.length + 1)
   deter, stoch, _ = agent.observe(params, batch, jax.random.key(6))
   moved_by = lambda k: jax.tree.map(lambda p, d: p + k * d, params["pol"], direction)
-  mean_of = jax.jit(lambda pol: nets.normal(*agent.pol.apply({"params": pol}, deter, stoch), agent.config.min_std)[0])
+  mean_of = jax.jit(lambda pol: nets.normal(*agent.pol.apply({"params": pol}, deter, stoch), *agent.deviations)[0])
   distance = lambda k: float(jnp.sqrt(jnp.mean(jnp.square(mean_of(moved_by(k)) - mean_of(params["pol"])))))
   k = 1.0
   for _ in range(60):  # nearly linear in k

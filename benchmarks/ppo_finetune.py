@@ -198,13 +198,14 @@ def score(labels, reward: np.ndarray, ended: np.ndarray, onset: int, control_s: 
     own = [r for r in rows if r["arm"] == arm]
     hit = [r for r in own if r["affected"]]
     times = [np.inf if r["recovery_steps"] is None else r["recovery_steps"] for r in hit]
-    mean = lambda name: (float(bootstrap.iqm(x)), bootstrap.interval(x)) if (x := [r[name] for r in hit if r[name] is not None]) else (None, None)
+    mean = lambda rows, name: (float(bootstrap.iqm(x)), bootstrap.interval(x)) if (x := [r[name] for r in rows if r[name] is not None]) else (None, None)
     out = {"seeds": len(own), "affected": len(hit), "recovered": int(np.sum(np.isfinite(times))),
            "recovery_median_steps": bootstrap.finite(bootstrap.censored_median(times)) if times else None,
            "recovery_median_steps_ci": bootstrap.interval(times, bootstrap.censored_median) if times else None,
            "terminations": sum(r["terminations"] for r in own), "updates": updates if arm == "ppo" else 0}
-    for name in ("reward_pre", "reward_final", "return_lost", "normalised"):
-      out[name], out[name + "_ci"] = mean(name)
+    for key, name, of in (("reward_pre", "reward_pre", own), ("reward_final", "reward_final", own), ("reward_final_affected", "reward_final", hit),
+                          ("return_lost", "return_lost", own), ("normalised", "normalised", hit)):
+      out[key], out[key + "_ci"] = mean(of, name)
     arms[arm] = out
   return {"arms": arms, "rows": rows, "control_s": control_s}
 
@@ -217,7 +218,7 @@ def main(args) -> None:
   for arm, r in value["arms"].items():
     show = lambda name, digits=2: "-" if r[name] is None else f"{r[name]:.{digits}f} {['-' if x is None else round(x, digits) for x in r[name + '_ci']]}"
     print(f"{arm}: {r['recovered']} of {r['affected']} affected recovered, median {show('recovery_median_steps', 0)} steps; reward {show('reward_pre')} before, "
-          f"{show('reward_final')} at the end; normalised {show('normalised')}; {r['updates']} updates, {r['terminations']} falls")
+          f"{show('reward_final_affected')} of the affected at the end; normalised {show('normalised')}; {r['updates']} updates, {r['terminations']} falls")
   print(f"{value['wall_s']:.0f} s, of which {value['wall_s_updates']:.0f} s updates")
 
 

@@ -19,6 +19,7 @@ from typing import Annotated
 
 import tyro
 
+from mjx_cl import __version__
 from mjx_cl.config import ARMS, PRESETS, AdaptConfig, RunConfig, TrainConfig, replace
 from mjx_cl.errors import FileError, UserError, choose
 
@@ -840,7 +841,10 @@ DO = {Run: do_run, Bench: do_bench, Train: do_train, Eval: do_eval, Certify: do_
 
 
 def parse(argv: list[str] | None):
-  """Arguments -> command. tyro's framed report of a mistake becomes one line."""
+  """Arguments -> command. tyro's framed report of a mistake becomes one line. `--version` alone prints it and ends."""
+  if (sys.argv[1:] if argv is None else argv) == ["--version"]:
+    print(f"mjx-cl {__version__}")
+    raise SystemExit(0)
   report = io.StringIO()
   try:
     with contextlib.redirect_stderr(report):

@@ -43,7 +43,7 @@ class DreamerConfig:
       where the model promises too much, and its return falls).
     anchor: weight of -log policy(a | s) for the mean of the policy, over the actions that the robot itself took, in replayed states; 0: off, as the
       authors. The policy reads the latents of the world model; where learning moves those under it, this makes it follow.
-    min_std: least deviation of the policy's actions, of 1 at most; 0.1, as the authors'. What the robot does is drawn with it, in tests too.
+    min_std, max_std: least and greatest deviation of the policy's actions; 0.1 and 1, as the authors'. What the robot does is drawn with it, in tests too.
     bins: classes of the two-hot heads.
     entropy: weight of the policy's entropy.
     obs_scale: one number per observation variable that it is divided by before encoder and decoder loss, `spec`: the robot's typical deviations
@@ -61,6 +61,7 @@ class DreamerConfig:
   policy_lr: float = 1.0
   anchor: float = 0.0
   min_std: float = 0.1
+  max_std: float = 1.0
   warmup: int = 1000
   agc: float = 0.3
   bins: int = 255
@@ -83,8 +84,8 @@ class DreamerConfig:
     positive(self, "batch", "length", "imagine", "horizon", "lr", "policy_lr", "bins")
     if not (math.isfinite(self.anchor) and self.anchor >= 0):
       raise UserError(f"anchor must be 0 or above; got {self.anchor}")
-    if not 0 < self.min_std < 1:
-      raise UserError(f"min_std must lie between 0 and 1; got {self.min_std}")
+    if not 0 < self.min_std < self.max_std <= 1:
+      raise UserError(f"min_std and max_std must lie above 0 and up to 1, min_std below; got {self.min_std} and {self.max_std}")
     if self.context != 1:
       raise UserError(f"context must be 1, as in the authors' code; got {self.context}")
     if not 0 <= self.last_starts <= self.length:

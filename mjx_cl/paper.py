@@ -177,6 +177,9 @@ def setup(experiment: Experiment, config: dict) -> list[str]:
   pairs = [(card["dreamer"]["size"], author.size, "{} in place of {}"), (own("batch"), author.batch, "{} sequences an update in place of {}"),
            (own("lr"), author.lr, "learning rate {:g} in place of {:g}"),
            (own("policy_lr"), author.policy_lr, "the policy's own steps {:g} times as long"),
+           (own("anchor"), author.anchor, "policy held to the actions taken with a weight of {:g}"),
+           (dreamer["min_std"], author.min_std, "deviation of the actions from {:g} on in place of {:g}"),
+           (dreamer["max_std"], author.max_std, "up to {:g} in place of {:g}"), (dreamer["entropy"], author.entropy, "entropy weight {:g} in place of {:g}"),
            (dreamer["horizon"], author.horizon, "horizon {} in place of {}"), (adapt["ratio"], RATIO, "train ratio {:g} in place of {:g}"),
            (config["onset"], experiment.onset, "onset {:,} in place of {:,}")]
   words = [text.format(ours, theirs) for ours, theirs, text in pairs if ours != theirs]

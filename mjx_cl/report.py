@@ -408,9 +408,31 @@ def gradient(results: pathlib.Path) -> str:
   return text + "\n\n" + grid(("agent", "step along the gradient", "the dream promises", "the robot gains", "terminations"), rows)
 
 
+def ppo(results: pathlib.Path) -> str:
+  """Model-free finetuning on the paper's walker, beside the method's arms."""
+  own = load(results / "ppo_finetune.json")
+  paper = load(results / "paper" / "bench.json")["entries"]["walker"]
+  rows = []
+  for arm, learner in (("ppo-none", "PPO, as pretrained"), ("ppo", "PPO, told the onset")):
+    r = own["arms"][arm]
+    worth = f"{both(r, 'normalised', 2)}, {r['affected']} seeds" if r["normalised"] is not None else "-"
+    rows.append((learner, f"{r['recovered']} of {r['affected']}", both(r, "recovery_median_steps"), both(r, "reward_pre", 2), both(r, "reward_final_affected", 2), worth,
+                 number(r["updates"]), number(r["terminations"] / r["seeds"], 1)))
+  for arm, learner in (("none", "DreamerV3, as shipped"), ("detector", "DreamerV3, by its own alarm"), ("oracle", "DreamerV3, told the onset")):
+    r, worth = paper["arms"][arm], paper["scores"]["normalised"][arm]
+    rows.append((learner, f"{r['recovered']} of {r['affected']}", both(r, "recovery_median_steps"), both(r, "reward_pre", 2), both(r, "reward_final_affected", 2),
+                 f"{both(worth, 'normalised', 2)}, {worth['seeds']} seeds", number(r["updates_mean"]), number(r["terminations_mean"], 1)))
+  text = fill(f"""
+      PPO: brax's, pretrained for {number(own['policy']['steps'])} control steps to a return of {number(own['policy']['return'])}, then from the onset on {own['settings']['epochs']} epochs of
+      {own['settings']['minibatches']} minibatches every {number(own['settings']['horizon'])} control steps at a learning rate of {own['settings']['lr']:g}; {len(own['seeds'])} seeds,
+      {number(own['steps'])} steps, {number(own['wall_s'])} s in all. The reward before the onset is that of all streams, at the end of the affected ones. Medians are censored, the rest interquartile means,
+      with 95 % bootstrap intervals over streams.""")
+  return text + "\n\n" + grid(("learner", "recovered", "median [steps]", "reward before", "reward at the end", "normalised recovery", "updates", "falls"), rows)
+
+
 BLOCKS = {"run-walker": run_walker, "arl0": arl0, "leaderboard": leaderboard, "physics": physics, "dreamer": dreamer, "agents": agents,
           "detectors": detectors, "paper": experiments, "arms": arms,
-          "other-arms": other_arms, "stop-rule": stop_rule, "again": again, "study": study, "gradient": gradient}
+          "other-arms": other_arms, "stop-rule": stop_rule, "again": again, "study": study, "gradient": gradient, "ppo": ppo}
 
 
 # ---- README ----------------------------------------------------------------------------------------------------------------------

@@ -424,8 +424,10 @@ def test_anchor_is_the_likelihood_of_the_actions_taken_and_moves_the_mean_alone(
 
 
 def test_least_deviation_of_the_actions(plain):
-  """With raw deviations far below 0 the actions scatter by min_std, in acting as in the dream."""
+  """With raw deviations far below 0 the actions scatter by min_std, in acting as in the dream; far above it by max_std."""
   agent, _, state = plain
+  low, high = nets.normal(jnp.zeros(1), jnp.array([-50.0, 50.0]), 0.02, 0.3)[1]
+  np.testing.assert_allclose([low, high], [0.02, 0.3], rtol=1e-6)
   params = {**state.params, "pol": {**state.params["pol"], "std": {"kernel": 0.0 * state.params["pol"]["std"]["kernel"], "bias": jnp.full(ACT, -50.0)}}}
   for least in (0.1, 0.02):
     own = Agent(replace(agent.config, min_std=least), agent.obs_size, agent.act_size)

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from test_run import saved  # noqa: F401  a fixture
 
+import mjx_cl
 from mjx_cl import agents, cli, detectors, envs, fault_presets, faults, run, store
 from mjx_cl.config import ARMS, PRESETS
 from mjx_cl.dreamer.sizes import SIZES
@@ -64,6 +65,12 @@ def test_help_imports_nothing_heavy(argv):
 def test_help_names_every_command(mjx):
   code, out, err = mjx("--help")
   assert code == 0 and err == "" and all(name in out for name in ("run", "train", "eval", "plot", "query", "list", "doctor"))
+
+
+def test_version(capsys):
+  with pytest.raises(SystemExit) as end:
+    cli.main(["--version"])
+  assert end.value.code == 0 and capsys.readouterr().out == f"mjx-cl {mjx_cl.__version__}\n"
 
 
 def test_list(mjx):

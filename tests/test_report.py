@@ -35,6 +35,7 @@ SOURCES = {
     "again": ("again/bench.json",),
     "study": ("study/bench.json", "study/suite.json"),
     "gradient": ("policy_gradient.json",),
+    "ppo": ("ppo_finetune.json", "paper/bench.json"),
 }
 ALL = [(name, file) for name, files in SOURCES.items() for file in files]
 
@@ -278,6 +279,7 @@ CONSTANTS = {  # what a block says of itself: windows of the definitions, sizes 
     "again": {"95", "2,000"},
     "study": {"1", "2,000"},
     "gradient": {"95"},
+    "ppo": {"95", "3"},
 }
 
 
@@ -446,6 +448,10 @@ def test_what_differs_from_the_papers_setup():
   assert paper.setup(walker, same) == ["onset 9,000 in place of 5,000"]
   same["agent_card"]["dreamer"] |= {"horizon": 33, "policy_lr": 0.5}
   assert paper.setup(dog, same) == ["the policy's own steps 0.5 times as long", "horizon 33 in place of 333", "MuJoCo in place of Isaac Lab"]
+  same["agent_card"]["dreamer"] = {"size": "size12m", "anchor": 0.2, "min_std": 0.03, "max_std": 0.5, "entropy": 0.0}
+  same["adapt"] |= {"anchor": 0.05}
+  assert paper.setup(dog, same)[:4] == ["policy held to the actions taken with a weight of 0.05", "deviation of the actions from 0.03 on in place of 0.1",
+                                        "up to 0.5 in place of 1", "entropy weight 0 in place of 0.0003"]
 
 
 def test_the_papers_block_names_every_experiment(results):

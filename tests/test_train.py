@@ -302,7 +302,7 @@ def test_the_policy_is_held_at_the_start_of_the_pure_phase(short_walker, tmp_pat
     replace(DREAMER, anchor=-0.5)
   with pytest.raises(UserError, match="set both to 0"):
     make_trainer(short_walker, tmp_path, replace(DREAMER, anchor=0.5), shake=0.1)
-  with pytest.raises(UserError, match="min_std must lie between 0 and 1"):
+  with pytest.raises(UserError, match="min_std and max_std must lie above 0"):
     replace(DREAMER, min_std=0.0)
 
 

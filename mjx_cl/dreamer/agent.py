@@ -97,6 +97,7 @@ class Agent:
     self.stepwise = jax.default_backend() == "cpu" if stepwise is None else stepwise
     self.config, self.obs_size, self.act_size, self.clone_std = config, obs_size, act_size, clone_std
     self.size = s = SIZES[config.size]
+    self.deviations = config.min_std, config.max_std
     self.bins = jnp.asarray(nets.two_hot_bins(config.bins))
     if isinstance(config.obs_scale, str):
       raise UserError("obs_scale `spec` is for training, where there is a robot; an agent takes the numbers")
@@ -159,7 +160,7 @@ class Agent:
     deter = self._core(params, carry.deter[None], carry.stoch[None], carry.action[None])
     logits = self._apply(params, "dyn", deter, self._encode(params, obs[None]), method="posterior")
     stoch = rssm.sample(logits, jax.random.uniform(key_z, (1, self.size.stoch))).reshape(1, -1)
-    mean, std = nets.normal(*self._apply(params, "pol", deter, stoch), self.config.min_std)
+    mean, std = nets.normal(*self._apply(params, "pol", deter, stoch), *self.deviations)
     action = mean if deterministic else mean + std * jax.random.normal(key_a, mean.shape)
     return Carry(deter[0], stoch[0], action[0]), action[0]
 
@@ -209,7 +210,7 @@ class Agent:
 
   def choose(self, params, deter, stoch, noise):
     """The policy's action (N, A) for standard normal `noise`."""
-    mean, std = nets.normal(*self._apply(params, "pol", deter, stoch), self.config.min_std)
+    mean, std = nets.normal(*self._apply(params, "pol", deter, stoch), *self.deviations)
     return mean + std * noise
 
   def latent(self, params, deter, stoch) -> Latent:
@@ -282,7 +283,7 @@ class Agent:
 
   def _clone_loss(self, params, deter, stoch, batch):
     """Mean over labelled replayed states of KL(N(demo, clone_std^2) || policy) [nats]."""
-    mean, std = nets.normal(*self._apply(params, "pol", deter, stoch), self.config.min_std)
+    mean, std = nets.normal(*self._apply(params, "pol", deter, stoch), *self.deviations)
     demo, has = batch.demo[:, 1:].swapaxes(0, 1), batch.has_demo[:, 1:].swapaxes(0, 1).astype(jnp.float32)
     var = self.clone_std ** 2
     kl = jnp.sum(jnp.log(std / self.clone_std) + (var + jnp.square(mean - demo)) / (2 * jnp.square(std)) - 0.5, -1)
@@ -293,7 +294,7 @@ class Agent:
 
     The deviation is held: fitted to actions that were drawn from it, it would take in the error of the mean, and grow with every round.
     """
-    mean, std = nets.normal(*self._apply(params, "pol", deter, stoch), self.config.min_std)
+    mean, std = nets.normal(*self._apply(params, "pol", deter, stoch), *self.deviations)
     std = sg(std)
     taken = 1.0 - batch.last[:, 1:].swapaxes(0, 1).astype(jnp.float32)
     logp = nets.normal_logp(mean, std, batch.action[:, 1:].swapaxes(0, 1))

@@ -51,7 +51,7 @@ def readings(agent, params, slow, *features, pre=(None,) * 4):
 
 def step_losses(agent, pol, val, features, action, adv, omega, ret, slow, pre=(None, None)):
   """Sums over rows of the policy loss, the value loss and the entropy, three float32 ()."""
-  mean, std = nets.normal(*agent.pol.apply({"params": pol}, *features, pre=pre[0]), agent.config.min_std)
+  mean, std = nets.normal(*agent.pol.apply({"params": pol}, *features, pre=pre[0]), *agent.deviations)
   entropy = nets.normal_entropy(std)
   policy = -omega * (nets.normal_logp(mean, std, action) * adv + agent.config.entropy * entropy)
   logits = agent.val.apply({"params": val}, *features, pre=pre[1])
@@ -109,7 +109,7 @@ def imagine_stepwise(agent, params, slow, deter, stoch, key) -> Imagined:
   def step(state, x):
     noise, uniform = x
     pre, said, parts = look(state)
-    mean, std = nets.normal(*agent.pol.apply({"params": params["pol"]}, pre=pre[0]), agent.config.min_std)
+    mean, std = nets.normal(*agent.pol.apply({"params": params["pol"]}, pre=pre[0]), *agent.deviations)
     action = mean + std * noise
     return agent.follow(params, state, action, uniform, parts), (state.deter, state.stoch, action, said, tuple(pre))
   end, (deters, stochs, actions, (rew, con, val, slow_val), pre) = jax.lax.scan(step, agent.latent(params, deter, stoch), (noise[:-1], uniform))

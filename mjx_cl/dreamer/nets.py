@@ -125,9 +125,9 @@ def two_hot_mean(logits: jax.Array, bins: jax.Array) -> jax.Array:
 
 # ---- the policy's normal ---------------------------------------------------------------------------------------------------------
 
-def normal(mean_raw: jax.Array, std_raw: jax.Array, least: float = 0.1) -> tuple[jax.Array, jax.Array]:
-  """Mean tanh(m) and deviation least + (1 - least) sigmoid(s + 2). Samples are neither squashed nor clipped."""
-  return jnp.tanh(mean_raw), least + (1.0 - least) * jax.nn.sigmoid(std_raw + 2.0)
+def normal(mean_raw: jax.Array, std_raw: jax.Array, least: float = 0.1, most: float = 1.0) -> tuple[jax.Array, jax.Array]:
+  """Mean tanh(m) and deviation least + (most - least) sigmoid(s + 2). Samples are neither squashed nor clipped."""
+  return jnp.tanh(mean_raw), least + (most - least) * jax.nn.sigmoid(std_raw + 2.0)
 
 
 def normal_logp(mean: jax.Array, std: jax.Array, x: jax.Array) -> jax.Array:
