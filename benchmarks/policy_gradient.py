@@ -111,7 +111,7 @@ def measure(args) -> dict:
   rows = []
   for i, factor in enumerate(FACTORS):
     gain = earned[i] - earned[0]
-    rows.append({"step": factor * args.size, "promise": (promised[i] - promised[0]) / agent.config.imagine, "reward": float(earned[i].mean()), "gain": float(gain.mean()),
+    rows.append({"step": factor * args.size, "moved": distance(factor * k), "promise": (promised[i] - promised[0]) / agent.config.imagine, "reward": float(earned[i].mean()), "gain": float(gain.mean()),
                  "gain_ci": bootstrap.interval(gain, np.mean), "terminations": int(ends[i])})
   at = {r["step"]: r for r in rows}
   return {"env": args.env, "name": args.agent or args.env, "robots": args.robots, "steps": args.steps, "batches": args.batches, "jitter": args.jitter,
@@ -129,15 +129,19 @@ def main(args) -> None:
     print(f"{r['step']:7.3f} {r['promise']:15.4f} {r['reward']:12.4f} {r['gain']:12.4f} [{r['gain_ci'][0]:.4f}, {r['gain_ci'][1]:.4f}] {r['terminations']:13d}")
 
 
+def parser() -> argparse.ArgumentParser:
+  out = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+  out.add_argument("env", nargs="?", default="walker", choices=sorted(envs.ENVS))
+  out.add_argument("--agent", help="shipped name or folder; default: the robot's own")
+  out.add_argument("--json", action="store_true", help="one JSON value on standard output")
+  out.add_argument("--robots", type=int, default=48)
+  out.add_argument("--steps", type=int, default=1000, help="control steps that each policy drives")
+  out.add_argument("--records", type=int, default=1000, help="control steps of own data")
+  out.add_argument("--batches", type=int, default=48)
+  out.add_argument("--size", type=float, default=0.02, help="root mean square change of the policy's mean action")
+  out.add_argument("--jitter", type=float, default=0.0, help="noise on the actions of half of the robots while collecting, as in training")
+  return out
+
+
 if __name__ == "__main__":
-  parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-  parser.add_argument("env", nargs="?", default="walker", choices=sorted(envs.ENVS))
-  parser.add_argument("--agent", help="shipped name or folder; default: the robot's own")
-  parser.add_argument("--json", action="store_true", help="one JSON value on standard output")
-  parser.add_argument("--robots", type=int, default=48)
-  parser.add_argument("--steps", type=int, default=1000, help="control steps that each policy drives")
-  parser.add_argument("--records", type=int, default=1000, help="control steps of own data")
-  parser.add_argument("--batches", type=int, default=48)
-  parser.add_argument("--size", type=float, default=0.02, help="root mean square change of the policy's mean action")
-  parser.add_argument("--jitter", type=float, default=0.0, help="noise on the actions of half of the robots while collecting, as in training")
-  sys.exit(cli.attempt(lambda: main(parser.parse_args())))
+  sys.exit(cli.attempt(lambda: main(parser().parse_args())))

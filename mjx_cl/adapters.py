@@ -5,7 +5,10 @@ seed s is the robot that seed s + i of `run` has, its later episodes included.
 """
 from __future__ import annotations
 
+import contextlib
 import functools
+import importlib
+import io
 import types
 
 import jax
@@ -72,16 +75,26 @@ def join(env, agent=None, fault: str = "none", target: str | None = None, severi
 
 # ---- brax ----------------------------------------------------------------------------------------------------------------------------
 
+def brax(module: str):
+  """brax's module of that name. What its imports print (a line where warp is absent) stays off standard output.
+
+  Raises:
+    UserError where brax is not installed.
+  """
+  try:
+    with contextlib.redirect_stdout(io.StringIO()):
+      return importlib.import_module(f"brax.{module}")
+  except ImportError:
+    raise UserError("this needs brax: pip install 'mjx-cl[brax]'") from None
+
+
 def brax_env(env, fault: str | None = None, target: str | None = None, severity: float = 0.5, onset: int = 0, duration: int | None = None):
   """Our environment as a `brax.envs.Env`, nominal unless a fault is named.
 
   brax's own wrappers do the vmap, the time limit and the autoreset; its autoreset restarts every robot from its own first state. They
   leave `info` alone, which is where the fault and its clock live: a reset touches neither.
   """
-  try:
-    from brax.envs import base
-  except ImportError:
-    raise UserError("the brax adapter needs brax: pip install 'mjx-cl[brax]'") from None
+  base = brax("envs.base")
   rollout, begin = join(env, None, fault or "none", target, severity, onset, duration)
 
   class BraxEnv(base.Env):

@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_cl.adapters import brax_env
+from mjx_cl.adapters import brax, brax_env
 from mjx_cl.errors import FileError
 
 
@@ -101,8 +101,7 @@ HIDDEN = (128,) * 3  # policy and value
 
 def _template(env):
   """(normaliser, policy, value) of the shapes that brax trains for `env`: what `latest.msgpack` is read into."""
-  from brax.training.acme import running_statistics, specs
-  from brax.training.agents.ppo import networks
+  running_statistics, specs, networks = (brax(f"training.{name}") for name in ("acme.running_statistics", "acme.specs", "agents.ppo.networks"))
   size = len(env.spec.obs)
   net = networks.make_ppo_networks(size, len(env.spec.act), running_statistics.normalize, policy_hidden_layer_sizes=HIDDEN,
                                    value_hidden_layer_sizes=HIDDEN)
@@ -136,7 +135,7 @@ def train(env, out: str | os.PathLike, steps: int, seed: int = 0, evals: int = 1
   """
   own = getattr(env, "demonstration", {})
   adapter = brax_env(Shaped(env, own["weights"], own["bonus"]) if "bonus" in own else env)
-  from brax.training.agents.ppo import networks, train as ppo
+  networks, ppo = brax("training.agents.ppo.networks"), brax("training.agents.ppo.train")
   out = pathlib.Path(out)
   out.mkdir(parents=True, exist_ok=True)
   rows, params = latest(out, env) if resume else ([], None)

@@ -1,5 +1,5 @@
 """Benchmarks that measure a learner: what they hand to others' code, and that what they learn moves the right way."""
-import argparse
+import dataclasses
 import importlib.util
 import json
 import pathlib
@@ -12,7 +12,9 @@ import pyarrow.parquet as pq
 import pytest
 from flax import serialization
 
-from mjx_cl import demonstrator, envs
+from test_agent import shake
+
+from mjx_cl import agents, demonstrator, envs
 from mjx_cl.errors import UserError
 
 FOLDER = pathlib.Path(__file__).parent.parent / "benchmarks"
@@ -116,3 +118,22 @@ def test_ppo_finetunes_from_the_onset_on_and_the_other_arm_not(ppo, policy, tmp_
 def test_ppo_bad_input_is_one_line(ppo, policy, words, message):
   with pytest.raises(UserError, match=message):
     ppo.measure(ppo.parser().parse_args(["walker", "--policy", str(policy), *words]))
+
+
+def test_policy_gradient_moves_the_policy_by_what_it_says(tiny, tmp_path):
+  """Of an agent with made-up heads: five policies at the distances asked for; the unmoved one promises and gains nothing on itself, the others differ."""
+  train = tiny.init(jax.random.key(0))
+  params = shake(train.params)
+  bins = np.sign(tiny.bins) * np.log1p(np.abs(np.asarray(tiny.bins)))
+  for name in ("rew", "val"):  # predictions near 1, not near the bins' 5e8
+    params[name]["out"]["bias"] -= 4 * jnp.abs(jnp.asarray(bins) - 0.5)
+  agents.save(tmp_path / "agent", train._replace(params=params, slow=params["val"], range=jnp.array([0.0, 1.0])),
+              {"env": "walker", "preset": "tiny", "repeat": 1, "dreamer": dataclasses.asdict(tiny.config)})
+  module = load("policy_gradient")
+  value = module.measure(module.parser().parse_args(["walker", "--agent", str(tmp_path / "agent"), "--robots", "4", "--steps", "64", "--records", "64", "--batches", "4"]))
+  still, *moved = value["rows"]
+  assert still["step"] == still["promise"] == still["gain"] == still["moved"] == 0.0
+  assert [r["step"] for r in moved] == pytest.approx([0.02, -0.02, 0.06, -0.06])
+  np.testing.assert_allclose([r["moved"] for r in moved], [0.02, 0.02, 0.06, 0.06], rtol=0.2)  # nearly linear in the step
+  assert len({r["reward"] for r in value["rows"]}) == 5 and all(r["promise"] for r in moved)
+  assert json.loads(json.dumps(value)) == value
