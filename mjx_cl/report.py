@@ -419,6 +419,8 @@ def ppo(results: pathlib.Path) -> str:
     rows.append((learner, f"{r['recovered']} of {r['affected']}", both(r, "recovery_median_steps"), both(r, "reward_pre", 2), both(r, "reward_final_affected", 2), worth,
                  number(r["updates"]), number(r["terminations"] / r["seeds"], 1)))
   for arm, learner in (("none", "DreamerV3, as shipped"), ("detector", "DreamerV3, by its own alarm"), ("oracle", "DreamerV3, told the onset")):
+    if arm not in paper["arms"]:
+      continue
     r, worth = paper["arms"][arm], paper["scores"]["normalised"][arm]
     rows.append((learner, f"{r['recovered']} of {r['affected']}", both(r, "recovery_median_steps"), both(r, "reward_pre", 2), both(r, "reward_final_affected", 2),
                  f"{both(worth, 'normalised', 2)}, {worth['seeds']} seeds", number(r["updates_mean"]), number(r["terminations_mean"], 1)))
