@@ -426,7 +426,7 @@ def ppo(results: pathlib.Path) -> str:
                  f"{both(worth, 'normalised', 2)}, {worth['seeds']} seeds", number(r["updates_mean"]), number(r["terminations_mean"], 1)))
   text = fill(f"""
       PPO: brax's, pretrained for {number(own['policy']['steps'])} control steps to a return of {number(own['policy']['return'])}, then from the onset on {own['settings']['epochs']} epochs of
-      {own['settings']['minibatches']} minibatches every {number(own['settings']['horizon'])} control steps at a learning rate of {own['settings']['lr']:g}; {len(own['seeds'])} seeds,
+      {own['settings']['minibatches']} minibatches every {number(own['settings']['horizon'])} control steps at a learning rate of {own['settings']['lr']:g}; {own['arms']['ppo']['seeds']} seeds,
       {number(own['steps'])} steps, {number(own['wall_s'])} s in all. The reward before the onset is that of all streams, at the end of the affected ones. Medians are censored, the rest interquartile means,
       with 95 % bootstrap intervals over streams.""")
   return text + "\n\n" + grid(("learner", "recovered", "median [steps]", "reward before", "reward at the end", "normalised recovery", "updates", "falls"), rows)
