@@ -128,7 +128,10 @@ def measure(args) -> dict:
   if "bonus" in getattr(env, "demonstration", {}):
     raise UserError(f"the demonstrator of {args.env!r} learned another reward than the robot's; take a robot whose demonstrator did not")
   settings = demonstrator.PPO | getattr(env, "demonstration", {}).get("ppo", {})
-  curve, (normaliser, policy, value) = demonstrator.latest(pathlib.Path(args.policy), env)
+  try:
+    curve, (normaliser, policy, value) = demonstrator.latest(pathlib.Path(args.policy), env)
+  except FileError:
+    raise FileError(f"{args.policy} holds no PPO policy of {args.env!r}; train one with: python -m mjx_cl.demonstrator {args.env} --out DIR") from None
   net = networks_of(env)
   actor = Actor(net, len(env.spec.act))
   the_faults, plan, target = faults.build(changes(config), env, config.onset)

@@ -84,8 +84,8 @@ def brax(module: str):
   try:
     with contextlib.redirect_stdout(io.StringIO()):
       return importlib.import_module(f"brax.{module}")
-  except ImportError:
-    raise UserError("this needs brax: pip install 'mjx-cl[brax]'") from None
+  except ImportError as e:
+    raise UserError(f"this needs brax ({e}): pip install 'mjx-cl[brax]'") from None
 
 
 def brax_env(env, fault: str | None = None, target: str | None = None, severity: float = 0.5, onset: int = 0, duration: int | None = None):

@@ -120,7 +120,7 @@ class TrainConfig:
     jitter: deviation of white noise on the actions of those same robots, in every phase: the last of them gets all of it, the others equal steps
       less. What an action does shows in the data only as far as actions differ from what the policy would have done there.
     hold: updates of the pure phase, from its start, without the policy's own gradient: critic and model learn what the robots do by themselves,
-      held by `anchor`, before the policy climbs on them. A critic that saw a demonstrator's data too tells the two apart by their posture.
+      held by `anchor`, before the policy climbs on them. A critic that saw a demonstrator's data too may tell the two apart by posture.
     fault, severity: domain randomisation: each robot draws a target of this fault and a severity, uniform in [0, `severity`], at the start and at the
       end of every chunk of 64 decisions in which one of its episodes ended. None: healthy robots.
   """

@@ -114,7 +114,8 @@ def test_ppo_finetunes_from_the_onset_on_and_the_other_arm_not(ppo, policy, tmp_
 
 
 @pytest.mark.parametrize("words, message", [
-    (["--horizon", "100"], "multiple of 64 x minibatches"), (["--lr", "0"], "lr must be above 0"), (["--fault", "nonsense"], "nonsense")])
+    (["--horizon", "100"], "multiple of 64 x minibatches"), (["--lr", "0"], "lr must be above 0"), (["--fault", "nonsense"], "nonsense"),
+    (["--policy", "nowhere"], "nowhere holds no PPO policy of 'walker'; train one with"), (["--fault", "walker/gear-half", "--onset", "-1"], "onset must lie in")])
 def test_ppo_bad_input_is_one_line(ppo, policy, words, message):
   with pytest.raises(UserError, match=message):
     ppo.measure(ppo.parser().parse_args(["walker", "--policy", str(policy), *words]))
