@@ -395,6 +395,7 @@ def test_intervals_few_alarms_and_all_columns(browser, file, board):
 
 def test_curves_and_intervals_are_drawn_and_toggle(browser, file, board):
   from selenium.webdriver.common.action_chains import ActionChains
+  from selenium.webdriver.support.ui import WebDriverWait
   browser.open(file)
   assert [t.text for t in browser.all("#curves text.title")] == ["car", "quadruped", "walker"]
   best = max((e for e in board["overall"] if e["detector"] in REAL), key=lambda e: e["cost_standard"])["detector"]
@@ -431,7 +432,8 @@ def test_curves_and_intervals_are_drawn_and_toggle(browser, file, board):
   browser.js("arguments[0].scrollIntoView({block: 'center'})", row)
   ActionChains(browser.driver).move_to_element(row).perform()
   tip = browser.one("#tip")
-  assert tip.is_displayed() and best in tip.text and "95 % interval" in tip.text
+  WebDriverWait(browser.driver, 20).until(lambda _: tip.is_displayed())  # the browser hears of the pointer in its own time
+  assert best in tip.text and "95 % interval" in tip.text
 
 
 def test_fault_page_draws_streams_and_alarms(browser, file, board):
