@@ -44,13 +44,6 @@ from mjx_cl.scoring import bootstrap, normalised, recovery  # noqa: E402
 CHUNK, WARMUP = 64, 1000  # control steps of a chunk, and those at the start of a run that count for nothing, as in AdaptConfig
 
 
-def networks_of(env):
-  """brax's networks as `demonstrator.train` builds them."""
-  running_statistics, networks = brax("training.acme.running_statistics"), brax("training.agents.ppo.networks")
-  return networks.make_ppo_networks(len(env.spec.obs), len(env.spec.act), running_statistics.normalize, policy_hidden_layer_sizes=demonstrator.HIDDEN,
-                                    value_hidden_layer_sizes=demonstrator.HIDDEN)
-
-
 class Actor:
   """A brax policy in the place of an agent in a Rollout; its parameters are {normaliser, policy, value}. It remembers nothing."""
 
@@ -66,8 +59,8 @@ class Actor:
   def act(self, params, carry: Carry, obs, key, deterministic: bool = False):
     logits = self.net.policy_network.apply(params["normaliser"], params["policy"], obs)
     dist = self.net.parametric_action_distribution
-    raw = dist.mode(logits) if deterministic else dist.postprocess(dist.sample_no_postprocessing(logits, key))
-    return carry._replace(action=raw), raw
+    action = dist.mode(logits) if deterministic else dist.sample(logits, key)
+    return carry._replace(action=action), action
 
 
 def transitions(net, params, rows):
@@ -132,7 +125,7 @@ def measure(args) -> dict:
     curve, (normaliser, policy, value) = demonstrator.latest(pathlib.Path(args.policy), env)
   except FileError:
     raise FileError(f"{args.policy} holds no PPO policy of {args.env!r}; train one with: python -m mjx_cl.demonstrator {args.env} --out DIR") from None
-  net = networks_of(env)
+  net = demonstrator.networks_of(env)
   actor = Actor(net, len(env.spec.act))
   the_faults, plan, target = faults.build(changes(config), env, config.onset)
   roll = Rollout(env, actor, the_faults)

@@ -99,14 +99,18 @@ PPO = {"discounting": 0.995, "entropy_cost": 1e-2, "reward_scaling": 10.0}
 HIDDEN = (128,) * 3  # policy and value
 
 
+def networks_of(env):
+  """brax's networks, of the shapes that `train` trains for `env`."""
+  running_statistics, networks = brax("training.acme.running_statistics"), brax("training.agents.ppo.networks")
+  return networks.make_ppo_networks(len(env.spec.obs), len(env.spec.act), running_statistics.normalize, policy_hidden_layer_sizes=HIDDEN,
+                                    value_hidden_layer_sizes=HIDDEN)
+
+
 def _template(env):
-  """(normaliser, policy, value) of the shapes that brax trains for `env`: what `latest.msgpack` is read into."""
-  running_statistics, specs, networks = (brax(f"training.{name}") for name in ("acme.running_statistics", "acme.specs", "agents.ppo.networks"))
-  size = len(env.spec.obs)
-  net = networks.make_ppo_networks(size, len(env.spec.act), running_statistics.normalize, policy_hidden_layer_sizes=HIDDEN,
-                                   value_hidden_layer_sizes=HIDDEN)
-  key = jax.random.key(0)
-  return running_statistics.init_state(specs.Array((size,), jnp.float32)), net.policy_network.init(key), net.value_network.init(key)
+  """(normaliser, policy, value) of those networks: what `latest.msgpack` is read into."""
+  running_statistics, specs = brax("training.acme.running_statistics"), brax("training.acme.specs")
+  net, key = networks_of(env), jax.random.key(0)
+  return (running_statistics.init_state(specs.Array((len(env.spec.obs),), jnp.float32)), net.policy_network.init(key), net.value_network.init(key))
 
 
 def latest(out: pathlib.Path, env) -> tuple[list[dict], tuple]:
