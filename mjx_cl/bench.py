@@ -20,7 +20,7 @@ import tomllib
 from collections.abc import Callable
 from typing import NamedTuple
 
-from mjx_cl import store
+from mjx_cl import pieces, store
 from mjx_cl.adapt.arms import ARMS, FOREVER, ONSET
 from mjx_cl.config import AdaptConfig, RunConfig, becomes, replace
 from mjx_cl.errors import FileError, UserError
@@ -174,7 +174,7 @@ def adapting_steps(config: RunConfig, arm: str) -> int:
 
 def estimate(part: Part, rate: float) -> Estimate:
   """Expected cost of a part on a machine whose dense float32 products run at `rate` FLOP/s. Physics is taken to scale alike: an estimate, no promise."""
-  from mjx_cl import agents, envs, memory
+  from mjx_cl import agents, envs, memory, run
   c = part.config
   spec = envs.make(c.env).spec
   trained = agents.load(c.agent, c.env, len(spec.obs), len(spec.act)).agent.config
@@ -186,8 +186,7 @@ def estimate(part: Part, rate: float) -> Estimate:
   share = 1.0 if not starts else 0.5 + 0.5 * starts / trained.length  # imagination is about half of an update
   physics = max(PHYSICS_S.get(name, 0.1e-3) for name in filter(None, (c.env, becomes(c))))
   seconds = streams * c.steps * ((WATCH_S + ACT_S) * size + physics) + updates * batch * trained.length * UPDATE_S * share * size
-  records = c.steps + 192
-  need = memory.need(trained.size, len(spec.obs), len(spec.act), records, trained.bins)
+  need = memory.need(trained.size, len(spec.obs), len(spec.act), run.capacity(c.steps, spec.episode_steps), trained.bins)
   return Estimate(streams, streams * c.steps, updates, COMPILE_S + seconds * RATE / rate, need.total(streams))
 
 
@@ -239,25 +238,38 @@ def pick(parts: tuple[Part, ...], only: tuple[str, ...], shard: tuple[int, int] 
 
 
 def take(out: pathlib.Path, parts, folders) -> list[str]:
-  """Copies finished parts that lie in `folders`, others' OUT of the same suite, and are missing here; returns their names.
+  """Copies finished parts that lie in `folders`, others' OUT of the same suite, and are missing here; returns their names. Seeds of a part that
+  lie in several of them are joined, see pieces.py.
 
   Raises:
-    UserError where a folder holds a part with other settings.
+    UserError where a folder holds a part with other settings, or seeds of a part are missing or there twice.
   """
   got = []
-  for folder in map(pathlib.Path, folders):
-    for part in parts:
-      if not finished(out, part) and finished(folder, part):
-        tmp = out / (part.name + ".tmp")
-        shutil.rmtree(tmp, ignore_errors=True)
-        tmp.mkdir(parents=True)
-        for name in MERGED:
-          if (folder / part.name / name).exists():
-            shutil.copyfile(folder / part.name / name, tmp / name)
-        shutil.rmtree(out / part.name, ignore_errors=True)
-        os.replace(tmp, out / part.name)
-        got.append(part.name)
+  for part in parts:
+    if finished(out, part):
+      continue
+    there = [pathlib.Path(folder) / part.name for folder in folders]
+    sources = next(([own] for own in there if pieces.seeds_of(own, part.config) == part_seeds(part)), None) or pieces.choose(there, part.config)
+    if not sources:
+      continue
+    tmp = out / (part.name + ".tmp")
+    shutil.rmtree(tmp, ignore_errors=True)
+    tmp.mkdir(parents=True)
+    if len(sources) == 1:
+      for name in MERGED:
+        if (sources[0] / name).exists():
+          shutil.copyfile(sources[0] / name, tmp / name)
+    else:
+      pieces.join(sources, tmp, part.config)
+    shutil.rmtree(out / part.name, ignore_errors=True)
+    os.replace(tmp, out / part.name)
+    got.append(part.name)
   return got
+
+
+def part_seeds(part: Part) -> list[int]:
+  """Seeds of a part."""
+  return list(range(part.config.first_seed, part.config.first_seed + part.config.seeds))
 
 
 def publish(out: pathlib.Path, parts, to) -> list[str]:
@@ -266,10 +278,12 @@ def publish(out: pathlib.Path, parts, to) -> list[str]:
   for part in parts:
     if not finished(out, part):
       continue
+    (to / part.name).mkdir(parents=True, exist_ok=True)
     for name in PUBLISHED:
       if (out / part.name / name).exists():
-        (to / part.name).mkdir(parents=True, exist_ok=True)
         store.atomic(to / part.name / name, lambda file, source=out / part.name / name: file.write(source.read_bytes()))
+      else:  # of an earlier run, as the figure where seeds were joined without their traces
+        (to / part.name / name).unlink(missing_ok=True)
     done.append(part.name)
   for name in ("suite.json", "bench.json", "bench.parquet", "recovery.png", "ratio.png"):
     if done and (out / name).exists():

@@ -218,7 +218,7 @@ class Bench:
   jobs: int | None = None
   """Parts side by side, each on its share of the cores; default: one per core as far as memory allows."""
   merge: tuple[str, ...] = ()
-  """Folders of the same suite from other machines; their finished parts are copied here and not run."""
+  """Folders of the same suite from other machines; their finished parts are copied here and not run, seeds of a part that several hold are joined."""
   publish: str | None = None
   """Copy finished parts' tables and figures, without the traces, to this folder."""
   json: bool = False
@@ -478,18 +478,19 @@ def do_bench(args: Bench) -> None:
   for folder in args.merge:
     if not os.path.isdir(folder):
       raise UserError(f"--merge: no folder {folder}")
-  needs, space = [estimates[p.name].bytes for p in parts if p.name not in done], int(memory.MARGIN * memory.free())
-  if max(needs, default=0) > space:
-    raise UserError(f"a part needs {max(needs) / 2**30:.1f} GiB, {space / 2**30:.1f} GiB may be used; fewer --seeds would fit")
-  jobs = workers.number(args.jobs, needs, space)
   try:
     out.mkdir(parents=True, exist_ok=True)
   except OSError as e:
     raise FileError(f"cannot make {out}: {e.strerror}") from None
-  for line in plan_lines(suite, parts, done, estimates):
-    say(line)
   for name in bench.take(out, parts, args.merge):
     say(f"{name}: taken over")
+    done.add(name)
+  needs, space = [estimates[p.name].bytes for p in parts if p.name not in done], int(memory.MARGIN * memory.free())
+  if max(needs, default=0) > space:
+    raise UserError(f"a part needs {max(needs) / 2**30:.1f} GiB, {space / 2**30:.1f} GiB may be used; fewer --seeds would fit")
+  jobs = workers.number(args.jobs, needs, space)
+  for line in plan_lines(suite, parts, done, estimates):
+    say(line)
   value = bench.execute(suite, out, parts, estimates, say, RunDisplay, jobs=jobs)
   if args.publish:
     bench.publish(out, suite.parts, args.publish)

@@ -1,6 +1,8 @@
 """Bytes that a training or a run will hold, known before anything is allocated."""
 from __future__ import annotations
 
+import bisect
+from collections.abc import Callable
 from typing import NamedTuple
 
 from mjx_cl.dreamer.sizes import SIZES
@@ -45,21 +47,22 @@ def free() -> int:
   return stats["bytes_limit"] - stats["bytes_in_use"] if stats else psutil.virtual_memory().available
 
 
-def check(size: str, obs_size: int, act_size: int, records: int, seeds: int, what: str, bins: int = 255, shards: int = 1) -> Need:
+def check(size: str, obs_size: int, act_size: int, records: int, seeds: int, what: tuple[str, Callable[[int], int]], bins: int = 255, shards: int = 1) -> Need:
   """Refuses what would not fit.
 
   Args:
-    records: of one seed. seeds: of all. what: the setting that bounds the records, and how many robots fill it, e.g. ("capacity", 32).
+    records: of one seed. seeds: of all. what: the setting that bounds the records, and the records that a value of it needs (never fewer for more).
     shards: devices over which the seeds are spread.
   Raises:
     UserError that names the number which would fit.
   """
-  setting, robots = what
+  setting, records_of = what
   wanted = need(size, obs_size, act_size, records, bins)
   here = -(-seeds // shards)
   space = int(MARGIN * free())
   if wanted.total(here) > space:
-    left = (space - wanted.total(here) + here * wanted.replay) // here // wanted.record // robots
+    room = (space - wanted.total(here) + here * wanted.replay) // here // wanted.record
+    left = bisect.bisect_right(range(1, 2 + max(0, room)), room, key=records_of)
     fits = f"{setting}={left:,} would fit" if left > 0 else f"not even {setting}=1 fits: fewer seeds or a smaller size would"
     raise UserError(f"{seeds} seeds of {size} with {records:,} records each need {wanted.total(here) / 2**30:.1f} GiB a device, {space / 2**30:.1f} GiB may be "
                     f"used; {fits}")

@@ -24,7 +24,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_cl import agents, checkpoint, detectors, envs, faults, memory, store
+from mjx_cl import agents, checkpoint, detectors, envs, faults, memory, replay, store
 from mjx_cl.adapt import phase as phase_lib
 from mjx_cl.adapt.arms import ARMS, FOREVER, NEVER, never_stops
 from mjx_cl.adapt.convergence import SIGNALS
@@ -64,6 +64,13 @@ class Progress(NamedTuple):
   note: str = ""
 
 
+def capacity(steps: int, episode: int, repeat: int = 1) -> int:
+  """Replay records kept for a stream of `steps` control steps whose episodes last `episode`: all that it can write, one more than steps an episode.
+  A robot that falls often begins more episodes than that, and in the end forgets its oldest records."""
+  chunks = -(-steps // (CHUNK * repeat))
+  return replay.room((chunks + 2) * CHUNK + steps // episode)
+
+
 class Runner:
   """Runs one RunConfig into the folder `out`.
 
@@ -94,12 +101,13 @@ class Runner:
       begin = lambda k, breaks: self.rollout.start(k, target, spared(plan, breaks), jnp.where(breaks, config.onset, FOREVER))
     self.chunk_steps = CHUNK * self.repeat
     self.chunks = -(-config.steps // self.chunk_steps)
-    capacity = (self.chunks + 1) * CHUNK + config.steps // min(r.spec.episode_steps for r in self.robots) + CHUNK
-    memory.check(agent.config.size, len(spec.obs), len(spec.act), capacity, len(config.arms) * config.seeds, ("steps", 1), agent.config.bins)
+    episode = min(r.spec.episode_steps for r in self.robots)
+    needs = lambda steps: capacity(steps, episode, self.repeat)
+    memory.check(agent.config.size, len(spec.obs), len(spec.act), needs(config.steps), len(config.arms) * config.seeds, ("steps", needs), agent.config.bins)
     self.seeds = [config.first_seed + i for i in range(config.seeds)]
     self.labels = [(arm, seed) for arm in config.arms for seed in self.seeds]
     self.groups = len(self.labels)
-    self.crew = Crew(Loop(agent, monitor, detector, spec, config.adapt, self.repeat, capacity=capacity), self.groups)
+    self.crew = Crew(Loop(agent, monitor, detector, spec, config.adapt, self.repeat, capacity=needs(config.steps)), self.groups)
     self.breaks = np.asarray([ARMS[arm].breaks for arm, _ in self.labels])
     keys = jnp.stack([jax.random.key(seed) for _, seed in self.labels])[:, None]
     self.keys = jax.vmap(lambda k: jax.random.fold_in(k, 7))(keys[:, 0])
@@ -446,14 +454,7 @@ class Runner:
     severity = 1.0 if self.other is not None else max(c.severity for c in self.changes)
     out = {"env": self.config.env, "fault": self.config.fault, "severity": severity, "onset": self.config.onset, "steps": self.config.steps,
            "detector": self.config.detector}
-    of = lambda change: {arm: summarise(own, self.config, self.env.spec.control_s) for arm in self.config.arms
-                         if (own := [r for r in runs if r["arm"] == arm and r["change"] == change])}
-    out["arms"] = arms = of(0)
-    later = range(1, 1 + max(r["change"] for r in runs))
-    if later:
-      out["later_changes"] = [of(change) for change in later]
-    if "detector" in arms:
-      out |= arms["detector"]
+    out |= by_arm(runs, self.config, self.env.spec.control_s)
     nominal = trace["valid"][15 * self.repeat:]
     out["invalid_share"] = float(1.0 - nominal[self.repeat - 1::self.repeat].mean()) if len(nominal) >= self.repeat else None
     wall = sum(self.seconds.values())
@@ -462,7 +463,7 @@ class Runner:
     shares = {"physics": self.seconds["physics"], "acting": self.seconds["acting"], "monitor": monitor, "updates": self.seconds["digest"] - monitor,
               "other": self.seconds["other"]}
     out["wall_s"] = wall
-    out["wall_s_arms"] = {arm: float(sum(r["wall_s"] or 0.0 for r in runs if r["arm"] == arm)) for arm in arms}
+    out["wall_s_arms"] = {arm: float(sum(r["wall_s"] or 0.0 for r in runs if r["arm"] == arm)) for arm in out["arms"]}
     out["wall_share"] = {k: v / wall for k, v in shares.items()}
     return out
 
@@ -492,6 +493,16 @@ def arm_agents(config: RunConfig, spec) -> dict[str, agents.Trained]:
 def spared(plan: faults.Plan, breaks) -> faults.Plan:
   """`plan` for a robot that breaks, bool (); without any severity for one that does not."""
   return plan._replace(severity=jnp.where(breaks, plan.severity, 0.0))
+
+
+def by_arm(rows: list[dict], config: RunConfig, control_s: float) -> dict:
+  """What summary.json says from the rows of runs.parquet alone: `arms`, `later_changes` where there are any, and arm `detector` once more at the top."""
+  of = lambda change: {arm: summarise(own, config, control_s) for arm in config.arms if (own := [r for r in rows if r["arm"] == arm and r["change"] == change])}
+  out: dict = {"arms": of(0)}
+  later = range(1, 1 + max(r["change"] for r in rows))
+  if later:
+    out["later_changes"] = [of(change) for change in later]
+  return out | out["arms"].get("detector", {})
 
 
 def summarise(rows: list[dict], config: RunConfig, control_s: float) -> dict:

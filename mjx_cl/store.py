@@ -64,6 +64,12 @@ def write_table(path, columns: dict, nan_is_null: bool = True, codec: str = "zst
   atomic(path, lambda file: pyarrow.parquet.write_table(pyarrow.table(arrays), file, compression=codec, compression_level=level, **how))
 
 
+def write_arrow(path, table) -> None:
+  """Writes a pyarrow Table as Parquet, compressed as `write_table` does."""
+  import pyarrow.parquet
+  atomic(path, lambda file: pyarrow.parquet.write_table(table, file, compression="zstd", use_dictionary=False))
+
+
 def read_suite(name: str, folder: pathlib.Path) -> tuple[pathlib.Path, dict]:
   """A suite by name, FOLDER/NAME.toml, or from a TOML file: (its path, its tables).
 
@@ -83,25 +89,29 @@ def read_suite(name: str, folder: pathlib.Path) -> tuple[pathlib.Path, dict]:
     raise FileError(f"{path} is no TOML: {e}") from None
 
 
-def read_table(path) -> dict:
-  """Columns of a Parquet file as NumPy arrays, null as nan."""
+def read_arrow(path):
+  """A Parquet file as a pyarrow Table.
+
+  Raises:
+    FileError for a file that cannot be read.
+  """
   import pyarrow
   import pyarrow.parquet
   try:
-    table = pyarrow.parquet.read_table(path)
+    return pyarrow.parquet.read_table(path)
   except (OSError, pyarrow.ArrowException) as e:
     raise FileError(f"cannot read {path}: {str(e).splitlines()[0]}") from None
+
+
+def read_table(path) -> dict:
+  """Columns of a Parquet file as NumPy arrays, null as nan."""
+  table = read_arrow(path)
   return {name: table[name].to_numpy() for name in table.column_names}
 
 
 def read_plain(path) -> dict[str, list]:
   """Columns of a Parquet file as Python values, null as None."""
-  import pyarrow
-  import pyarrow.parquet
-  try:
-    return pyarrow.parquet.read_table(path).to_pydict()
-  except (OSError, pyarrow.ArrowException) as e:
-    raise FileError(f"cannot read {path}: {str(e).splitlines()[0]}") from None
+  return read_arrow(path).to_pydict()
 
 
 def read_rows(path) -> list[dict]:

@@ -143,7 +143,7 @@ class Trainer:
     spec = env.spec
     self.plain = Agent(dreamer, len(spec.obs), len(spec.act))
     self.mesh = seeds_mesh(seeds)
-    memory.check(dreamer.size, len(spec.obs), len(spec.act), config.envs * config.capacity, seeds, ("capacity", config.envs), dreamer.bins,
+    memory.check(dreamer.size, len(spec.obs), len(spec.act), config.envs * config.capacity, seeds, ("capacity", lambda n: n * config.envs), dreamer.bins,
                  1 if self.mesh is None else self.mesh.size)
     self.failed: dict[int, str] = {}  # seed -> the term that was not finite, and when
     fault = faults.make(config.fault or "none", env)

@@ -266,7 +266,7 @@ def test_scratch_starts_from_fresh_parameters(story, same):
 
 
 def test_one_trace_serves_all_arms(story):
-  assert story.loop.digest._cache_size() == 1
+  assert story.loop._program._cache_size() == 1
 
 
 # ---- a run of all arms ---------------------------------------------------------------------------------------------------------------

@@ -30,7 +30,7 @@ def test_need_is_what_is_allocated():
 
 def test_the_number_that_is_named_fits_and_the_next_does_not(monkeypatch):
   monkeypatch.setattr(memory, "free", lambda: 200 * 2**20)
-  ask = lambda capacity: memory.check("size1m", OBS, ACT, 8 * capacity, 3, ("capacity", 8))
+  ask = lambda capacity: memory.check("size1m", OBS, ACT, 8 * capacity, 3, ("capacity", lambda n: 8 * n))
   with pytest.raises(UserError, match="3 seeds of size1m with 8,000,000 records each need 27.0 GiB a device, 0.2 GiB may be used") as e:
     ask(1_000_000)
   fits = int(re.search(r"capacity=([\d,]+) would fit", str(e.value))[1].replace(",", ""))
@@ -43,15 +43,15 @@ def test_the_number_that_is_named_fits_and_the_next_does_not(monkeypatch):
 def test_weights_that_do_not_fit_are_said_so(monkeypatch):
   monkeypatch.setattr(memory, "free", lambda: 2**20)
   with pytest.raises(UserError, match="not even capacity=1 fits"):
-    memory.check("size12m", OBS, ACT, 10, 1, ("capacity", 1))
+    memory.check("size12m", OBS, ACT, 10, 1, ("capacity", lambda n: n))
 
 
 def test_devices_share_the_seeds(monkeypatch):
   need = memory.need("size1m", OBS, ACT, 1000)
   monkeypatch.setattr(memory, "free", lambda: int(need.total(2) / memory.MARGIN) + 1)
-  memory.check("size1m", OBS, ACT, 1000, 4, ("capacity", 1), shards=2)
+  memory.check("size1m", OBS, ACT, 1000, 4, ("capacity", lambda n: n), shards=2)
   with pytest.raises(UserError):
-    memory.check("size1m", OBS, ACT, 1000, 4, ("capacity", 1))
+    memory.check("size1m", OBS, ACT, 1000, 4, ("capacity", lambda n: n))
 
 
 def test_trainer_and_runner_refuse_before_they_allocate(monkeypatch, short_walker, tmp_path):

@@ -108,12 +108,14 @@ class Loop:
     spec: of the environment (acceptance, posture).
     repeat: control steps per decision.
     capacity: post-alarm records kept per stream.
+
+  The numbers of `config` are arguments of the program, not constants in it: runs that differ in budget, ratio, average or rule share one compilation.
   """
 
   def __init__(self, agent: Agent, monitor: Monitor, detector, spec, config: AdaptConfig, repeat: int = 1, capacity: int = 20_480):
     self.agent, self.monitor, self.detector, self.spec = agent, monitor, detector, spec
     self.config, self.repeat, self.capacity = config, repeat, capacity
-    self.digest = jax.jit(self._digest, donate_argnums=0)
+    self._program = jax.jit(self._digest, donate_argnums=0)
 
   def init(self, train: TrainState, groups: int) -> LoopState:
     """State before the first step; `train` is the shipped agent, the same for every stream."""
@@ -125,8 +127,8 @@ class Loop:
     return LoopState(spread(train), spread(train.params), spread(empty), self.monitor.init(groups, 1), spread(self.detector.init()), spread(phase_lib.init(self.config)),
                      past, jnp.zeros(groups), jnp.zeros(groups, jnp.int32))
 
-  def _digest(self, state: LoopState, rows, now, choices: Choices, keys, acceptance=None):
-    """One chunk.
+  def digest(self, state: LoopState, rows, now, choices: Choices, keys, acceptance=None) -> tuple[LoopState, Digest]:
+    """One chunk, jitted; `state` is used up.
 
     Args:
       rows: rollout.Row, leading (T, groups, 1). now: int32 (), control steps done after the chunk. choices: of the streams.
@@ -135,6 +137,9 @@ class Loop:
     Returns:
       (state', Digest).
     """
+    return self._program(state, rows, now, choices, keys, acceptance, self.config)
+
+  def _digest(self, state, rows, now, choices, keys, acceptance, config):
     split = jax.vmap(lambda key: jax.random.split(jax.random.fold_in(key, now), 3))(keys)
     key_monitor, key_eval, key_update = split[:, 0], split[:, 1], split[:, 2]
     length = rows.reward.shape[0]
@@ -151,18 +156,18 @@ class Loop:
     posture = jnp.mean(rows.final_obs[:, :, 0, index], 0)
 
     known = now - length * self.repeat + (jnp.arange(length) + 1) * self.repeat - 1  # control step at which each row is known
-    acted = alarms.fired & (known >= self.config.warmup)[:, None]
+    acted = alarms.fired & (known >= config.warmup)[:, None]
     first = jnp.argmax(acted, 0)
     alarm_step = known[first]
     # a start that is due at step s is known before the step is taken, so that replay begins with its row
     opened = now - length * self.repeat
-    falls = (choices.at >= jnp.maximum(opened, self.config.warmup)) & (choices.at < now)
+    falls = (choices.at >= jnp.maximum(opened, config.warmup)) & (choices.at < now)
     due, at = jnp.any(falls, 1), jnp.min(jnp.where(falls, choices.at, now), 1)
     first = jnp.where(due, -((opened - at) // self.repeat) - 1, first)
     alarm_step = jnp.where(due, at, alarm_step)
-    if acceptance is None or self.config.acceptance is not None:
-      acceptance = self.spec.acceptance if self.config.acceptance is None else self.config.acceptance
-    step = lambda *x: phase_lib.update(*x[:-3], self.config, *x[-3:])
+    if acceptance is None or config.acceptance is not None:
+      acceptance = self.spec.acceptance if config.acceptance is None else config.acceptance
+    step = lambda *x: phase_lib.update(*x[:-3], config, *x[-3:])
     was = state.phase.phase
     phase, decision, ok = jax.vmap(step, (0, 0, 0, 0, 0, None, 0, 0 if jnp.ndim(acceptance) else None, None, 0, 0, 0))(
         state.phase, signals, posture, jnp.any(acted, 0), alarm_step, now, choices.listens, acceptance, least_posture,
@@ -178,13 +183,13 @@ class Loop:
 
     c = self.agent.config
     windows = jax.vmap(lambda r: replay_lib.windows(r, c.length + 1))(replay)
-    due = (phase.phase == phase_lib.ADAPTING) & (windows >= self.config.start_windows)
-    owed = jnp.where(due, state.owed + length * self.config.ratio / (c.batch * c.length), 0.0)
+    due = (phase.phase == phase_lib.ADAPTING) & (windows >= config.start_windows)
+    owed = jnp.where(due, state.owed + length * config.ratio / (c.batch * c.length), 0.0)
     number = jnp.floor(owed + 1e-6).astype(jnp.int32)
     train, acting = state.train, state.acting
     if choices.fresh is not None:
       train, acting = self._renew(train, acting, keys, begins & choices.fresh)
-    if self.config.fresh_moments:
+    if config.fresh_moments:
       fresh = jax.vmap(self.agent.optimizer.init)(train.params)
       reset = lambda new, old: jnp.where(begins.reshape((-1,) + (1,) * (old.ndim - 1)), new, old)
       train = train._replace(opt=jax.lax.cond(jnp.any(begins), lambda o: jax.tree.map(reset, fresh, o), lambda o: o, train.opt))
@@ -193,7 +198,7 @@ class Loop:
     taken = train.updates - counted
 
     # the robot acts by a moving average of what it learns, and keeps it when it is done
-    rate = jnp.where(number > 0, self.config.average, 0.0)
+    rate = jnp.where(number > 0, config.average, 0.0)
     ended = (was == phase_lib.ADAPTING) & (phase.phase != phase_lib.ADAPTING)
     wide = lambda x, like: x.reshape((-1,) + (1,) * (like.ndim - 1))
     acting = jax.tree.map(lambda a, p: a + wide(rate, a) * (p - a), acting, train.params)

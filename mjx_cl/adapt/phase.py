@@ -1,7 +1,12 @@
 """The phase of one stream: nominal --alarm or schedule--> adapting --> converged | aborted | ended. One call per chunk, every decision has a
-reason."""
+reason.
+
+AdaptConfig is a pytree here: numbers that only enter arithmetic are leaves, so that a jitted function which takes it as an argument serves every
+budget, ratio and rule; fields of STATIC shape arrays or choose what is computed, and are part of the structure.
+"""
 from __future__ import annotations
 
+import dataclasses
 from typing import NamedTuple
 
 import jax
@@ -16,6 +21,24 @@ PHASES = ("nominal", "adapting", "converged", "aborted", "ended")
 NOTHING, START, STOP, ABORT_BELOW, ABORT_HOPELESS, ABORT_BUDGET, END = range(7)
 REASONS = ("", "alarm", "all six signals settled, task acceptable", "settled below acceptance", "no settling in sight", "budget spent",
            "fixed number of steps over")
+
+STATIC = ("patience", "refit", "fresh_moments")
+
+
+def _flatten(config: AdaptConfig):
+  names = [f.name for f in dataclasses.fields(config)]
+  return tuple(getattr(config, n) for n in names if n not in STATIC), tuple(getattr(config, n) for n in STATIC)
+
+
+def _unflatten(static, leaves) -> AdaptConfig:
+  config = object.__new__(AdaptConfig)  # traced values can't be checked; those of the config that was flattened have been
+  names = [f.name for f in dataclasses.fields(AdaptConfig)]
+  for name, value in (*zip(STATIC, static), *zip((n for n in names if n not in STATIC), leaves)):
+    object.__setattr__(config, name, value)
+  return config
+
+
+jax.tree_util.register_pytree_node(AdaptConfig, _flatten, _unflatten)
 
 
 class PhaseState(NamedTuple):

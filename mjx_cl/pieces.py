@@ -1,0 +1,124 @@
+"""Runs that differ in nothing but their seeds, joined to one: what several machines lived, or one machine on several days.
+
+A stream's keys come from its seed alone, so the seeds of a run may be lived apart; only the last digits of a float may differ then (see run.Runner).
+The joined folder is as `mjx-cl run` writes it: streams are numbered arm by arm, seed by seed, and summary.json is computed anew from the rows. Its config.json
+is the first piece's with all the seeds, and `pieces` says of each when and on what it was run. Tables that one piece lacks, as published ones
+lack their trace, are left out.
+"""
+from __future__ import annotations
+
+import json
+import pathlib
+
+from mjx_cl import store
+from mjx_cl.config import RunConfig
+from mjx_cl.errors import FileError, UserError
+
+ORDER = {"trace": "step", "events": "step", "runs": "change", "signals": "step", "snapshots": "step", "stop": "since"}  # table -> what follows the stream
+KEPT = ("git_commit", "machine", "python", "versions")
+
+
+def seeds_of(folder, config: RunConfig) -> list[int] | None:
+  """Seeds of the finished run in `folder` if it is `config` but for its seeds; None where there is no finished run.
+
+  Raises:
+    UserError where it was run with other settings.
+  """
+  from mjx_cl.run import check_same, identity
+  folder = pathlib.Path(folder)
+  if not (folder / "config.json").exists() or not (folder / "summary.json").exists():
+    return None
+  check_same(folder, {k: v for k, v in identity(config).items() if k not in ("physics", "seeds", "first_seed")})
+  own = json.loads((folder / "config.json").read_text())
+  return list(range(own["first_seed"], own["first_seed"] + own["seeds"]))
+
+
+def choose(folders, config: RunConfig) -> list[pathlib.Path]:
+  """Of `folders` those whose seeds make up the seeds of `config`, in the order of their seeds; empty where none of them holds any.
+
+  Raises:
+    UserError where two hold the same seed, or one is in none of them: the line names it.
+  """
+  wanted = range(config.first_seed, config.first_seed + config.seeds)
+  found: dict[int, pathlib.Path] = {}
+  begins = {}
+  for folder in map(pathlib.Path, folders):
+    own = seeds_of(folder, config)
+    if not own or not set(own) <= set(wanted):
+      continue
+    for seed in own:
+      if seed in found:
+        raise UserError(f"seed {seed} lies both in {found[seed]} and in {folder}; give one of them")
+      found[seed] = folder
+    begins[folder] = own[0]
+  missing = [seed for seed in wanted if seed not in found]
+  if found and missing:
+    raise UserError(f"{', '.join(map(str, begins))}: no seed {', '.join(map(str, missing))}; run what is missing with --first-seed {missing[0]} --seeds N and "
+                    "another --out, or ask for fewer --seeds")
+  return sorted(begins, key=begins.get)
+
+
+def join(folders, out, config: RunConfig) -> dict:
+  """Writes the run of all seeds of `folders` into the folder `out` and returns summary.json's value.
+
+  Args:
+    folders: of finished runs, see `choose`. config: with the seeds of all of them.
+  Raises:
+    FileError for a piece that cannot be read.
+  """
+  import numpy as np
+  from mjx_cl import envs, plots, run
+  from mjx_cl.scoring import stop
+  folders, out = [pathlib.Path(f) for f in folders], pathlib.Path(out)
+  summaries, configs = [], []
+  for folder in folders:
+    try:
+      summaries.append(json.loads((folder / "summary.json").read_text()))
+      configs.append(json.loads((folder / "config.json").read_text()))
+    except (OSError, ValueError) as e:
+      raise FileError(f"{folder} is no finished run: {e}") from None
+  arms = list(config.arms)
+  number = {(arm, config.first_seed + i): a * config.seeds + i for a, arm in enumerate(arms) for i in range(config.seeds)}
+  out.mkdir(parents=True, exist_ok=True)
+  rows = {}
+  for name, key in ORDER.items():
+    files = [folder / f"{name}.parquet" for folder in folders]
+    if not all(file.exists() for file in files):
+      continue
+    tables = [store.read_arrow(file) for file in files]
+    table = joined(tables, number, key)
+    rows[name] = table
+    store.write_arrow(out / f"{name}.parquet", table)
+  if "runs" not in rows:
+    raise FileError(f"no runs.parquet in one of {', '.join(map(str, folders))}")
+  runs = rows["runs"].to_pylist()
+  # what is a mean over control steps is weighted by streams; of seconds the sum counts, as if the pieces had been run one after another
+  wall = [s["wall_s"] for s in summaries]
+  mean = lambda values, weights: float(np.average(values, weights=weights))
+  invalid = [(s["invalid_share"], c["seeds"]) for s, c in zip(summaries, configs) if s["invalid_share"] is not None]
+  spec = envs.make(config.env).spec
+  value = {k: summaries[0][k] for k in ("env", "fault", "severity", "onset", "steps", "detector")}
+  value |= run.by_arm(runs, config, spec.control_s)
+  value |= {"invalid_share": mean(*zip(*invalid)) if invalid else None, "wall_s": float(sum(wall)),
+            "wall_s_arms": {arm: float(sum(s["wall_s_arms"][arm] for s in summaries)) for arm in summaries[0]["wall_s_arms"]},
+            "wall_share": {k: mean([s["wall_share"][k] for s in summaries], wall) for k in summaries[0]["wall_share"]}}
+  if "stop" in rows:
+    value["wall_s_snapshots"] = float(sum(s.get("wall_s_snapshots") or 0.0 for s in summaries))
+    value["stop_rule"] = stop.summarise(rows["stop"].to_pylist())
+  pieces = [piece for own in configs for piece in own.get("pieces", [{k: own[k] for k in ("first_seed", "seeds", *KEPT) if k in own}])]
+  store.write_json(out / "config.json", configs[0] | {"first_seed": config.first_seed, "seeds": config.seeds, "pieces": pieces})
+  if "trace" in rows:
+    plots.figure(out)
+  store.write_json(out / "summary.json", value)  # last: a folder with it is a finished run
+  return value
+
+
+def joined(tables, number: dict[tuple[str, int], int], key: str):
+  """pyarrow Tables one below the other, `stream` counted anew, ordered by stream and `key`. A column that a piece lacks is null there."""
+  import pyarrow
+  table = pyarrow.concat_tables(tables, promote_options="permissive")
+  stream = [number[at] for at in zip(table["arm"].to_pylist(), table["seed"].to_pylist())]
+  at = table.column_names.index("stream")
+  table = table.set_column(at, "stream", pyarrow.array(stream, table.schema.field("stream").type))
+  rank = pyarrow.array(range(len(table)))  # events of one step stay in their order
+  return table.append_column("rank", rank).sort_by([("stream", "ascending"), (key, "ascending"), ("rank", "ascending")]).drop_columns("rank")
