@@ -1,9 +1,10 @@
 """Draws the learning curve of a pretraining from its metrics.parquet.
 
-  python benchmarks/learning_curve.py runs/train results/walker_agent [--published]
+  python benchmarks/learning_curve.py runs/train results/walker_agent [--published] [--then runs/on]
 
 One line per seed, the mean with its 95 % bootstrap interval over seeds where there are several, against updates, records and wall time;
-`--published` adds DreamerV3's own walker-walk curve.
+`--published` adds DreamerV3's own walker-walk curve. `--then` is a training that began with the agent of the first (`--agent runs/train/agent`, its
+seed 0): its line goes on where that one ended, in `then.parquet` too; of the wall time of seeds trained side by side it inherits one share.
 """
 from __future__ import annotations
 
@@ -32,6 +33,7 @@ def main() -> None:
   parser.add_argument("train", help="folder that `mjx-cl train` wrote")
   parser.add_argument("out", help="folder for curve.parquet and curve.png")
   parser.add_argument("--published", action="store_true", help="add the published walker-walk curve")
+  parser.add_argument("--then", help="folder of a training that began with the agent of the first")
   args = parser.parse_args()
   import matplotlib
   matplotlib.use("Agg")
@@ -47,12 +49,21 @@ def main() -> None:
   columns = ("updates", "records", "seconds", "phase", "return", *(f"return/{s}" for s in seeds), "episodes", "expert_return", "loss/dyn", "loss/value",
              "adv_mag", "ent/action")
   store.write_table(out / "curve.parquet", {c: table[c][ended] for c in columns if c in table})
+  then = None
+  if args.then:
+    then = store.read_table(pathlib.Path(args.then) / "metrics.parquet")
+    for name, share in (("updates", 1), ("records", 1), ("seconds", len(seeds))):
+      then[name] = then[name] + table[name][-1] / share
+    ((rows, _),) = curves(then).values()
+    then = {c: then[c][rows] for c in columns if c in then}
+    store.write_table(out / "then.parquet", then)
   fig, axes = plt.subplots(1, 3, figsize=(13, 3.8), sharey=True, constrained_layout=True)
   scales = (("updates", 1.0, "updates of each seed"), ("records", 1e6, "records of each seed [million control steps]"), ("seconds", 3600, "wall time [h]"))
+  smooth = lambda values: np.convolve(np.pad(values, (3, 3), mode="edge"), np.ones(7) / 7, "valid")
   for axis, (name, unit, label) in zip(axes, scales):
     x = table[name].astype(float) / unit
     for seed, (rows, values) in seeds.items():
-      axis.plot(x[rows], np.convolve(np.pad(values, (3, 3), mode="edge"), np.ones(7) / 7, "valid"), lw=0.9, alpha=0.8,
+      axis.plot(x[rows], smooth(values), lw=0.9, alpha=0.8,
                 label=f"seed {seed}, running mean of 7" if len(seeds) > 1 else "running mean of 7")
     if len(seeds) > 1:
       grid = np.linspace(0, len(table["updates"]) - 1, 31)
@@ -69,6 +80,10 @@ def main() -> None:
         mask = table["phase"] == phase
         if mask.any():
           axis.axvspan(x[mask].min(), x[mask].max(), color=color, alpha=0.12, lw=0, label=phase)
+    if then:
+      on = then[name].astype(float) / unit
+      axis.plot(on, smooth(then["return"]), "C0", lw=0.9, label="seed 0 on alone, running mean of 7")
+      x = np.append(x, on)
     if args.published and name != "seconds":
       steps = np.asarray(list(PUBLISHED))
       at = steps * 0.25 if name == "updates" else steps / 2 / unit

@@ -26,8 +26,8 @@ from mjx_cl.config import AdaptConfig, RunConfig, becomes, replace
 from mjx_cl.errors import FileError, UserError
 
 SUITES = pathlib.Path(__file__).parent / "suites" / "bench"
-PUBLISHED = ("config.json", "events.parquet", "runs.parquet", "summary.json", "figure.png", "snapshots.parquet", "stop.parquet")
-MERGED = (*PUBLISHED, "trace.parquet", "residuals.parquet", "signals.parquet")
+PUBLISHED = ("config.json", "events.parquet", "runs.parquet", "summary.json", "figure.png", "snapshots.parquet", "stop.parquet", "signals.parquet")
+MERGED = (*PUBLISHED, "trace.parquet", "residuals.parquet")
 
 # Seconds on 2 quiet cores whose dense float32 products run at RATE (matmul_rate), from wall_s, wall_share and updates in results/quick/*/summary.json
 RATE = 440e9

@@ -91,7 +91,8 @@ class Runner:
     self.others = arm_agents(config, spec)
     self.changes = changes(config)
     self.faults, plan, target = faults.build(self.changes, self.robots[-1], config.onset)
-    detector = detectors.make(config.detector, robot=getattr(type(self.env), "agents_of", None) or config.env, **config.settings)
+    robot = getattr(type(self.env), "agents_of", None) or config.env
+    detector = detectors.make(config.detector, robot=robot, **config.settings)
     monitor = Monitor(agent, n=15, form=config.form, actions=config.actions, spec=spec)
     if self.other is None:
       self.rollout = Rollout(self.env, agent, self.faults, self.repeat, config.deterministic)
@@ -107,7 +108,9 @@ class Runner:
     self.seeds = [config.first_seed + i for i in range(config.seeds)]
     self.labels = [(arm, seed) for arm in config.arms for seed in self.seeds]
     self.groups = len(self.labels)
-    self.crew = Crew(Loop(agent, monitor, detector, spec, config.adapt, self.repeat, capacity=needs(config.steps)), self.groups)
+    same = (agent.config, agent.obs_size, agent.act_size, agent.stepwise, config.form, config.actions, spec, detectors.DETECTORS.get(config.detector),
+            config.detector, robot, json.dumps(config.settings, sort_keys=True, default=repr))
+    self.crew = Crew(Loop(agent, monitor, detector, spec, config.adapt, self.repeat, capacity=needs(config.steps), same=same), self.groups)
     self.breaks = np.asarray([ARMS[arm].breaks for arm, _ in self.labels])
     keys = jnp.stack([jax.random.key(seed) for _, seed in self.labels])[:, None]
     self.keys = jax.vmap(lambda k: jax.random.fold_in(k, 7))(keys[:, 0])

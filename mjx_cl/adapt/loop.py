@@ -4,6 +4,7 @@ Streams are groups of one member: each has its own parameters. A stream that is 
 """
 from __future__ import annotations
 
+from collections.abc import Hashable
 from typing import Any, NamedTuple
 
 import jax
@@ -99,6 +100,9 @@ def choices(labels, config: AdaptConfig, steps: int, onsets=None) -> Choices:
                  flags(lambda a: a.fresh) if any(arm.fresh for arm in arms) else None)
 
 
+_programs: dict[Hashable, Any] = {}  # see Loop's `same`
+
+
 class Loop:
   """Monitor, detector, phase machine and learner of a run.
 
@@ -108,14 +112,17 @@ class Loop:
     spec: of the environment (acceptance, posture).
     repeat: control steps per decision.
     capacity: post-alarm records kept per stream.
+    same: stands for agent, monitor, detector and spec together; Loops of a process that give an equal one share their compiled program. None: its own.
 
   The numbers of `config` are arguments of the program, not constants in it: runs that differ in budget, ratio, average or rule share one compilation.
   """
 
-  def __init__(self, agent: Agent, monitor: Monitor, detector, spec, config: AdaptConfig, repeat: int = 1, capacity: int = 20_480):
+  def __init__(self, agent: Agent, monitor: Monitor, detector, spec, config: AdaptConfig, repeat: int = 1, capacity: int = 20_480,
+               same: Hashable | None = None):
     self.agent, self.monitor, self.detector, self.spec = agent, monitor, detector, spec
     self.config, self.repeat, self.capacity = config, repeat, capacity
-    self._program = jax.jit(self._digest, donate_argnums=0)
+    program = jax.jit(self._digest, donate_argnums=0)
+    self._program = program if same is None else _programs.setdefault((same, repeat), program)
 
   def init(self, train: TrainState, groups: int) -> LoopState:
     """State before the first step; `train` is the shipped agent, the same for every stream."""
