@@ -315,11 +315,11 @@ class Query:
 
 @dataclass(frozen=True)
 class Report:
-  """Writes the README's numbers anew from the files in results/: what lies between `<!-- report:NAME -->` and `<!-- /report -->`, nothing else."""
+  """Writes the numbers of README and docs anew from the files in results/: what lies between `<!-- report:NAME -->` and `<!-- /report -->`, nothing else."""
   results: str = "results"
   """Folder of the results."""
-  readme: str = "README.md"
-  """Text with marked blocks."""
+  page: tuple[str, ...] = ()
+  """Texts with marked blocks; default: README.md and docs/*.md."""
   check: bool = False
   """Write nothing; exit code 1 and the names of the blocks where text and results disagree."""
   json: bool = False
@@ -799,16 +799,23 @@ def do_query(args: Query) -> None:
 
 def do_report(args: Report) -> None:
   from mjx_cl import report
-  blocks = report.report(args.results, args.readme, args.check)
-  names = list(dict.fromkeys(b["name"] for b in blocks if not b["agrees"]))
+  pages = args.page or [str(p) for p in report.pages()] or ["README.md"]
+  found = {page: report.report(args.results, page, check=True) for page in pages}  # whatever is wrong is said before anything is written
+  if not args.check:
+    for page in pages:
+      report.report(args.results, page)
+  stale = {page: list(dict.fromkeys(b["name"] for b in blocks if not b["agrees"])) for page, blocks in found.items()}
+  stale = {page: names for page, names in stale.items() if names}
   if args.json:
-    emit(blocks)
-  elif not blocks:
-    print(f"{args.readme}: no marked block")
-  elif not (names and args.check):
-    print(f"{args.readme}: " + (f"written anew: {', '.join(names)}" if names else f"all {len(blocks)} blocks agree with {args.results}"))
-  if names and args.check:
-    raise FileError(f"{args.readme} disagrees with {args.results} in: {', '.join(names)}; mjx-cl report writes them anew")
+    emit([{"page": page, **block} for page, blocks in found.items() for block in blocks])
+  else:
+    for page, blocks in found.items():
+      if not blocks:
+        print(f"{page}: no marked block")
+      elif not (args.check and page in stale):
+        print(f"{page}: " + (f"written anew: {', '.join(stale[page])}" if page in stale else f"all {len(blocks)} blocks agree with {args.results}"))
+  if stale and args.check:
+    raise FileError("; ".join(f"{page} disagrees with {args.results} in: {', '.join(names)}" for page, names in stale.items()) + "; mjx-cl report writes them anew")
 
 
 def do_list(args: List) -> None:

@@ -1,7 +1,7 @@
-"""README's numbers from the files of results/: what lies between `<!-- report:NAME -->` and `<!-- /report -->` is written by BLOCKS[NAME].
+"""Numbers of README and docs from the files of results/: what lies between `<!-- report:NAME -->` and `<!-- /report -->` is written by BLOCKS[NAME].
 
-Both markers stand alone on their lines. A block is a function of the results folder that returns Markdown; a new one is one function and one line of
-the table. No JAX is needed here.
+Both markers stand alone on their lines. A block is a function of the results folder that returns Markdown, with links as of a page beside that folder;
+a new one is one function and one line of the table. No JAX is needed here.
 """
 from __future__ import annotations
 
@@ -95,6 +95,20 @@ def both(values: dict, name: str, digits: int = 0) -> str:
   return f"{number(values[name], digits)} {span(values[name + '_ci'], digits)}".strip()
 
 
+def few(values: dict, name: str, n: int, digits: int = 0) -> str:
+  """As `both`, of `n` seeds. A bootstrap of up to three values can only give their smallest and largest, which is no 95 % interval: the range is
+  written as such, `0.79 (0.77 to 0.81), 2 seeds`."""
+  low, high = values[name + "_ci"] or (None, None)
+  if n > 3 or low is None:
+    text = both(values, name, digits)
+  else:
+    text = number(values[name], digits) + (f" ({number(low, digits)} to {number(high, digits)})" if n > 1 else "")
+  return f"{text}, {n} seed{'s' * (n != 1)}"
+
+
+FEW = "Of three seeds or fewer the range stands in round brackets: they give no interval."
+
+
 def grid(head, rows) -> str:
   """A Markdown table."""
   line = lambda cells: "|" + "|".join(f" {c} " if c else " " for c in cells) + "|"
@@ -167,15 +181,30 @@ def leaderboard(results: pathlib.Path) -> str:
   """Detectors on the recorded streams: those that beat never alarming, and their own plain form, as a table, the others in a sentence."""
   meta = load(results / "leaderboard.json")
   overall = sorted(table(results / "leaderboard_overall.parquet"), key=lambda r: (-r["cost_standard"], r["detector"]))
-  rows = table(results / "leaderboard.parquet", ["detector", "reference", "robot", "fault", "severity", "arl0_alarms"])
+  rows = table(results / "leaderboard.parquet", ["detector", "reference", "robot", "fault", "severity", "arl0_alarms", "cost_standard", "control_s"])
   robots, faults = sorted({r["robot"] for r in rows}), len({(r["robot"], r["fault"], r["severity"]) for r in rows})
   alarms = statistics.mode(r["arl0_alarms"] for r in rows if not r["reference"])
   (low, high), minutes = meta["seeds"]["score"], meta["wall_s"] / 60
+  asked = {r["robot"]: 3600 / r["control_s"] / meta["arl0_target"] for r in rows}
+  silent = {}  # detectors that no threshold brings to the asked rate: their scores never alarmed on the tuning streams
+  for r in rows:
+    if not r["reference"] and r["arl0_alarms"] == 0:
+      silent.setdefault(r["detector"], set()).add(r["robot"])
+  best = {}
+  for robot in robots:
+    means = {}
+    for r in rows:
+      if r["robot"] == robot and not r["reference"] and r["cost_standard"] is not None:
+        means.setdefault(r["detector"], []).append(r["cost_standard"])
+    best[robot] = max((statistics.fmean(x), name) for name, x in means.items())
   text = fill(f"""
       Every detector sees the same recorded streams of frozen agents: {joined(robots)}, {faults} fault settings (fault x severity),
       {high - low + 1} scoring seeds each; thresholds at ARL0 = {number(meta['arl0_target'])} control steps, calibrated on other seeds' healthy
-      streams ({alarms} alarms for most{', so every rate is an order of magnitude and marked so' if alarms < 50 else ''}). Score: 0 for never
-      alarming, 100 for alarming at the onset and at no other time; intervals over seeds. `mjx-cl leaderboard` ({len(overall)} detectors;
+      streams ({alarms} alarms for most{', so every rate is an order of magnitude and marked so' if alarms < 50 else ''}): asked for are
+      {joined([f"{number(asked[r], 1)} ({r})" for r in robots])} false alarms an hour, what came on the scoring seeds stands in the table. Score: 0 for never
+      alarming, 100 for alarming at the onset and at no other time, a mean over robots; intervals over seeds. Best on each robot:
+      {joined([f"`{name}` {number(x)} ({robot})" for robot, (x, name) in best.items()])}. Mean ranks closer than {number(meta['critical_difference'], 1)} are not
+      told apart (Nemenyi). `mjx-cl leaderboard` ({len(overall)} detectors;
       {number(meta['stream_steps'] / 1e6, 1)} million stream-steps, {number(minutes, 1)} minutes on {meta['machine']['cores']} shared cores; goal 3
       minutes{', missed' if minutes > 3 else ''}). The page: [results/leaderboard.html](results/leaderboard.html), one file, sortable, a page per
       fault.""")
@@ -183,13 +212,16 @@ def leaderboard(results: pathlib.Path) -> str:
   plain = lambda name: name if "(oracle)" in name else re.split("[@ ]", name)[0]  # cusum@opr and cusum white are variants of cusum
   kind = lambda name: "worse" if not score[name] > 0 else "variant" if score[name] < score.get(plain(name), score[name]) else "shown"
   whole = lambda x: f"{percent(x)}%"
-  shown = [(r["detector"], f"{number(r['cost_standard'])} {span((r['cost_standard_low'], r['cost_standard_high']))}", whole(r["detected_within_1s"]),
+  shown = [(r["detector"] + " †" * (r["detector"] in silent), f"{number(r['cost_standard'])} {span((r['cost_standard_low'], r['cost_standard_high']))}", whole(r["detected_within_1s"]),
             whole(r["detected_within_5s"]), whole(r["miss_probability"]), number(r["false_alarms_per_hour"], 1), number(r["mean_rank"], 1))
            for r in overall if kind(r["detector"]) == "shown"]
   rest = ""
   for which, words in (("variant", "Variants that score less than the plain form"), ("worse", "No better than never alarming")):
     names = [f"{name} {number(x)}" for name, x in score.items() if kind(name) == which]
     rest += f" {words}: {', '.join(names)}." if names else ""
+  marked = {name: own for name, own in silent.items() if kind(name) == "shown"}
+  if marked:
+    rest = f" † no threshold gives that rate of false alarms, it stays silent: {'; '.join(f'{name} on {joined(sorted(own))}' for name, own in marked.items())}." + rest
   board = grid(("detector", "score [95 %]", "within 1 s", "within 5 s", "missed", "false alarms/h", "mean rank"), shown)
   return "\n\n".join([text, "![leaderboard](results/leaderboard.png)", board, *([fill(rest)] if rest else [])])
 
@@ -300,31 +332,34 @@ def experiments(results: pathlib.Path) -> str:
       (heads[name] if not k else "", *line, own[name] if not k else "") for name, k, line in rows])
 
 
-def arms(results: pathlib.Path, suite: str = "paper") -> str:
-  """The arms of a suite side by side, of the paper's: recovery, what it is worth, what it cost."""
-  rows, pairs = [], []
-  for part, entry in load(results / suite / "bench.json")["entries"].items():
+def arms(results: pathlib.Path, suite: str = "paper", beside: dict | None = None) -> str:
+  """The arms of a suite side by side, of the paper's: recovery, what it is worth, what it cost. `beside`: entries of another suite that come first."""
+  rows, pairs, entries = [], [], load(results / suite / "bench.json")["entries"]
+  for part, entry in [*(beside or {}).items(), *entries.items()]:
     scores = entry["scores"]
     for k, (arm, own) in enumerate(entry["arms"].items()):
       back, worth = scores["recovery"][arm], (scores["normalised"] or {}).get(arm)
       rows.append((f"`{part}`" if not k else "", arm, f"{back['recovered']} of {back['n']}" if back else "none affected",
                    both(back, "median_steps") if back else "-", both(back, "restricted_mean_steps") if back else "-",
-                   f"{both(worth, 'normalised', 2)}, {worth['seeds']} seeds" if worth and worth["seeds"] else "-",
+                   few(worth, "normalised", worth["seeds"], 2) if worth and worth["seeds"] else "-",
                    number(own["updates_mean"]), number(own["terminations_mean"], 1)))
     pair = scores["against_oracle"]
-    if pair and pair["seeds"]:
+    if part in entries and pair and pair["seeds"]:
       holds = {True: "the interval holds 0", False: "the interval does not hold 0", None: "no interval"}[pair["holds_zero"]]
       pairs.append(f"{part} {both(pair, 'difference', 2)}, {pair['seeds']} seeds, {holds}")
   text = fill(f"""
       Affected streams that recover, Kaplan-Meier's median with Brookmeyer and Crowley's interval, restricted mean up to 10,000 steps or to where the run
       ends; normalised recovery over the last 2,000 steps before the next change (0: arm `none`, 1: the reward before onset), interquartile mean with its bootstrap
-      interval; updates and falls or crashes a stream, means. {f"Method minus oracle trigger, paired over seeds: {'; '.join(pairs)}." if pairs else ""}""")
+      interval; updates and falls or crashes a stream, means. {FEW if any(" to " in cell for row in rows for cell in row) else ""} {f"Method minus oracle trigger, paired over seeds: {'; '.join(pairs)}." if pairs else ""}""")
   return text + "\n\n" + grid(("experiment", "arm", "recovered", "median [steps]", "restricted mean [steps]", "normalised recovery", "updates", "falls"), rows)
 
 
 def other_arms(results: pathlib.Path) -> str:
-  """`arms` of the suite of that name."""
-  return arms(results, "arms")
+  """`arms` of the suite of that name, beside those of the paper's walker where these are of as many seeds."""
+  entries = load(results / "arms" / "bench.json")["entries"]
+  walker = load(results / "paper" / "bench.json")["entries"]["walker"]
+  seeds = {own["seeds"] for entry in (walker, *entries.values()) for own in entry["arms"].values()}
+  return arms(results, "arms", {"paper/walker": walker} if len(seeds) == 1 else None)
 
 
 def stop_rule(results: pathlib.Path) -> str:
@@ -382,11 +417,12 @@ def study(results: pathlib.Path) -> str:
       own, worth = entry["arms"][arm], (entry["scores"]["normalised"] or {}).get(arm)
       rows.append((f"{plan[part]['severity']:g}", f"{plan[part]['adapt']['ratio']:g}", str(own["seeds"]), f"{back['recovered']} of {back['n']}" if back else "none affected",
                    both(back, "restricted_mean_steps") if back else "-",
-                   f"{both(worth, 'normalised', 2)}, {worth['seeds']} seeds" if worth and worth["seeds"] else "-", number(own["updates_mean"])))
+                   few(worth, "normalised", worth["seeds"], 2) if worth and worth["seeds"] else "-", number(own["updates_mean"])))
   done = f"{len(entries)} of {len(plan)} parts are finished." if len(entries) < len(plan) else ""
+  gone = joined([f"`{part}`" for part in plan if part not in entries]) if done else ""
   text = fill(f"""
       Finetuning from the true onset for a fixed time ({', '.join(sorted({plan[p]['env'] + ', ' + plan[p]['fault'] for p in entries}))}): affected streams that recover, restricted
-      mean time to recovery, normalised recovery over the last 2,000 steps (0: no adaptation, 1: the reward before onset), updates a stream. {done}""")
+      mean time to recovery, normalised recovery over the last 2,000 steps (0: no adaptation, 1: the reward before onset), updates a stream. {FEW if any(" to " in cell for row in rows for cell in row) else ""} {done and f"{done} Missing: {gone}."}""")
   return text + "\n\n" + grid(("severity", "train ratio", "seeds", "recovered", "restricted mean [steps]", "normalised recovery", "updates"), rows)
 
 
@@ -437,7 +473,7 @@ BLOCKS = {"run-walker": run_walker, "arl0": arl0, "leaderboard": leaderboard, "p
           "other-arms": other_arms, "stop-rule": stop_rule, "again": again, "study": study, "gradient": gradient, "ppo": ppo}
 
 
-# ---- README ----------------------------------------------------------------------------------------------------------------------
+# ---- pages -----------------------------------------------------------------------------------------------------------------------
 
 class Block(NamedTuple):
   """A marked block: `first` and `last` are the lines of its markers, counted from 0."""
@@ -487,8 +523,15 @@ def render(name: str, results: pathlib.Path) -> str:
     raise FileError(f"block {name!r}: its files in {results} do not hold what it shows ({type(e).__name__}: {e})") from None
 
 
+def pages(root=".") -> list[pathlib.Path]:
+  """README.md and docs/*.md of a folder, as far as they hold marked blocks."""
+  root = pathlib.Path(root)
+  texts = [root / "README.md", *sorted((root / "docs").glob("*.md"))]
+  return [path for path in texts if path.is_file() and "<!-- report:" in path.read_text(errors="replace")]
+
+
 def report(results="results", readme="README.md", check: bool = False) -> list[dict]:
-  """Writes the marked blocks of `readme` anew; nothing else in it changes, and nothing at all where all agree.
+  """Writes the marked blocks of a page anew; nothing else in it changes, and nothing at all where all agree.
 
   Args:
     check: only compare.
@@ -505,9 +548,11 @@ def report(results="results", readme="README.md", check: bool = False) -> list[d
   except UnicodeDecodeError:
     raise FileError(f"{readme} is no UTF-8 text") from None
   lines = re.findall(r"[^\n]*\n|[^\n]+", old)
+  here, root = readme.resolve().parent, results.resolve().parent
+  up = "../" * len(here.relative_to(root).parts) if here.is_relative_to(root) else ""  # links are those of a page beside the results
   out, rows, at, texts = [], [], 0, {}
   for block in find(lines, str(readme)):
-    texts[block.name] = texts.get(block.name) or render(block.name, results)
+    texts[block.name] = texts.get(block.name) or render(block.name, results).replace("](results/", f"]({up}results/")
     end = "\r\n" if lines[block.first].endswith("\r\n") else "\n"
     new = "".join(line + end for line in texts[block.name].split("\n"))
     rows.append({"name": block.name, "line": block.first + 1, "agrees": "".join(lines[block.first + 1:block.last]) == new})

@@ -17,7 +17,8 @@ from mjx_cl.errors import FileError, UserError
 
 ROOT = pathlib.Path(__file__).parent.parent
 RESULTS, README = ROOT / "results", ROOT / "README.md"
-USED = [b.name for b in report.find(README.read_text().splitlines(), "README.md")]
+PAGES = report.pages(ROOT)
+USED = [(page, b.name) for page in PAGES for b in report.find(page.read_text().splitlines(), page.name)]
 SOURCES = {
     "run-walker": ("walker_gear/config.json", "walker_gear/summary.json", "walker_gear/runs.parquet"),
     "arl0": ("arl0.json",),
@@ -114,52 +115,64 @@ def block(name):
 
 # ---- README and results ----------------------------------------------------------------------------------------------------------
 
-def test_readme_agrees_with_results():
-  rows = report.report(RESULTS, README, check=True)
-  assert [r["name"] for r in rows if not r["agrees"]] == [], "run `mjx-cl report`"
-  assert set(USED) >= {"run-walker", "arl0", "leaderboard", "physics", "dreamer", "agents"}
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+def test_pages_agree_with_results(page):
+  rows = report.report(RESULTS, page, check=True)
+  assert rows and [r["name"] for r in rows if not r["agrees"]] == [], "run `mjx-cl report`"
+
+
+def test_every_block_is_shown_once():
+  assert sorted(name for _, name in USED) == sorted(report.BLOCKS)
+  assert {name for page, name in USED if page == README} >= {"run-walker", "paper", "leaderboard"}
+
+
+@pytest.mark.parametrize("page", [*PAGES, *sorted((ROOT / "docs").glob("*.md"))], ids=lambda p: p.name)
+def test_links_of_a_page_lead_somewhere(page):
+  links = re.findall(r"\]\(([^)#\s]+)[^)]*\)", page.read_text())
+  assert [at for at in links if not re.match(r"https?:", at) and not (page.parent / at).exists()] == []
 
 
 def test_every_block_has_its_sources_here():
   assert set(SOURCES) == set(report.BLOCKS)
 
 
-@pytest.mark.parametrize("name", USED)
-def test_one_changed_digit_is_found(name, mjx, tmp_path):
-  lines = README.read_text().splitlines(keepends=True)
-  (at,) = [b for b in report.find(lines, "README.md") if b.name == name]
+@pytest.mark.parametrize("shown, name", USED, ids=lambda x: getattr(x, "stem", x))
+def test_one_changed_digit_is_found(shown, name, mjx, tmp_path):
+  lines = shown.read_text().replace("../results/", "results/").splitlines(keepends=True)  # the copy does not lie beside the results
+  right = "".join(lines)
+  (at,) = [b for b in report.find(lines, shown.name) if b.name == name]
   k = max(k for k in range(at.first + 1, at.last) if re.search(r"\d", lines[k]))
   lines[k] = re.sub(r"\d(?=\D*$)", lambda m: str((int(m[0]) + 1) % 10), lines[k].rstrip("\n")) + "\n"
   wrong = page(tmp_path, "".join(lines))
   before = wrong.read_bytes()
-  code, out, err = mjx("report", "--results", RESULTS, "--readme", wrong, "--check")
+  code, out, err = mjx("report", "--results", RESULTS, "--page", wrong, "--check")
   assert (code, out) == (1, "") and err.count("\n") == 1 and f"disagrees with {RESULTS} in: {name};" in err
-  assert wrong.read_bytes() == before != README.read_bytes()
-  assert mjx("report", "--results", RESULTS, "--readme", wrong)[:2] == (0, f"{wrong}: written anew: {name}\n")
-  assert wrong.read_bytes() == README.read_bytes()
+  assert wrong.read_bytes() == before != right.encode()
+  assert mjx("report", "--results", RESULTS, "--page", wrong)[:2] == (0, f"{wrong}: written anew: {name}\n")
+  assert wrong.read_text() == right
 
 
 @pytest.mark.parametrize("end", ["\n", "\r\n"])
 def test_nothing_outside_the_blocks_changes(end, mjx, results, tmp_path):
   before, after = "\ufeffa  \n\n\x0b ü 1.25\u2028x\n", "b\n  <b>-->\n" + block("physics") + "last line without an end"
   path = page(tmp_path, before + block("arl0") + after, end)
-  assert mjx("report", "--results", results, "--readme", path)[0] == 0
+  assert mjx("report", "--results", results, "--page", path)[0] == 0
   once = path.read_bytes()
   text = once.decode().replace(end, "\n")
   assert text.startswith(before + "<!-- report:arl0 -->\nDetector and stop rule") and once.count(b"\n") == once.count(end.encode()) > 10
   assert text.endswith("last line without an end") and report.render("arl0", results) in text and report.render("physics", results) in text
   stamp = path.stat().st_mtime_ns, path.stat().st_ino
-  assert mjx("report", "--results", results, "--readme", path)[1] == f"{path}: all 2 blocks agree with {results}\n"
+  assert mjx("report", "--results", results, "--page", path)[1] == f"{path}: all 2 blocks agree with {results}\n"
   assert path.read_bytes() == once and (path.stat().st_mtime_ns, path.stat().st_ino) == stamp  # not even written
 
 
 def test_json_says_which_agree(mjx, results, tmp_path):
   path = page(tmp_path, "x\n" + block("arl0") + block("physics") + block("arl0"))
-  code, out, err = mjx("report", "--results", results, "--readme", path, "--json")
+  code, out, err = mjx("report", "--results", results, "--page", path, "--json")
   assert code == 0 and err == "" and json.loads(out) == [
-      {"name": "arl0", "line": 2, "agrees": False}, {"name": "physics", "line": 4, "agrees": False}, {"name": "arl0", "line": 6, "agrees": False}]
+      {"page": str(path), "name": name, "line": line, "agrees": False} for name, line in (("arl0", 2), ("physics", 4), ("arl0", 6))]
   path.write_text(path.read_text().replace("Speed", "Haste"))
-  code, out, err = mjx("report", "--results", results, "--readme", path, "--json", "--check")
+  code, out, err = mjx("report", "--results", results, "--page", path, "--json", "--check")
   assert code == 1 and [r["agrees"] for r in json.loads(out)] == [True, False, True] and "in: physics;" in err
 
 
@@ -185,19 +198,19 @@ def test_no_jax_is_imported():
 ])
 def test_bad_markers(text, says, mjx, results, tmp_path):
   path = page(tmp_path, text)
-  code, out, err = mjx("report", "--results", results, "--readme", path)
+  code, out, err = mjx("report", "--results", results, "--page", path)
   assert (code, out) == (1, "") and err.count("\n") == 1 and says in err and path.read_text() == text
 
 
 def test_files_that_are_not_there(mjx, results, tmp_path):
   path = page(tmp_path, "\n")
-  assert mjx("report", "--results", tmp_path / "none", "--readme", path) == (2, "", f"mjx-cl: no folder {tmp_path / 'none'}\n")
-  assert mjx("report", "--results", results, "--readme", tmp_path / "none.md") == (2, "", f"mjx-cl: no file {tmp_path / 'none.md'}\n")
-  code, out, err = mjx("report", "--results", results, "--readme", tmp_path)
+  assert mjx("report", "--results", tmp_path / "none", "--page", path) == (2, "", f"mjx-cl: no folder {tmp_path / 'none'}\n")
+  assert mjx("report", "--results", results, "--page", tmp_path / "none.md") == (2, "", f"mjx-cl: no file {tmp_path / 'none.md'}\n")
+  code, out, err = mjx("report", "--results", results, "--page", tmp_path)
   assert code == 1 and err.count("\n") == 1 and "irectory" in err
-  assert mjx("report", "--results", results, "--readme", path) == (0, f"{path}: no marked block\n", "")
+  assert mjx("report", "--results", results, "--page", path) == (0, f"{path}: no marked block\n", "")
   path.write_bytes(b"\xff\xfe\x00")
-  assert mjx("report", "--results", results, "--readme", path) == (1, "", f"mjx-cl: {path} is no UTF-8 text\n")
+  assert mjx("report", "--results", results, "--page", path) == (1, "", f"mjx-cl: {path} is no UTF-8 text\n")
 
 
 @pytest.mark.parametrize("name, file", ALL)
@@ -334,8 +347,19 @@ def test_the_board_is_sorted_and_whole(results):
   shown = [re.match(r"\| (.+?) \| (-?\d+) \[", line).groups() for line in text.split("\n") if re.match(r"\| .+ \| -?\d+ \[", line)]
   assert [int(x) for _, x in shown] == sorted((int(x) for _, x in shown), reverse=True) and len(shown) > 10
   rest = text[text.rindex("\n\n"):].replace("\n", " ")
-  assert {r["detector"] for r in overall} == {d for d, _ in shown} | {r["detector"] for r in overall if f" {r['detector']} " in rest}
+  assert {r["detector"] for r in overall} == {d.removesuffix(" †") for d, _ in shown} | {r["detector"] for r in overall if f" {r['detector']} " in rest}
   assert "-0 " not in text and "-0]" not in text and "-0.0" not in text
+  rows = parquet.read_table(results / "leaderboard.parquet").to_pylist()
+  mute = {r["detector"] for r in rows if r["arl0_alarms"] == 0 and not r["reference"]}
+  assert {d.removesuffix(" †") for d, _ in shown if d.endswith("†")} == mute & {d.removesuffix(" †") for d, _ in shown} and mute
+  best = max({r["detector"] for r in rows if not r["reference"]}, key=lambda d: np.mean([r["cost_standard"] for r in rows if (r["detector"], r["robot"]) == (d, "car")]))
+  assert f"`{best}`" in text.split("Best on each robot:")[1].split("(car)")[0]
+
+
+@pytest.mark.parametrize("n, ci, want", [(5, [0.77, 0.81], "0.79 [0.77, 0.81], 5 seeds"), (3, [0.77, 0.81], "0.79 (0.77 to 0.81), 3 seeds"),
+                                         (1, [0.79, 0.79], "0.79, 1 seed"), (1, None, "0.79, 1 seed")])
+def test_three_seeds_give_no_interval(n, ci, want):
+  assert report.few({"x": 0.79, "x_ci": ci}, "x", n, 2) == want
 
 
 def test_an_experiment_that_was_not_run_is_named(results):
