@@ -99,10 +99,10 @@ def few(values: dict, name: str, n: int, digits: int = 0) -> str:
   """As `both`, of `n` seeds. A bootstrap of up to three values can only give their smallest and largest, which is no 95 % interval: the range is
   written as such, `0.79 (0.77 to 0.81), 2 seeds`."""
   low, high = values[name + "_ci"] or (None, None)
-  if n > 3 or low is None:
+  if n > 3:
     text = both(values, name, digits)
   else:
-    text = number(values[name], digits) + (f" ({number(low, digits)} to {number(high, digits)})" if n > 1 else "")
+    text = number(values[name], digits) + (f" ({number(low, digits)} to {number(high, digits)})" if n > 1 and low is not None else "")
   return f"{text}, {n} seed{'s' * (n != 1)}"
 
 
