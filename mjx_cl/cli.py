@@ -181,6 +181,8 @@ class Leaderboard:
   """Settings of --add, name=value ..."""
   channel: str = "opr"
   """What --add watches: opr, rpr, reward, surprise or group_0 .. group_7."""
+  log: bool = False
+  """Give --add the logarithm, as the built-in detectors of one number have it."""
   threshold: str | None = None
   """Setting of --add that is calibrated, larger = fewer alarms; default: it runs as it is, and its own rate of false alarms is printed."""
   submit: str | None = None
@@ -659,7 +661,7 @@ def do_record(args: Record) -> None:
 def do_leaderboard(args: Leaderboard) -> None:
   import math
   from mjx_cl import leaderboard, store, streams, submissions
-  for flag, given, other in (("--set", args.set, args.add), ("--threshold", args.threshold, args.add), ("--name", args.name, args.add or args.submit)):
+  for flag, given, other in (("--set", args.set, args.add), ("--threshold", args.threshold, args.add), ("--log", args.log, args.add), ("--name", args.name, args.add or args.submit)):
     if given and not other:
       raise UserError(f"{flag} belongs to a detector of one's own; give --add" + (" or --submit" if flag == "--name" else ""))
   if args.name and args.add and args.submit:
@@ -677,7 +679,7 @@ def do_leaderboard(args: Leaderboard) -> None:
   entries = [leaderboard.entry(n, s) for n, s in known.items() if not args.detector or n in args.detector]
   if args.add:
     from mjx_cl.detectors import host
-    build = lambda value: host.load(args.add, settings(args.set) | ({args.threshold: value} if args.threshold else {}), args.name, args.channel)
+    build = lambda value: host.load(args.add, settings(args.set) | ({args.threshold: value} if args.threshold else {}), args.name, args.channel, args.log)
     one = build(1.0)
     extra.append((one.host_name, submissions.from_host(build if args.threshold else one, args.threshold)))
   if args.submit:

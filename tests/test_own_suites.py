@@ -349,6 +349,7 @@ def test_one_robot_of_several(tmp_path):
 def test_settings_without_a_detector_are_refused(refused, small, tmp_path):  # noqa: F811
   folder = small[2]
   assert "--threshold belongs to a detector of one's own; give --add" in refused(2, "leaderboard", folder, "--threshold", "x")
+  assert "--log belongs to a detector of one's own; give --add" in refused(2, "leaderboard", folder, "--log")
   assert "--set belongs to" in refused(2, "leaderboard", folder, "--set", "a=1")
   assert "give --add or --submit" in refused(2, "leaderboard", folder, "--name", "x")
   assert "--name names one detector" in refused(2, "leaderboard", folder, "--name", "x", "--add", "a:B", "--submit", "c.parquet")

@@ -4,6 +4,7 @@ import re
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
 README = (pathlib.Path(__file__).parent.parent / "README.md").read_text()
@@ -26,3 +27,17 @@ def test_the_learner_learns_the_environment_of_the_example(tmp_path):
   (block,) = [b for b in BLOCKS if "Trainer" in b]
   out = run(block + "\nprint(float(action[0]))\n", tmp_path).split("\n")
   assert float(re.search(r"return ([-0-9.]+) of 20", out[0])[1]) > 14 and float(out[1]) > 0
+
+
+def test_the_detector_of_the_example(tmp_path):
+  """The class as `--add` takes it: it knows the level after 500 samples, sees what rises above, and its setting works as `--threshold` needs."""
+  from mjx_cl.detectors import host
+  (block,) = [b for b in BLOCKS if "# mine.py" in b]
+  (tmp_path / "mine.py").write_text(block)
+  x = np.random.default_rng(0).uniform(0.5, 1.5, 2000)
+  x[1500] = 10.0
+  alarms = {}
+  for level in (1.2, 2.0, 20.0):
+    detector = host.load(f"{tmp_path / 'mine.py'}:Mine", {"level": level}).factory()
+    alarms[level] = [t for t, sample in enumerate(x) if detector.update(sample)]
+  assert alarms[2.0] == [1500] and alarms[20.0] == [] and len(alarms[1.2]) > 100 and min(alarms[1.2]) >= 500
