@@ -92,7 +92,7 @@ def main() -> None:
     axis.set_xlabel(label)
     axis.grid(alpha=0.3)
   axes[0].set_ylabel("return of the training's own episodes")
-  axes[0].legend(loc="best", fontsize=7)
+  axes[1].legend(loc="lower right", fontsize=7)
   fig.savefig(out / "curve.png", dpi=110)
   fig.clear()
 
