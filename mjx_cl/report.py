@@ -273,8 +273,8 @@ GOALS = {"velocity_error_m_s": 0.25, "fall_rate": 0.05}  # of the shipped quadru
 
 def agents(results: pathlib.Path) -> str:
   """The shipped agents: what training cost, and what evaluation gave."""
-  def trained(name):
-    last = table(results / f"{name}_agent" / "curve.parquet", ["updates", "records", "seconds"])[-1]
+  def trained(name, curve="curve"):
+    last = table(results / name / f"{curve}.parquet", ["updates", "records", "seconds"])[-1]
     return f"{number(round(last['updates'], -2))} updates, {number(last['records'] / 1e6, 1)} M records, {number(last['seconds'] / 60)} minutes"
 
   def driving(e):
@@ -288,10 +288,12 @@ def agents(results: pathlib.Path) -> str:
             f"{late['velocity_error_m_s']}); {percent(e['fall_rate'])} % {percents(e['fall_rate_ci'])} fall (goal {percent(GOALS['fall_rate'])}"
             f"{late['fall_rate']})")
 
-  tasks = (("`walker`", "walker_agent/eval.json", trained("walker"), lambda e: f"{e['terminations']} terminations"),
-           ("`car`", "car_agent/eval.json", trained("car"), driving),
+  falls = lambda e: f"{e['terminations']} terminations"
+  tasks = (("`walker`", "walker_agent/eval.json", trained("walker_agent"), falls),
+           ("`walker-plain`, without a demonstrator", "walker_learning/eval.json", trained("walker_learning", "then"), falls),
+           ("`car`", "car_agent/eval.json", trained("car_agent"), driving),
            ("the same in `car_real`, unchanged", "car_agent/eval_car_real.json", "", driving),
-           ("`quadruped`", "quadruped_agent/eval.json", trained("quadruped"), walking))
+           ("`quadruped`", "quadruped_agent/eval.json", trained("quadruped_agent"), walking))
   rows = []
   for name, file, training, own in tasks:
     e = load(results / file)
