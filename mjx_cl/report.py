@@ -428,6 +428,22 @@ def study(results: pathlib.Path) -> str:
   return text + "\n\n" + grid(("severity", "train ratio", "seeds", "recovered", "restricted mean [steps]", "normalised recovery", "updates"), rows)
 
 
+def two_agents(results: pathlib.Path) -> str:
+  """The same run with two agents that were trained apart: what carries over."""
+  rows = []
+  for agent, folder in (("`walker`", "walker_gear"), ("`walker-plain`", "walker_plain")):
+    own = load(results / folder / "summary.json")["arms"]
+    r, still = own["detector"], own["none"]
+    rows.append((agent, f"{r['false_alarm_streams']} of {r['seeds']}", f"{r['affected_alarmed_within_500']} of {r['affected']}", both(r, "latency_median_steps"),
+                 f"{r['recovered_within_10000']} of {r['affected']} ({r['recovered']} in the end)", both(r, "reward_pre", 2), both(still, "reward_final_affected", 2),
+                 both(r, "reward_final_affected", 2), f"{r['converged']} of {r['seeds']}", number(r["updates_mean"])))
+  text = fill("""
+      `mjx-cl run walker` with each of two agents, arm `detector`: streams with a false alarm before the onset, affected streams that alarm within 500 steps, median latency of all streams (misses count as
+      infinite), affected streams recovered within 10,000 steps, reward per step before the onset, and of the affected over the last 2,000 steps without adaptation and with it (interquartile means), streams
+      that converged, updates a stream; 95 % bootstrap intervals over streams.""")
+  return text + "\n\n" + grid(("agent", "false alarms", "alarm", "latency [steps]", "recovered", "reward before", "at the end, `none`", "at the end, `detector`", "converged", "updates"), rows)
+
+
 def gradient(results: pathlib.Path) -> str:
   """What the imagined policy gradient promises, and what the robot earns along it."""
   agents_ = load(results / "policy_gradient.json")["agents"]
@@ -472,7 +488,7 @@ def ppo(results: pathlib.Path) -> str:
 
 BLOCKS = {"run-walker": run_walker, "arl0": arl0, "leaderboard": leaderboard, "physics": physics, "dreamer": dreamer, "agents": agents,
           "detectors": detectors, "paper": experiments, "arms": arms,
-          "other-arms": other_arms, "stop-rule": stop_rule, "again": again, "study": study, "gradient": gradient, "ppo": ppo}
+          "other-arms": other_arms, "stop-rule": stop_rule, "again": again, "study": study, "two-agents": two_agents, "gradient": gradient, "ppo": ppo}
 
 
 # ---- pages -----------------------------------------------------------------------------------------------------------------------

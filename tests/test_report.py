@@ -35,6 +35,7 @@ SOURCES = {
     "stop-rule": ("stop/bench.json",),
     "again": ("again/bench.json",),
     "study": ("study/bench.json", "study/suite.json"),
+    "two-agents": ("walker_gear/summary.json", "walker_plain/summary.json"),
     "gradient": ("policy_gradient.json",),
     "ppo": ("ppo_finetune.json", "paper/bench.json"),
 }
@@ -291,6 +292,7 @@ CONSTANTS = {  # what a block says of itself: windows of the definitions, sizes 
     "stop-rule": {"95"},
     "again": {"95", "2,000"},
     "study": {"1", "2,000"},
+    "two-agents": {"95", "500", "10,000", "2,000"},
     "gradient": {"95"},
     "ppo": {"95", "3"},
 }
