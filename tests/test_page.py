@@ -430,9 +430,13 @@ def test_curves_and_intervals_are_drawn_and_toggle(browser, file, board):
   assert float(band.get_attribute("x")) == pytest.approx(best_rank * per_rank + at_zero, abs=0.1)
   row = browser.one(f"#intervals svg:first-child g.series[data-name='{best}'] rect.hit")
   browser.js("arguments[0].scrollIntoView({block: 'center'})", row)
-  ActionChains(browser.driver).move_to_element(row).perform()
-  tip = browser.one("#tip")
-  WebDriverWait(browser.driver, 20).until(lambda _: tip.is_displayed())  # the browser hears of the pointer in its own time
+  tip, title = browser.one("#tip"), browser.one("#intervals")
+
+  def hovers(_):
+    """The pointer comes to the row anew: a late scroll of the page hides the tip, and a pointer that rests where it was is no event."""
+    ActionChains(browser.driver).move_to_element_with_offset(title, 0, 0).move_to_element(row).perform()
+    return tip.is_displayed()
+  WebDriverWait(browser.driver, 30).until(hovers)
   assert best in tip.text and "95 % interval" in tip.text
 
 
