@@ -481,3 +481,19 @@ def test_signals_of_a_chunk(story):
     np.testing.assert_allclose(t.digest.signals[:, 2], reward, rtol=1e-5, atol=1e-6)  # float32 mean of 16
     np.testing.assert_allclose(t.digest.signals[:, 0], np.nanmean(t.digest.residual.opr, 0), rtol=1e-5)
     assert np.isfinite(t.digest.signals).all()
+
+
+def test_numbers_of_the_config_are_arguments():
+  """All but what shapes arrays or chooses a computation: another budget is the same program, another patience is not."""
+  config = AdaptConfig(budget=777, acceptance=0.5, lr=None)
+  leaves, kind = jax.tree.flatten(config)
+  assert jax.tree.unflatten(kind, leaves) == config and 777 in leaves and 0.5 in leaves
+  traces = []
+
+  @jax.jit
+  def double(config):
+    traces.append(0)
+    return 2 * config.budget + config.trend * config.patience
+  assert float(double(config)) == pytest.approx(2 * 777 + 0.2 * 48)
+  assert float(double(dataclasses.replace(config, budget=5, ratio=4.0, trend=0.5))) == pytest.approx(2 * 5 + 0.5 * 48) and len(traces) == 1
+  assert float(double(dataclasses.replace(config, patience=8))) == pytest.approx(2 * 777 + 0.2 * 8) and len(traces) == 2

@@ -217,6 +217,24 @@ def test_parts_run_once_go_on_and_merge(mjx, refused, mini, tmp_path, monkeypatc
   assert content(out) == before
 
 
+def test_runs_of_one_kind_share_their_program(mini, tmp_path):  # noqa: F811
+  """Severity, seeds, length and the numbers of AdaptConfig are not in it; detector, form and learning rate are."""
+  (part, _, _) = bench.suite(str(mini)).parts
+  program = lambda **change: run.Runner(dataclasses.replace(part.config, **change), tmp_path).crew.loop._program
+  first = program()
+  adapt = dataclasses.replace(part.config.adapt, budget=300, ratio=4.0, near=2.0)
+  assert program(severity=1.0, seeds=3, steps=640, adapt=adapt) is first
+  for other in ({"settings": {"window": 41, "warmup": 20}}, {"form": "streaming"}, {"adapt": dataclasses.replace(part.config.adapt, lr=1e-3)}):
+    assert program(**other) is not first
+
+
+@pytest.mark.parametrize("steps, capacity", [(192, 1024), (640, 1024), (14_000, 14_336), (25_000, 28_672), (64_000, 65_536)])
+def test_replays_of_about_one_length_have_one_shape(steps, capacity):
+  """Room for every record, a quarter more at most."""
+  assert run.capacity(steps, 1000) == capacity >= steps + steps // 1000 + 2 * run.CHUNK or steps < 1024
+  assert capacity <= max(1024, 1.25 * (steps + steps // 1000 + 3 * run.CHUNK))
+
+
 @pytest.mark.parametrize("spoil", [
     lambda d: d._replace(skipped=np.asarray(d.skipped) + [0, 1]), lambda d: d._replace(signals=np.asarray(d.signals) * [[1.0], [np.nan]])], ids=["skipped", "nan"])
 def test_a_loss_that_is_not_finite_ends_a_run_in_one_line(mini, tmp_path, spoil):  # noqa: F811
