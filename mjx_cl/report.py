@@ -420,11 +420,23 @@ def study(results: pathlib.Path) -> str:
       rows.append((f"{plan[part]['severity']:g}", f"{plan[part]['adapt']['ratio']:g}", str(own["seeds"]), f"{back['recovered']} of {back['n']}" if back else "none affected",
                    both(back, "restricted_mean_steps") if back else "-",
                    few(worth, "normalised", worth["seeds"], 2) if worth and worth["seeds"] else "-", number(own["updates_mean"])))
+  from mjx_cl.scoring import normalised
+  lived = table(results / "study" / "bench.parquet")
+  pairs, severities = [], sorted({plan[p]["severity"] for p in entries})
+  for severity in severities:
+    ratios = sorted({plan[p]["adapt"]["ratio"] for p in entries if plan[p]["severity"] == severity})
+    scored = [r | {"arm": ratio} for p in entries for ratio in ratios if (plan[p]["severity"], plan[p]["adapt"]["ratio"]) == (severity, ratio)
+              for r in normalised.rows([r for r in lived if r["part"] == p]) if r["arm"] != "none"]
+    for low, high in zip(ratios, ratios[1:]):
+      pair = normalised.difference(scored, high, low)
+      if pair["seeds"] > 3:
+        holds = "the interval holds 0" if pair["holds_zero"] else "the interval does not hold 0"
+        pairs.append(f"{high:g} minus {low:g} at {severity:g}: {both(pair, 'difference', 2)}, {pair['seeds']} seeds, {holds}")
   done = f"{len(entries)} of {len(plan)} parts are finished." if len(entries) < len(plan) else ""
   gone = joined([f"`{part}`" for part in plan if part not in entries]) if done else ""
   text = fill(f"""
       Finetuning from the true onset for a fixed time ({', '.join(sorted({plan[p]['env'] + ', ' + plan[p]['fault'] for p in entries}))}): affected streams that recover, restricted
-      mean time to recovery, normalised recovery over the last 2,000 steps (0: no adaptation, 1: the reward before onset), updates a stream. {FEW if any(" to " in cell for row in rows for cell in row) else ""} {done and f"{done} Missing: {gone}."}""")
+      mean time to recovery, normalised recovery over the last 2,000 steps (0: no adaptation, 1: the reward before onset), updates a stream. {FEW if any(" to " in cell for row in rows for cell in row) else ""} {f"Paired over seeds, ratio {'; '.join(pairs)}." if pairs else ""} {done and f"{done} Missing: {gone}."}""")
   return text + "\n\n" + grid(("severity", "train ratio", "seeds", "recovered", "restricted mean [steps]", "normalised recovery", "updates"), rows)
 
 

@@ -34,7 +34,7 @@ SOURCES = {
     "other-arms": ("arms/bench.json",),
     "stop-rule": ("stop/bench.json",),
     "again": ("again/bench.json",),
-    "study": ("study/bench.json", "study/suite.json"),
+    "study": ("study/bench.json", "study/suite.json", "study/bench.parquet"),
     "two-agents": ("walker_gear/summary.json", "walker_plain/summary.json"),
     "gradient": ("policy_gradient.json",),
     "ppo": ("ppo_finetune.json", "paper/bench.json"),
@@ -94,10 +94,13 @@ def results(tmp_path):
   arms = {arm: entry["arms"][arm] | both("recovery_median_steps", 3333.0) for arm in entry["arms"]}
   entries = {"paper": entry, "arms": entry, "again": entry | {"arms": arms, "later_changes": [arms, arms]},
              "stop": {"stop_rule": {"share": 0.95, "horizon_steps": 10_000, "arms": {"oracle": judged}}, "scores": {"ablation": left_out}}}
-  entries["study"] = entry
   (out / "study").mkdir()
-  (out / "study/suite.json").write_text(json.dumps({"suite": "study", "parts": {"walker": {"env": "walker", "fault": "gear", "severity": 0.25,
-                                                                                            "adapt": {"ratio": 16.0}}}}))
+  part = {"env": "walker", "fault": "gear", "severity": 0.25}
+  (out / "study/suite.json").write_text(json.dumps({"suite": "study", "parts": {"walker": part | {"adapt": {"ratio": 16.0}}, "less": part | {"adapt": {"ratio": 4.0}}}}))
+  lived = [r | {"part": name, "reward_final": r["reward_final"] * (factor if r["arm"] == "detector" else 1)}
+           for name, factor in (("walker", 1.0), ("less", 0.8)) for r in runs]
+  write(out / "study/bench.parquet", lived)
+  (out / "study/bench.json").write_text(json.dumps({"suite": "study", "parts": 2, "finished": 2, "entries": {"walker": entry, "less": entry}}))
   for suite, value in entries.items():
     (out / suite).mkdir(exist_ok=True)
     (out / suite / "bench.json").write_text(json.dumps({"suite": suite, "parts": 1, "finished": 1, "entries": {"walker": value}}))
