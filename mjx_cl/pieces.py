@@ -16,6 +16,7 @@ from mjx_cl.errors import FileError, UserError
 
 ORDER = {"trace": "step", "events": "step", "runs": "change", "signals": "step", "snapshots": "step", "stop": "since"}  # table -> what follows the stream
 KEPT = ("git_commit", "machine", "python", "versions")
+SAME = ("physics", "agent_card", "repeat", "control_s")  # of config.json, beside the settings: one agent and one backend lived all the seeds
 
 
 def seeds_of(folder, config: RunConfig) -> list[int] | None:
@@ -37,15 +38,17 @@ def choose(folders, config: RunConfig) -> list[pathlib.Path]:
   """Of `folders` those whose seeds make up the seeds of `config`, in the order of their seeds; empty where none of them holds any.
 
   Raises:
-    UserError where two hold the same seed, or one is in none of them: the line names it.
+    UserError where one holds seeds that are not asked for, two hold the same seed, or one is in none of them: the line names it.
   """
   wanted = range(config.first_seed, config.first_seed + config.seeds)
   found: dict[int, pathlib.Path] = {}
   begins = {}
   for folder in map(pathlib.Path, folders):
     own = seeds_of(folder, config)
-    if not own or not set(own) <= set(wanted):
+    if own is None:
       continue
+    if not set(own) <= set(wanted):
+      raise UserError(f"{folder} holds seeds {own[0]} to {own[-1]}, asked for are {wanted[0]} to {wanted[-1]}; give --first-seed and --seeds that hold them")
     for seed in own:
       if seed in found:
         raise UserError(f"seed {seed} lies both in {found[seed]} and in {folder}; give one of them")
@@ -64,7 +67,7 @@ def join(folders, out, config: RunConfig) -> dict:
   Args:
     folders: of finished runs, see `choose`. config: with the seeds of all of them.
   Raises:
-    FileError for a piece that cannot be read.
+    UserError where pieces differ in their agent or physics; FileError for a piece that cannot be read.
   """
   import numpy as np
   from mjx_cl import envs, plots, run
@@ -77,6 +80,9 @@ def join(folders, out, config: RunConfig) -> dict:
       configs.append(json.loads((folder / "config.json").read_text()))
     except (OSError, ValueError) as e:
       raise FileError(f"{folder} is no finished run: {e}") from None
+  differ = [k for k in SAME if any(own.get(k) != configs[0].get(k) for own in configs)]
+  if differ:
+    raise UserError(f"{', '.join(map(str, folders))} are no pieces of one run: they differ in {', '.join(differ)}")
   arms = list(config.arms)
   number = {(arm, config.first_seed + i): a * config.seeds + i for a, arm in enumerate(arms) for i in range(config.seeds)}
   out.mkdir(parents=True, exist_ok=True)

@@ -100,6 +100,14 @@ def test_pieces_that_do_not_fit_are_one_line(tmp_path):
   with pytest.raises(UserError, match="no seed 3, 4; run what is missing with --first-seed 3"):
     pieces.choose([a, c], config)
   assert pieces.choose([tmp_path / "nothing"], config) == []
+  with pytest.raises(UserError, match="c holds seeds 5 to 9, asked for are 0 to 6; give --first-seed"):
+    pieces.choose([a, c], part_of("paper", "walker", 7).config)
+  strange = json.loads((b / "config.json").read_text())
+  for key in ("physics", "agent_card"):
+    store.write_json(b / "config.json", strange | {key: "another"})
+    with pytest.raises(UserError, match=f"no pieces of one run: they differ in {key}$"):
+      pieces.join([a, b], tmp_path / "all", config)
+  store.write_json(b / "config.json", strange)
   other = json.loads((c / "config.json").read_text())
   store.write_json(c / "config.json", other | {"steps": 24_000})
   with pytest.raises(UserError, match="steps"):

@@ -112,7 +112,7 @@ class Loop:
     spec: of the environment (acceptance, posture).
     repeat: control steps per decision.
     capacity: post-alarm records kept per stream.
-    same: stands for agent, monitor, detector and spec together; Loops of a process that give an equal one share their compiled program. None: its own.
+    same: stands for agent, monitor, detector and spec together; Loops of a process that give an equal one share their compiled program. None, or what has no hash: its own.
 
   The numbers of `config` are arguments of the program, not constants in it: runs that differ in budget, ratio, average or rule share one compilation.
   """
@@ -122,7 +122,10 @@ class Loop:
     self.agent, self.monitor, self.detector, self.spec = agent, monitor, detector, spec
     self.config, self.repeat, self.capacity = config, repeat, capacity
     program = jax.jit(self._digest, donate_argnums=0)
-    self._program = program if same is None else _programs.setdefault((same, repeat), program)
+    try:
+      self._program = program if same is None else _programs.setdefault((same, repeat), program)
+    except TypeError:  # a spec of another package that holds a list
+      self._program = program
 
   def init(self, train: TrainState, groups: int) -> LoopState:
     """State before the first step; `train` is the shipped agent, the same for every stream."""
