@@ -226,6 +226,11 @@ def test_runs_of_one_kind_share_their_program(mini, tmp_path):  # noqa: F811
   assert program(severity=1.0, seeds=3, steps=640, adapt=adapt) is first
   for other in ({"settings": {"window": 41, "warmup": 20}}, {"form": "streaming"}, {"adapt": dataclasses.replace(part.config.adapt, lr=1e-3)}):
     assert program(**other) is not first
+  unhashable = run.Runner(part.config, tmp_path).crew.loop
+  own = type(unhashable)(unhashable.agent, unhashable.monitor, unhashable.detector, unhashable.spec, unhashable.config, same=(["a list"],))
+  assert own._program is not first  # what has no hash shares nothing
+  from mjx_cl.adapt import loop
+  assert len(loop._programs) <= loop.PROGRAMS
 
 
 @pytest.mark.parametrize("steps, capacity", [(192, 1024), (640, 1024), (14_000, 14_336), (25_000, 28_672), (64_000, 65_536)])

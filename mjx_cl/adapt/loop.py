@@ -100,7 +100,8 @@ def choices(labels, config: AdaptConfig, steps: int, onsets=None) -> Choices:
                  flags(lambda a: a.fresh) if any(arm.fresh for arm in arms) else None)
 
 
-_programs: dict[Hashable, Any] = {}  # see Loop's `same`
+_programs: dict[Hashable, Any] = {}  # see Loop's `same`; the newest last
+PROGRAMS = 8                         # as many are kept: a compiled program takes memory
 
 
 class Loop:
@@ -121,11 +122,19 @@ class Loop:
                same: Hashable | None = None):
     self.agent, self.monitor, self.detector, self.spec = agent, monitor, detector, spec
     self.config, self.repeat, self.capacity = config, repeat, capacity
-    program = jax.jit(self._digest, donate_argnums=0)
+    self._program = jax.jit(self._digest, donate_argnums=0)
+    if same is not None:
+      self._share((same, repeat))
+
+  def _share(self, key) -> None:
+    """Takes over the program of an equal Loop of this process, if it is still kept."""
     try:
-      self._program = program if same is None else _programs.setdefault((same, repeat), program)
+      self._program = _programs.pop(key, self._program)
     except TypeError:  # a spec of another package that holds a list
-      self._program = program
+      return
+    _programs[key] = self._program
+    while len(_programs) > PROGRAMS:
+      del _programs[next(iter(_programs))]
 
   def init(self, train: TrainState, groups: int) -> LoopState:
     """State before the first step; `train` is the shipped agent, the same for every stream."""
