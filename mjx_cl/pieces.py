@@ -18,12 +18,14 @@ ORDER = {"trace": "step", "events": "step", "runs": "change", "signals": "step",
 KEPT = ("git_commit", "machine", "python", "versions")
 SAME = ("physics", "agent_card", "repeat", "control_s")  # of config.json, beside the settings: one agent and one backend lived all the seeds
 
+SUMMED = ("env", "fault", "severity", "onset", "steps", "detector", "invalid_share", "wall_s", "wall_s_arms", "wall_share")  # what `join` takes from summary.json
+
 
 def seeds_of(folder, config: RunConfig) -> list[int] | None:
   """Seeds of the finished run in `folder` if it is `config` but for its seeds; None where there is no finished run.
 
   Raises:
-    UserError where it was run with other settings.
+    UserError where it was run with other settings; FileError for a config.json that is not a run's.
   """
   from mjx_cl.run import check_same, identity
   folder = pathlib.Path(folder)
@@ -31,7 +33,10 @@ def seeds_of(folder, config: RunConfig) -> list[int] | None:
     return None
   check_same(folder, {k: v for k, v in identity(config).items() if k not in ("physics", "seeds", "first_seed")})
   own = json.loads((folder / "config.json").read_text())
-  return list(range(own["first_seed"], own["first_seed"] + own["seeds"]))
+  try:
+    return list(range(own["first_seed"], own["first_seed"] + own["seeds"]))
+  except (KeyError, TypeError):
+    raise FileError(f"{folder / 'config.json'} is not a run's: it does not say its seeds") from None
 
 
 def choose(folders, config: RunConfig) -> list[pathlib.Path]:
@@ -80,6 +85,9 @@ def join(folders, out, config: RunConfig) -> dict:
       configs.append(json.loads((folder / "config.json").read_text()))
     except (OSError, ValueError) as e:
       raise FileError(f"{folder} is no finished run: {e}") from None
+    lacks = [k for k in SUMMED if k not in summaries[-1]]
+    if lacks:
+      raise FileError(f"{folder / 'summary.json'} is not a run's: it lacks {', '.join(lacks)}")
   differ = [k for k in SAME if any(own.get(k) != configs[0].get(k) for own in configs)]
   if differ:
     raise UserError(f"{', '.join(map(str, folders))} are no pieces of one run: they differ in {', '.join(differ)}")
@@ -103,7 +111,7 @@ def join(folders, out, config: RunConfig) -> dict:
   mean = lambda values, weights: float(np.average(values, weights=weights))
   invalid = [(s["invalid_share"], c["seeds"]) for s, c in zip(summaries, configs) if s["invalid_share"] is not None]
   spec = envs.make(config.env).spec
-  value = {k: summaries[0][k] for k in ("env", "fault", "severity", "onset", "steps", "detector")}
+  value = {k: summaries[0][k] for k in SUMMED[:6]}
   value |= run.by_arm(runs, config, spec.control_s)
   value |= {"invalid_share": mean(*zip(*invalid)) if invalid else None, "wall_s": float(sum(wall)),
             "wall_s_arms": {arm: float(sum(s["wall_s_arms"][arm] for s in summaries)) for arm in summaries[0]["wall_s_arms"]},

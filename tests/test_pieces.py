@@ -107,7 +107,15 @@ def test_pieces_that_do_not_fit_are_one_line(tmp_path):
     store.write_json(b / "config.json", strange | {key: "another"})
     with pytest.raises(UserError, match=f"no pieces of one run: they differ in {key}$"):
       pieces.join([a, b], tmp_path / "all", config)
+  store.write_json(b / "config.json", {k: v for k, v in strange.items() if k != "first_seed"})
+  with pytest.raises(FileError, match="config.json is not a run's: it does not say its seeds"):
+    pieces.choose([a, b], config)
   store.write_json(b / "config.json", strange)
+  whole = json.loads((b / "summary.json").read_text())
+  store.write_json(b / "summary.json", {k: v for k, v in whole.items() if k != "wall_s"})
+  with pytest.raises(FileError, match="summary.json is not a run's: it lacks wall_s$"):
+    pieces.join([a, b], tmp_path / "all", config)
+  store.write_json(b / "summary.json", whole)
   other = json.loads((c / "config.json").read_text())
   store.write_json(c / "config.json", other | {"steps": 24_000})
   with pytest.raises(UserError, match="steps"):
