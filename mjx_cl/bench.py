@@ -292,6 +292,7 @@ def publish(out: pathlib.Path, parts, to) -> list[str]:
 
 
 HORIZON = 10_000  # control steps after the onset, of the restricted mean time to recovery
+PATIENCES = (48, 24, 12)  # chunks over which signals must be settled, of the stop rule without its floor
 
 
 def scores(folder) -> dict:
@@ -303,6 +304,7 @@ def scores(folder) -> dict:
     recovery: arm -> Kaplan-Meier of the affected streams: n, recovered, median_steps, restricted_mean_steps up to HORIZON or to where the run ends, each with
       _ci; null without affected streams.
     ablation: the stop rule with each signal left out (scoring.stop.ablated); only where an arm that never stops has adapted.
+    without_floor: patience [chunks], as text -> the same without the floor of `least` control steps, so that the signals alone decide.
   """
   from mjx_cl.scoring import normalised, recovery, stop, survival
   config, rows = json.loads((folder / "config.json").read_text()), store.read_rows(folder / "runs.parquet")
@@ -314,6 +316,7 @@ def scores(folder) -> dict:
   if (folder / "signals.parquet").exists():
     try:
       out["ablation"] = stop.ablated(stop.ablation(folder))
+      out["without_floor"] = {str(n): stop.ablated(stop.ablation(folder, least=1, patience=n)) for n in PATIENCES}
     except UserError as e:
       if isinstance(e, FileError):
         raise  # else no stream has adapted

@@ -366,7 +366,8 @@ def other_arms(results: pathlib.Path) -> str:
 
 def stop_rule(results: pathlib.Path) -> str:
   """When the stop rule ended finetuning, against the oracle stop; and when it would have with a signal left out."""
-  rows, without, first = [], [], None
+  rows, without, floorless, first = [], [], [], None
+  share = lambda own: "-" if own["lost_share"] is None else f"{percent(own['lost_share'], 1)} {percents(own['lost_share_ci'], 1)} %"
   for part, entry in load(results / "stop" / "bench.json")["entries"].items():
     first = first or entry["stop_rule"]
     for arm, own in entry["stop_rule"]["arms"].items():
@@ -376,8 +377,12 @@ def stop_rule(results: pathlib.Path) -> str:
                    str(own["ended_unrecoverable"])))
     for name, own in entry["scores"]["ablation"].items():
       without.append((f"`{part}`" if not name else "", f"`{name}`" if name else "none", f"{own['converged']} of {own['adaptations']}", str(own["aborted"]),
-                      both(own, "own_stop_steps_median"), f"{own['early']} of {own['judged']}",
-                      "-" if own["lost_share"] is None else f"{percent(own['lost_share'], 1)} {percents(own['lost_share_ci'], 1)} %"))
+                      both(own, "own_stop_steps_median"), f"{own['early']} of {own['judged']}", share(own)))
+    for patience, names in entry["scores"]["without_floor"].items():
+      for name, own in names.items():
+        floorless.append((f"`{part}`" if not name else "", f"{number(64 * int(patience))}" if not name else "", f"`{name}`" if name else "none",
+                          f"{own['converged']} of {own['adaptations']}", str(own["aborted"]), both(own, "own_stop_steps_median"),
+                          f"{own['early']} of {own['judged']}", share(own)))
   text = fill(f"""
       The oracle stop is the earliest snapshot whose frozen episodes on the broken robot reach {percent(first['share'])} % of the best snapshot's. Medians and
       interquartile means with 95 % bootstrap intervals over streams; an adaptation that never ended counts as later than all others. Return lost is the best
@@ -387,7 +392,11 @@ def stop_rule(results: pathlib.Path) -> str:
       when.""")
   return "\n\n".join([text, grid(("fault", "arm", "ended", "steps after the oracle stop", "earlier than it", "return lost", "share of the best", "updates wasted (mean)",
                                    "aborts right / wrong", "ended on a lost fault"), rows), more,
-                      grid(("fault", "left out", "converged", "aborted", "median stop [steps]", "earlier than the oracle", "share of the best lost"), without)])
+                      grid(("fault", "left out", "converged", "aborted", "median stop [steps]", "earlier than the oracle", "share of the best lost"), without),
+                      fill("""
+      The same without the floor (`--adapt.least 1`), so that nothing but the signals decides, over shorter and shorter lengths in which they must be settled."""),
+                      grid(("fault", "settled over [steps]", "left out", "converged", "aborted", "median stop [steps]", "earlier than the oracle",
+                            "share of the best lost"), floorless)])
 
 
 def again(results: pathlib.Path) -> str:

@@ -106,12 +106,18 @@ def _suite(data: dict) -> Suite:
 
 
 def suite(name: str) -> Suite:
-  """A suite by name (`mjx-cl list suites`) or from a TOML file.
+  """A suite by name (`mjx-cl list suites`) or from a TOML file. `base` in a file names a suite that ships: what the file leaves out is as there.
 
   Raises:
     UserError for an unknown name or a value out of range; FileError for a file that is no TOML.
   """
   path, data = store.read_suite(name, SUITES)
+  if "base" in data:
+    base = data.pop("base")
+    names = sorted(p.stem for p in SUITES.glob("*.toml"))
+    if base not in names:
+      raise UserError(f"suite {path.name}: unknown base {base!r}; choose from: {', '.join(names)}")
+    data = store.read_suite(base, SUITES)[1] | data
   fields = {f.name for f in dataclasses.fields(Suite)}
   if set(data) != fields:
     wrong = [f"unknown {k!r}" for k in sorted(set(data) - fields)] + [f"missing {k!r}" for k in sorted(fields - set(data))]

@@ -1,4 +1,6 @@
 """Shared by all tests: XLA flags and compile cache before the first use of JAX, and the few programs that are costly to compile."""
+import ctypes
+import gc
 import os
 import pathlib
 import tempfile
@@ -16,6 +18,30 @@ import numpy as np  # noqa: E402
 import pytest  # noqa: E402
 
 ROBOTS = 256  # batch of the one MJX program that the suite compiles
+LIMIT = 2.0   # GiB
+
+
+def resident_gib() -> float:
+  """Memory that this process holds; 0 where /proc is missing."""
+  try:
+    return int(pathlib.Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**30
+  except OSError:
+    return 0.0
+
+
+@pytest.fixture(scope="module", autouse=True)
+def forget():
+  """A module's compiled programs go with it once the process holds more than LIMIT GiB; session fixtures take theirs from the compile cache again."""
+  yield
+  if resident_gib() > LIMIT:
+    jax.clear_caches()
+    from mjx_cl.adapt import loop
+    loop._programs.clear()
+    gc.collect()
+    try:
+      ctypes.CDLL("libc.so.6").malloc_trim(0)  # glibc keeps what was freed
+    except (OSError, AttributeError):
+      pass
 
 
 @pytest.fixture(scope="session")

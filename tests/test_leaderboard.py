@@ -123,9 +123,9 @@ def test_other_pasts_are_refused(tmp_path, monkeypatch):
 
 
 def test_suites_that_ship_are_sound():
-  for name in ("leaderboard",):
+  for name, alarms in (("leaderboard", 20), ("leaderboard-100k", 30)):
     s = streams.suite(name)
-    assert s.nominal["tune"] * 10 * (s.nominal["steps"] - s.count_from) / s.arl0 >= 20
+    assert s.name == name and s.nominal["tune"] * 10 * (s.nominal["steps"] - s.count_from) / s.arl0 >= alarms
     from mjx_cl import envs, faults
     for robot, tables in s.robots.items():
       env = envs.make(robot)
@@ -153,6 +153,13 @@ def test_suite_files(tmp_path):
   (tmp_path / "a.toml").write_text("name = 'a'\nfoo = 1")
   with pytest.raises(UserError, match="unknown 'foo'.*missing 'arl0'"):
     streams.suite(str(tmp_path / "a.toml"))
+  (tmp_path / "a.toml").write_text("base = 'leaderboard'\nname = 'a'\narl0 = 5\nlatents = {nominal = 1, after_s = 2.0}")
+  own, base = streams.suite(str(tmp_path / "a.toml")), streams.suite("leaderboard")
+  assert own == dataclasses.replace(base, name="a", arl0=5, latents={"nominal": 1, "after_s": 2.0}) and own.latents != base.latents
+  for wrong in ("'nope'", "3", "'../leaderboard'"):
+    (tmp_path / "a.toml").write_text(f"base = {wrong}")
+    with pytest.raises(UserError, match="unknown base .*choose from: .*leaderboard"):
+      streams.suite(str(tmp_path / "a.toml"))
 
 
 def test_foreign_folders(tmp_path, small):

@@ -93,7 +93,7 @@ def results(tmp_path):
                      **both("lost_share", 0.056)} for n, name in enumerate(("", "reward"), 6)}
   arms = {arm: entry["arms"][arm] | both("recovery_median_steps", 3333.0) for arm in entry["arms"]}
   entries = {"paper": entry, "arms": entry, "again": entry | {"arms": arms, "later_changes": [arms, arms]},
-             "stop": {"stop_rule": {"share": 0.95, "horizon_steps": 10_000, "arms": {"oracle": judged}}, "scores": {"ablation": left_out}}}
+             "stop": {"stop_rule": {"share": 0.95, "horizon_steps": 10_000, "arms": {"oracle": judged}}, "scores": {"ablation": left_out, "without_floor": {"12": left_out}}}}
   (out / "study").mkdir()
   part = {"env": "walker", "fault": "gear", "severity": 0.25}
   (out / "study/suite.json").write_text(json.dumps({"suite": "study", "parts": {"walker": part | {"adapt": {"ratio": 16.0}}, "less": part | {"adapt": {"ratio": 4.0}}}}))

@@ -343,6 +343,11 @@ def test_leaving_out_the_signal_that_holds_up_the_stop(tmp_path):
   late = rows[0, ""]["stop"]
   assert 40 * 64 < late < 45 * 64 and rows[0, "value_loss"]["stop"] == 10 * 64 - 1 and rows[0, "value_loss"]["own_stop_steps"] == 10 * 64 - 330
   assert {r["stop"] for (seed, left), r in rows.items() if seed == 0 and left != "value_loss"} == {late}
+  other = {(r["seed"], r["left_out"]): r["stop"] for r in stop.ablation(tmp_path, patience=8, least=20 * 64)}
+  assert other[0, "value_loss"] == 26 * 64 - 1  # the first chunk whose end lies `least` after the start in step 330
+  assert other[0, ""] > late
+  with pytest.raises(UserError, match="no budget; choose from: patience, trend"):
+    stop.ablation(tmp_path, budget=5)
   assert all(r["outcome"] == "converged" for (seed, _), r in rows.items() if seed == 0)
   assert all(r["outcome"] == "aborted" for (seed, _), r in rows.items() if seed == 1)  # acceptance is still asked for
   reasons = {left: r["reason"] for (seed, left), r in rows.items() if seed == 1}

@@ -16,6 +16,7 @@ from mjx_cl.scoring import bootstrap, normalised
 
 SHARE = 0.95      # of the best snapshot's reward, from which a stop is good enough
 HORIZON = 10_000  # control steps that the robot lives on with the weights of its stop
+RULE = ("patience", "trend", "fluctuation", "excess", "near", "least", "give_up")  # settings of AdaptConfig that ablation may change
 COLUMNS = ("stream", "arm", "seed", "since", "stop", "outcome", "reason", "oracle_stop_steps", "own_stop_steps", "steps_after_oracle",
            "early", "reward_best", "reward_oracle", "reward_stop", "return_lost", "return_lost_early", "lost_share", "updates_wasted", "aborted",
            "unrecoverable")
@@ -158,23 +159,29 @@ def of_folder(folder) -> list[dict]:
 
 # ---- the rule with a signal left out -------------------------------------------------------------------------------------------------
 
-def ablation(folder) -> list[dict]:
+def ablation(folder, **rule) -> list[dict]:
   """When the stop rule would have ended the first adaptation of each stream that never stops, had it not asked a signal to settle.
 
   The phase machine of a run (adapt.phase) lives once more over the recorded chunk signals. A reward that is left out need not settle, but must
   still be accepted. Until the stop this is the life of arm `oracle` in the same seed, as far as both were rounded alike (run.Runner).
 
+  Args:
+    rule: settings of AdaptConfig that the rule reads, in place of the run's: ablation(folder, least=1, patience=12) asks what it would have done
+      without its floor of control steps. What the robot learnt meanwhile does not depend on them.
   Returns:
     rows {stream, arm, seed, left_out ("" or a signal), outcome, reason, stop (last control step, None: adapting to the end), own_stop_steps}, and
     where the run has snapshots what `rows` says of such a stop: oracle_stop_steps, steps_after_oracle, early, reward_stop, return_lost, lost_share.
   Raises:
-    FileError where the folder holds no signals.parquet; UserError where no stream that never stops has adapted.
+    FileError where the folder holds no signals.parquet; UserError where no stream that never stops has adapted, or for a setting that is not
+    the rule's.
   """
+  if not set(rule) <= set(RULE):
+    raise UserError(f"the stop rule has no {', '.join(sorted(set(rule) - set(RULE)))}; choose from: {', '.join(RULE)}")
   from mjx_cl.adapt.convergence import SIGNALS
   from mjx_cl.adapt.phase import REASONS, START, STOP
   from mjx_cl.config import AdaptConfig
   try:
-    config = AdaptConfig(**json.loads((pathlib.Path(folder) / "config.json").read_text())["adapt"])
+    config = AdaptConfig(**json.loads((pathlib.Path(folder) / "config.json").read_text())["adapt"] | rule)
   except (OSError, ValueError, KeyError, TypeError) as e:
     raise FileError(f"{folder} holds no run: {e}") from None
   chunks, curves = _read(folder, "signals"), {}
