@@ -50,7 +50,8 @@ def calibrated_rule(**settings) -> Detector:
 CALIBRATED = {
     "walker": {"window": 4000, "smooth": 400, "lag": 500, "threshold": 6.5, "patience": 1, "two_sided": False, "log": True},
     "quadruped": {"window": 4000, "smooth": 300, "lag": 500, "threshold": 4.5, "threshold_rpr": 8.5, "patience": 1, "two_sided": False, "log": False},
-    "car": {"window": 4000, "smooth": 300, "lag": 500, "threshold": 8.0, "threshold_rpr": 5.5, "patience": 1, "two_sided": False, "log": False},
+    # also where a car that has adapted must not take its own crashes for an event
+    "car": {"window": 4000, "smooth": 1, "lag": 0, "threshold": 4.0, "threshold_rpr": 4.0, "patience": 20, "two_sided": False, "log": False},
 }
 
 DETECTORS = {"rolling_sigma": calibrated_rule, "rolling_sigma_plain": paper_rule}
