@@ -367,7 +367,16 @@ def other_arms(results: pathlib.Path) -> str:
 def stop_rule(results: pathlib.Path) -> str:
   """When the stop rule ended finetuning, against the oracle stop; and when it would have with a signal left out."""
   rows, without, floorless, first = [], [], [], None
-  share = lambda own: "-" if own["lost_share"] is None else f"{percent(own['lost_share'], 1)} {percents(own['lost_share_ci'], 1)} %"
+  stopped = lambda own: (f"{own['converged']} of {own['adaptations']}", str(own["aborted"]), both(own, "own_stop_steps_median"), f"{own['early']} of {own['judged']}",
+                         "-" if own["lost_share"] is None else f"{percent(own['lost_share'], 1)} {percents(own['lost_share_ci'], 1)} %")
+
+  def alike(left_out):
+    """Signals left out with the same outcome share a row."""
+    rows: dict[tuple, tuple[list, dict]] = {}
+    for name, own in left_out.items():
+      rows.setdefault(stopped(own), ([], own))[0].append(f"`{name}`" if name else "none")
+    return [(joined(names).replace(" and ", " or "), own) for names, own in rows.values()]
+
   for part, entry in load(results / "stop" / "bench.json")["entries"].items():
     first = first or entry["stop_rule"]
     for arm, own in entry["stop_rule"]["arms"].items():
@@ -375,14 +384,11 @@ def stop_rule(results: pathlib.Path) -> str:
                    both(own, "return_lost"), f"{percent(own['lost_share'], 1)} {percents(own['lost_share_ci'], 1)} %",
                    both(own, "updates_wasted_mean"), f"{own['aborted_unrecoverable']} / {own['aborted_recoverable']}",
                    str(own["ended_unrecoverable"])))
-    for name, own in entry["scores"]["ablation"].items():
-      without.append((f"`{part}`" if not name else "", f"`{name}`" if name else "none", f"{own['converged']} of {own['adaptations']}", str(own["aborted"]),
-                      both(own, "own_stop_steps_median"), f"{own['early']} of {own['judged']}", share(own)))
-    for patience, names in entry["scores"]["without_floor"].items():
-      for name, own in names.items():
-        floorless.append((f"`{part}`" if not name else "", f"{number(64 * int(patience))}" if not name else "", f"`{name}`" if name else "none",
-                          f"{own['converged']} of {own['adaptations']}", str(own["aborted"]), both(own, "own_stop_steps_median"),
-                          f"{own['early']} of {own['judged']}", share(own)))
+    for k, (names, own) in enumerate(alike(entry["scores"]["ablation"])):
+      without.append((f"`{part}`" if not k else "", names, *stopped(own)))
+    for patience, left_out in entry["scores"]["without_floor"].items():
+      for k, (names, own) in enumerate(alike(left_out)):
+        floorless.append((f"`{part}`" if not k else "", number(64 * int(patience)) if not k else "", names, *stopped(own)))
   text = fill(f"""
       The oracle stop is the earliest snapshot whose frozen episodes on the broken robot reach {percent(first['share'])} % of the best snapshot's. Medians and
       interquartile means with 95 % bootstrap intervals over streams; an adaptation that never ended counts as later than all others. Return lost is the best

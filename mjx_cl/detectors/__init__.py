@@ -40,8 +40,8 @@ def calibrated_rule(**settings) -> Detector:
   """The paper's rule calibrated to ARL0 = 100,000 steps on nominal robots, seeds 100 to 109: trailing mean of the logarithms, a lagged
   reference, one side, a threshold for each residual. Figures of the walker; `make` takes those of the robot where it is told which.
 
-  How the figures were found: benchmarks/calibrate.py; its table: results/arl0.json. Runs of single samples in a row do not do: a gait makes
-  residuals swing, and at this ARL0 they find almost nothing within 500 steps.
+  How the figures were found: benchmarks/calibrate.py; its table: results/arl0.json. Runs of single samples in a row do for the car, not for what
+  walks: a gait makes residuals swing, and at this ARL0 they find almost nothing within 500 steps.
   """
   return paper_rule(**(CALIBRATED["walker"] | settings))
 
