@@ -14,7 +14,7 @@ from flax import serialization
 
 from test_agent import shake
 
-from mjx_cl import agents, demonstrator, envs
+from mjx_cl import agents, demonstrator, detectors, envs, store
 from mjx_cl.errors import UserError
 
 FOLDER = pathlib.Path(__file__).parent.parent / "benchmarks"
@@ -138,3 +138,44 @@ def test_policy_gradient_moves_the_policy_by_what_it_says(tiny, tmp_path):
   np.testing.assert_allclose([r["moved"] for r in moved], [0.02, 0.02, 0.06, 0.06], rtol=0.2)  # nearly linear in the step
   assert len({r["reward"] for r in value["rows"]}) == 5 and all(r["promise"] for r in moved)
   assert json.loads(json.dumps(value)) == value
+
+
+# ---- calibrate.py ----------------------------------------------------------------------------------------------------------------
+
+@pytest.mark.parametrize("settings", [dict(window=400, threshold=3.0, patience=10), dict(window=400, smooth=100, lag=50, threshold=6.0), dict(window=300, threshold=3.0, two_sided=True)],
+                         ids=["in a row", "smoothed", "as written"])
+def test_calibration_runs_the_detector_that_it_calibrates(settings):
+  """The NumPy scores and alarms of the calibration are those of `rolling_sigma` on the same stream, with a shift, a spike and gaps in it."""
+  calibrate = load("calibrate")
+  settings = {"patience": 1, "two_sided": False, "smooth": 1, "lag": 0} | settings
+  rng = np.random.default_rng(5)
+  x = rng.lognormal(0, 0.3, 3000).astype(np.float32)
+  x[1500:1600] *= 6
+  x[2300] = 40.0
+  x[rng.integers(0, 3000, 60)] = np.nan
+  z = calibrate.scores(x[:, None].astype(np.float64), settings["window"], settings["smooth"], settings["lag"], 200)
+  fired = calibrate.alarms(z, settings["threshold"], settings["patience"], settings["two_sided"])[:, 0]
+  detector = detectors.rolling_sigma(warmup=200, **settings)
+  good = np.flatnonzero(np.isfinite(x))
+  _, out = jax.lax.scan(detector.update, detector.init(), jnp.asarray(x[good]))
+  z = np.abs(z[good, 0]) if settings["two_sided"] else z[good, 0]
+  # float32 sums of some hundred terms: 1e-5 of each, a few times that of the deviation
+  np.testing.assert_allclose(np.asarray(out.score), z, rtol=1e-3, atol=1e-3)
+  assert np.array_equal(good[np.asarray(out.fired)], np.flatnonzero(fired)) and 1 <= fired.sum() < 100
+
+
+def test_settled_stretches_of_a_run(tmp_path):
+  """From the rows of refitting before a stream's first stop to its next onset; a stream that never stopped has none, and scoring seeds are refused."""
+  calibrate = load("calibrate")
+  config = {"first_seed": 100, "seeds": 3, "steps": 900, "adapt": {"refit": 50}}
+  store.write_json(tmp_path / "config.json", config)
+  rows = [(0, 9, "onset"), (0, 20, "start"), (0, 199, "stop"), (0, 500, "onset"), (0, 700, "stop"), (1, 20, "start"), (2, 20, "start"), (2, 29, "stop")]
+  store.write_table(tmp_path / "events.parquet", {"stream": [r[0] for r in rows], "step": [r[1] for r in rows], "kind": [r[2] for r in rows]})
+  step = np.tile(np.arange(900), 3)
+  store.write_table(tmp_path / "trace.parquet", {"stream": np.repeat([0, 1, 2], 900), "step": step, "opr": np.repeat([0, 1, 2], 900) * 1000.0 + step, "rpr": -1.0 * step})
+  first, last = calibrate.settled(tmp_path)
+  assert first["skip"] == 50 and np.array_equal(first["opr"], np.arange(150, 500)) and np.array_equal(first["rpr"], -np.arange(150, 500))
+  assert last["skip"] == 30 and np.array_equal(last["opr"], 2000 + np.arange(900))
+  store.write_json(tmp_path / "config.json", config | {"first_seed": 0})
+  with pytest.raises(SystemExit, match="those that tune"):
+    calibrate.settled(tmp_path)
