@@ -53,7 +53,7 @@ class Suite(NamedTuple):
 
 
 class Estimate(NamedTuple):
-  """What a part will take. Attributes: streams. stream_steps. updates: of all streams. seconds. bytes: of weights and replays."""
+  """What a part will take. Attributes: streams. stream_steps. updates: of all streams. seconds. bytes: that its process grows to."""
   streams: int
   stream_steps: int
   updates: float
@@ -187,7 +187,7 @@ def estimate(part: Part, rate: float) -> Estimate:
   physics = max(PHYSICS_S.get(name, 0.1e-3) for name in filter(None, (c.env, becomes(c))))
   seconds = streams * c.steps * ((WATCH_S + ACT_S) * size + physics) + updates * batch * trained.length * UPDATE_S * share * size
   need = memory.need(trained.size, len(spec.obs), len(spec.act), run.capacity(c.steps, spec.episode_steps), trained.bins)
-  return Estimate(streams, streams * c.steps, updates, COMPILE_S + seconds * RATE / rate, need.total(streams))
+  return Estimate(streams, streams * c.steps, updates, COMPILE_S + seconds * RATE / rate, memory.resident(need.total(streams)))
 
 
 def estimates(parts) -> dict[str, Estimate]:

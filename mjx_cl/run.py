@@ -24,7 +24,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_cl import agents, checkpoint, detectors, envs, faults, memory, replay, store
+from mjx_cl import agents, checkpoint, detectors, envs, faults, memory, replay, runtime, store
 from mjx_cl.adapt import phase as phase_lib
 from mjx_cl.adapt.arms import ARMS, FOREVER, NEVER, never_stops
 from mjx_cl.adapt.convergence import SIGNALS
@@ -260,6 +260,7 @@ class Runner:
     meta = {"seconds": self.seconds, "quiet": self.quiet, "stream_seconds": self.stream_seconds.tolist(), "updates": self._updates.tolist(),
             "alarms": self._alarms.tolist(), "phase": self._phase.tolist()}
     self.checkpoints.save(number, State(self.state.streams, self.crew.join(self.state.loop)), meta)
+    runtime.give_back()
     for old in sorted(self.work.glob("trace-*.npz"))[:-2]:
       old.unlink()
 

@@ -59,6 +59,17 @@ def keep_memory() -> bool:
   return bool(mallopt(mmap_max, 0) and mallopt(trim_threshold, -1))
 
 
+def give_back() -> bool:
+  """Hands free memory back to the system where glibc keeps it (`keep_memory`); True where that was done. For after what needed much and comes seldom: a save."""
+  if sys.platform != "linux":
+    return False
+  import ctypes
+  try:
+    return bool(ctypes.CDLL(None).malloc_trim(0))
+  except (AttributeError, OSError):  # no glibc
+    return False
+
+
 def setup() -> None:
   """Sets XLA flags, the compile cache, the allocator and synchronous CPU dispatch. Call before the first JAX computation.
 

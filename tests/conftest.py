@@ -1,5 +1,4 @@
 """Shared by all tests: XLA flags and compile cache before the first use of JAX, and the few programs that are costly to compile."""
-import ctypes
 import gc
 import os
 import pathlib
@@ -38,10 +37,7 @@ def forget():
     from mjx_cl.adapt import loop
     loop._programs.clear()
     gc.collect()
-    try:
-      ctypes.CDLL("libc.so.6").malloc_trim(0)  # glibc keeps what was freed
-    except (OSError, AttributeError):
-      pass
+    runtime.give_back()
 
 
 @pytest.fixture(scope="session")

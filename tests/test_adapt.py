@@ -10,7 +10,7 @@ import pytest
 
 from mjx_cl.adapt import phase as phase_lib
 from mjx_cl.adapt.convergence import SIGNALS, settled
-from mjx_cl.adapt.crew import Crew
+from mjx_cl.adapt.crew import Crew, cut
 from mjx_cl.adapt.loop import Loop, choices
 from mjx_cl.adapt.phase import ABORT_BELOW, ABORT_BUDGET, ABORT_HOPELESS, ABORTED, ADAPTING, CONVERGED, NOMINAL, START, STOP
 from mjx_cl.config import PRESETS, AdaptConfig
@@ -329,10 +329,11 @@ def tell(kind, config=EAGER, used=0, block=None):
   copy = lambda tree: jax.tree.map(lambda x: np.array(x), tree)
   begin, told = copy(state), []
   crew = Crew(loop, 3, block or 3, threads=2)
-  states = crew.split(state)
+  states = crew.split(state._replace(replay=[cut(state.replay, own, 0) for own in crew.blocks]))
+  whole = lambda joined: joined._replace(replay=jax.tree.map(lambda *x: np.concatenate(x), *joined.replay))
   for c in range(CHUNKS):
     states, digest = crew.digest(states, hand_rows(c * STEPS), jnp.int32((c + 1) * STEPS), chosen, keys)
-    told.append(Told(copy(crew.join(states)), digest))
+    told.append(Told(whole(copy(crew.join(states))), digest))
   joined = copy(crew.join(states))
   jax.tree.map(np.testing.assert_array_equal, copy(crew.acting(states)), joined.acting)
   jax.tree.map(np.testing.assert_array_equal, copy(crew.join(crew.split(joined))), joined)  # what a checkpoint holds, and back

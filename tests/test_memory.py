@@ -12,6 +12,11 @@ from mjx_cl.errors import UserError
 OBS, ACT = 24, 6
 
 
+@pytest.fixture(autouse=True)
+def small(monkeypatch):
+  monkeypatch.setattr(memory, "held", lambda: 0)
+
+
 def bytes_of(tree):
   return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(tree))
 
@@ -29,9 +34,9 @@ def test_need_is_what_is_allocated():
 
 
 def test_the_number_that_is_named_fits_and_the_next_does_not(monkeypatch):
-  monkeypatch.setattr(memory, "free", lambda: 200 * 2**20)
+  monkeypatch.setattr(memory, "free", lambda: int((memory.PROCESS + 200 * 2**20) / memory.MARGIN))
   ask = lambda capacity: memory.check("size1m", OBS, ACT, 8 * capacity, 3, ("capacity", lambda n: 8 * n))
-  with pytest.raises(UserError, match="3 seeds of size1m with 8,000,000 records each need 27.0 GiB a device, 0.2 GiB may be used") as e:
+  with pytest.raises(UserError, match="3 seeds of size1m with 8,000,000 records each need 35.5 GiB a device, 1.9 GiB may be used") as e:
     ask(1_000_000)
   fits = int(re.search(r"capacity=([\d,]+) would fit", str(e.value))[1].replace(",", ""))
   ask(fits)
@@ -46,9 +51,22 @@ def test_weights_that_do_not_fit_are_said_so(monkeypatch):
     memory.check("size12m", OBS, ACT, 10, 1, ("capacity", lambda n: n))
 
 
+def test_an_accelerator_holds_weights_and_replays_alone(monkeypatch):
+  assert memory.resident(2**30) == memory.PROCESS + int(memory.GROWTH * 2**30)
+  monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+  assert memory.resident(2**30) == 2**30
+  monkeypatch.setattr(memory, "free", lambda: 200 * 2**20)
+  with pytest.raises(UserError) as e:
+    memory.check("size1m", OBS, ACT, 10**7, 3, ("capacity", lambda n: n))
+  fits = int(re.search(r"capacity=([\d,]+) would fit", str(e.value))[1].replace(",", ""))
+  memory.check("size1m", OBS, ACT, fits, 3, ("capacity", lambda n: n))
+  with pytest.raises(UserError):
+    memory.check("size1m", OBS, ACT, fits + 1, 3, ("capacity", lambda n: n))
+
+
 def test_devices_share_the_seeds(monkeypatch):
   need = memory.need("size1m", OBS, ACT, 1000)
-  monkeypatch.setattr(memory, "free", lambda: int(need.total(2) / memory.MARGIN) + 1)
+  monkeypatch.setattr(memory, "free", lambda: int(memory.resident(need.total(2)) / memory.MARGIN) + 2)
   memory.check("size1m", OBS, ACT, 1000, 4, ("capacity", lambda n: n), shards=2)
   with pytest.raises(UserError):
     memory.check("size1m", OBS, ACT, 1000, 4, ("capacity", lambda n: n))
@@ -56,12 +74,24 @@ def test_devices_share_the_seeds(monkeypatch):
 
 def test_trainer_and_runner_refuse_before_they_allocate(monkeypatch, short_walker, tmp_path):
   from mjx_cl import run, train
-  monkeypatch.setattr(memory, "free", lambda: 10 * 2**20)
+  monkeypatch.setattr(memory, "free", lambda: int((memory.PROCESS + 10 * 2**20) / memory.MARGIN))
   with pytest.raises(UserError, match="capacity=[0-9,]+ would fit"):
     train.Trainer(short_walker, PRESETS["tiny"].dreamer, TrainConfig(capacity=10**7), tmp_path)
   with pytest.raises(UserError, match="a smaller size would|would fit"):
     run.Runner(RunConfig(env="walker"), tmp_path)
   assert not list(tmp_path.iterdir())
+
+
+def test_what_is_held_already_need_not_be_free(monkeypatch):
+  need = memory.resident(memory.need("size1m", OBS, ACT, 1000).total(1))
+  ask = lambda: memory.check("size1m", OBS, ACT, 1000, 1, ("capacity", lambda n: n))
+  monkeypatch.setattr(memory, "free", lambda: int(0.5 * need / memory.MARGIN))
+  with pytest.raises(UserError):
+    ask()
+  monkeypatch.setattr(memory, "held", lambda: need // 2 + 2)
+  ask()
+  monkeypatch.undo()
+  assert 50 * 2**20 < memory.held() < 2**40
 
 
 def test_table_has_every_size():

@@ -79,20 +79,26 @@ class Crew:
 
   def shapes(self, states: list[LoopState]) -> LoopState:
     """What `join` gives, without its numbers and without their memory."""
-    wide = lambda x, axis: np.broadcast_to(np.zeros((), x.dtype), x.shape[:axis] + (self.groups,) + x.shape[axis + 1:])
+    empty = lambda x, shape: np.broadcast_to(np.zeros((), x.dtype), shape)
+    wide = lambda x, axis: empty(x, x.shape[:axis] + (self.groups,) + x.shape[axis + 1:])
     field = lambda name: jax.tree.map(lambda x: wide(x, int(name in LATER)), getattr(states[0], name))
-    return LoopState(*(field(name) for name in LoopState._fields))
+    replays = [jax.tree.map(lambda x: empty(x, x.shape), state.replay) for state in states]
+    return LoopState(**{name: field(name) for name in LoopState._fields if name != "replay"}, replay=replays)
 
   def join(self, states: list[LoopState]) -> LoopState:
-    """One LoopState of all streams, NumPy: what a checkpoint holds."""
-    return states[0] if len(states) == 1 else glue(states, LATER)
+    """What a checkpoint holds: the fields of all streams put together, NumPy, and a list of the blocks' replays, which hold most of the memory, as they are."""
+    if len(states) == 1:
+      return states[0]._replace(replay=[states[0].replay])
+    return glue([state._replace(replay=None) for state in states], LATER)._replace(replay=[state.replay for state in states])
 
   def split(self, state: LoopState) -> list[LoopState]:
     """Inverse of `join`."""
     if len(self.blocks) == 1:
-      return [state]
+      return [state._replace(replay=state.replay[0])]
     part = lambda name, value, block: jax.tree.map(jnp.asarray, cut(jax.tree.map(np.asarray, value), block, int(name in LATER)))
-    return [LoopState(*(part(name, value, block) for name, value in zip(LoopState._fields, state))) for block in self.blocks]
+    whole = {name: value for name, value in zip(LoopState._fields, state) if name != "replay"}
+    return [LoopState(**{name: part(name, value, block) for name, value in whole.items()}, replay=jax.tree.map(jnp.asarray, replay))
+            for block, replay in zip(self.blocks, state.replay, strict=True)]
 
 
 def cut(tree, block: slice, axis: int):

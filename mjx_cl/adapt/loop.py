@@ -140,10 +140,11 @@ class Loop:
     """State before the first step; `train` is the shipped agent, the same for every stream."""
     a = self.agent
     spread = lambda tree: jax.tree.map(lambda x: jnp.broadcast_to(x, (groups,) + x.shape).copy(), tree)
-    empty = replay_lib.init(1, self.capacity, a.obs_size, a.act_size, a.size.deter, a.size.stoch)
+    shapes = jax.eval_shape(lambda: replay_lib.init(1, self.capacity, a.obs_size, a.act_size, a.size.deter, a.size.stoch))
+    replay = jax.tree.map(lambda x: jnp.zeros((groups,) + x.shape, x.dtype), shapes)  # empty: all zeros; a copy of one would be held twice for a while
     rows = max(1, self.config.refit // self.repeat)
     past = jax.tree.map(lambda x: jnp.asarray(x, x.dtype), unknown((rows, groups), a.obs_size))  # a weak type would be a second trace
-    return LoopState(spread(train), spread(train.params), spread(empty), self.monitor.init(groups, 1), spread(self.detector.init()), spread(phase_lib.init(self.config)),
+    return LoopState(spread(train), spread(train.params), replay, self.monitor.init(groups, 1), spread(self.detector.init()), spread(phase_lib.init(self.config)),
                      past, jnp.zeros(groups), jnp.zeros(groups, jnp.int32))
 
   def digest(self, state: LoopState, rows, now, choices: Choices, keys, acceptance=None) -> tuple[LoopState, Digest]:
