@@ -251,6 +251,7 @@ class RunConfig:
     deterministic: act by the policy's mean.
     snapshots: control steps of adaptation between two snapshots of the weights that act, in arms that never stop by themselves; 0: none.
       Each is evaluated on the broken robot once the run is over, see snapshots.py.
+    keep: what each stream has learnt is written as an agent, see run.Runner.keep.
   """
   env: str
   fault: str = "gear"
@@ -274,6 +275,7 @@ class RunConfig:
   deterministic: bool = False
   adapt: AdaptConfig = AdaptConfig()
   snapshots: int = 0
+  keep: bool = False
 
   def __post_init__(self):
     last = self.steps

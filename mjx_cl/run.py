@@ -330,10 +330,31 @@ class Runner:
       judged = stop.of_folder(self.out)
       store.write_table(self.out / "stop.parquet", {k: [r[k] for r in judged] for k in stop.COLUMNS})
       summary["stop_rule"] = stop.summarise(judged)
+    if self.config.keep:
+      self.keep()
     store.write_json(self.out / "summary.json", summary)
     self.checkpoints.close()
     shutil.rmtree(self.work, ignore_errors=True)
     return summary
+
+  def keep(self) -> None:
+    """Writes OUT/agents/ARM-SEED for every stream that has learnt: the weights that it acts by at the end, and the moments and counters of its learner.
+
+    The card is that of the agent it began with, and `adapted`: robot and fault it has lived with, arm, seed, control steps of the run, updates taken.
+    """
+    block_of = [(i, g - block.start) for i, block in enumerate(self.crew.blocks) for g in range(block.start, block.stop)]
+    for g, (arm, seed) in enumerate(self.labels):
+      if not self._updates[g]:
+        continue
+      i, at = block_of[g]
+      own = jax.tree.map(lambda x: np.asarray(x[at]), self.state.loop[i].train._replace(params=self.state.loop[i].acting))
+      card = (self.others[arm] if arm in self.others else self.trained).card
+      adapted = {"env": self.config.env, "becomes": becomes(self.config), "fault": self.config.fault, "arm": arm, "seed": seed, "steps": self.config.steps,
+                 "updates": int(self._updates[g])}
+      try:
+        agents.save(self.out / "agents" / f"{arm}-{seed}", own, {**card, "adapted": adapted})
+      except OSError as e:
+        raise FileError(f"cannot write in {self.out / 'agents'}: {e.strerror or e}; --resume writes them again") from None
 
   def _trace_table(self, trace, names) -> dict:
     steps, groups = trace["reward"].shape
@@ -592,6 +613,12 @@ def clear(out: pathlib.Path) -> None:
     (out / name).unlink(missing_ok=True)
   for name in ("work", "checkpoints"):
     shutil.rmtree(out / name, ignore_errors=True)
+  for card in (out / "agents").glob("*/card.json"):  # of `keep`
+    for name in ("agent.npz", "card.json"):
+      (card.parent / name).unlink(missing_ok=True)
+    for folder in (card.parent, card.parent.parent):
+      if not any(folder.iterdir()):
+        folder.rmdir()
 
 
 def identity(config: RunConfig) -> dict:

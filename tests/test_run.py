@@ -29,7 +29,7 @@ ENDS = [min(STEPS, (i + 1) * run.CHUNK) - 1 for i in range(-(-STEPS // run.CHUNK
 # nominal levels from step 100, an alarm at any sample beyond three deviations of the last 100, settled four chunks after it
 ARGS = ["run", "walker", "--steps", str(STEPS), "--onset", str(ONSET), "--seeds", "2", "--first-seed", "3", "--detector", "rolling_sigma_plain",
         "--set", "window=100", "warmup=30", "--adapt.warmup", "100", "--adapt.start-windows", "40", "--adapt.patience", "4", "--adapt.least", "64",
-        "--adapt.trend", "1e9", "--adapt.fluctuation", "1e9", "--adapt.refit", "100", "--json"]
+        "--adapt.trend", "1e9", "--adapt.fluctuation", "1e9", "--adapt.refit", "100", "--keep", "--json"]
 
 
 class Easy(Walker):
@@ -93,7 +93,7 @@ def of_stream(folder, stream, *kinds):
 
 def test_all_files_are_there_with_their_columns(whole):
   out, _, _ = whole
-  assert sorted(os.listdir(out)) == ["config.json", "events.parquet", "figure.png", "runs.parquet", "summary.json", "trace.parquet"]
+  assert sorted(os.listdir(out)) == ["agents", "config.json", "events.parquet", "figure.png", "runs.parquet", "summary.json", "trace.parquet"]
   assert list(table(out, "trace")) == [
       "stream", "arm", "seed", "fault", "step", "episode", "phase", "fault_active", "severity", "reward", "opr", "rpr", "score", "alarm",
       "terminated", "truncated", "valid", "dyn_loss", "adv_mag", "value_loss", "updates"]
@@ -327,16 +327,44 @@ def test_a_killed_and_interrupted_run_ends_in_the_same_files(whole, saved, tmp_p
       assert a[column] == b[column], (name, column)
   a, b = (json.loads((f / "summary.json").read_text()) for f in (out, whole[0]))
   assert {k: v for k, v in a.items() if "wall" not in k} == {k: v for k, v in b.items() if "wall" not in k}
+  for name in os.listdir(out / "agents"):
+    a, b = (agents.load(str(f / "agents" / name), "walker", 24, 6) for f in (out, whole[0]))
+    jax.tree.map(np.testing.assert_array_equal, a.train, b.train)
+
+
+def test_what_a_stream_has_learnt_is_an_agent(whole, saved):
+  """Of those that took updates, with the count; it differs from what the run began with, and arm `none` keeps nothing."""
+  out = whole[0]
+  runs = [dict(zip(table(out, "runs"), cells)) for cells in zip(*table(out, "runs").values())]
+  learnt = {f"{r['arm']}-{r['seed']}": r["updates"] for r in runs if r["updates"]}
+  assert learnt and sorted(os.listdir(out / "agents")) == sorted(learnt) and all(name.startswith("detector-") for name in learnt)
+  first = agents.load(str(saved), "walker", 24, 6)
+  for name, updates in learnt.items():
+    kept = agents.load(str(out / "agents" / name), "walker", 24, 6)
+    assert kept.card["adapted"] == {"env": "walker", "becomes": None, "fault": "gear", "arm": "detector", "seed": int(name[-1]), "steps": STEPS, "updates": updates}
+    assert int(kept.train.updates) == int(first.train.updates) + updates and kept.card["dreamer"] == first.card["dreamer"]
+    moved = jax.tree.leaves(jax.tree.map(lambda a, b: float(np.abs(a - b).max()), kept.train.params, first.train.params))
+    assert max(moved) > 0 and np.isfinite(moved).all()
+
+
+def test_overwriting_a_run_removes_its_agents_and_no_other_file(tmp_path):
+  for name in ("detector-3", "mine"):
+    (tmp_path / "agents" / name).mkdir(parents=True)
+  (tmp_path / "agents/mine/notes.txt").write_text("x")
+  for name in ("agent.npz", "card.json"):
+    (tmp_path / "agents/detector-3" / name).write_text("{}")
+  run.clear(tmp_path)
+  assert [str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*") if p.is_file()] == ["agents/mine/notes.txt"] and not (tmp_path / "agents/detector-3").exists()
 
 
 def test_resume_of_a_finished_run_changes_nothing(whole, saved, monkeypatch):
   out = whole[0]
-  before = {p.name: p.read_bytes() for p in out.iterdir()}
+  before = {p.name: p.read_bytes() for p in out.iterdir() if p.is_file()}
   monkeypatch.setattr(run.Runner, "__init__", None)  # nothing is built
   assert resume(ARGS + ["--agent", str(saved), "--out", str(out), "--resume"])[0] == 0
   code, stderr = resume(ARGS + ["--agent", str(saved), "--out", str(out), "--resume", "--severity", "0.7"])
   assert code == 2 and "severity" in stderr and stderr.count("\n") == 1
-  assert {p.name: p.read_bytes() for p in out.iterdir()} == before
+  assert {p.name: p.read_bytes() for p in out.iterdir() if p.is_file()} == before
 
 
 class Stub:
