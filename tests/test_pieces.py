@@ -89,7 +89,7 @@ def test_a_table_that_one_piece_lacks_is_left_out(tmp_path):
   (folders[1] / "stop.parquet").unlink()
   value = pieces.join(folders, tmp_path / "all", part.config)
   assert "stop_rule" not in value and {p.name for p in (tmp_path / "all").iterdir()} == {"config.json", "summary.json", "runs.parquet", "events.parquet",
-                                                                                            "snapshots.parquet"}
+                                                                                            "snapshots.parquet", "signals.parquet"}
 
 
 def test_pieces_that_do_not_fit_are_one_line(tmp_path):
