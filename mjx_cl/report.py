@@ -226,6 +226,27 @@ def leaderboard(results: pathlib.Path) -> str:
   return "\n\n".join([text, "![leaderboard](results/leaderboard.png)", board, *([fill(rest)] if rest else [])])
 
 
+def leaderboard_100k(results: pathlib.Path) -> str:
+  """The board at a tenth of the false alarms, beside the default one."""
+  folder = results / "leaderboard_100k"
+  meta, held = load(folder / "leaderboard.json"), {r["detector"]: r["cost_standard"] for r in table(results / "leaderboard_overall.parquet")}
+  overall = sorted(table(folder / "leaderboard_overall.parquet"), key=lambda r: (-r["cost_standard"], r["detector"]))
+  rows = [r for r in table(folder / "leaderboard.parquet", ["detector", "reference", "robot", "arl0_alarms", "arl0", "arl0_low", "arl0_high", "control_s"]) if not r["reference"]]
+  alarms = statistics.mode(r["arl0_alarms"] for r in rows)
+  like = next(r for r in rows if r["arl0_alarms"] == alarms)
+  asked = {r["robot"]: 3600 / r["control_s"] / meta["arl0_target"] for r in rows}
+  (low, high), minutes = meta["seeds"]["score"], meta["wall_s"] / 60
+  text = fill(f"""
+      Thresholds at ARL0 = {number(meta['arl0_target'])} control steps, calibrated on {number(alarms * like['arl0'])} healthy steps for each robot ({alarms} alarms for most: ARL0
+      {number(like['arl0'])} {span((like["arl0_low"], like["arl0_high"]))}), {high - low + 1} scoring seeds; asked for are {joined([f"{number(x, 2)} ({robot})" for robot, x in sorted(asked.items())])} false alarms
+      an hour. Score as on the board: 0 for never alarming, 100 for alarming at the onset and at no other time; detectors that score above 0. `mjx-cl leaderboard runs/streams-100k`:
+      {number(meta['stream_steps'] / 1e6)} million stream-steps, {number(minutes)} minutes on {meta['machine']['cores']} shared core{'s' if meta['machine']['cores'] > 1 else ''}.""")
+  whole = lambda x: f"{percent(x)}%"
+  shown = [(r["detector"], f"{number(r['cost_standard'])} {span((r['cost_standard_low'], r['cost_standard_high']))}", number(held[r["detector"]]) if r["detector"] in held else "-",
+            whole(r["detected_within_5s"]), whole(r["miss_probability"]), number(r["false_alarms_per_hour"], 1)) for r in overall if r["cost_standard"] > 0]
+  return text + "\n\n" + grid(("detector", "score [95 %]", "at ARL0 10,000", "within 5 s", "missed", "false alarms/h"), shown)
+
+
 def physics(results: pathlib.Path) -> str:
   """Speed of physics and fault layer."""
   bench = Bench(results / "physics.json")
@@ -513,7 +534,7 @@ def ppo(results: pathlib.Path) -> str:
   return text + "\n\n" + grid(("learner", "recovered", "median [steps]", "reward before", "reward at the end", "normalised recovery", "updates", "falls"), rows)
 
 
-BLOCKS = {"run-walker": run_walker, "arl0": arl0, "leaderboard": leaderboard, "physics": physics, "dreamer": dreamer, "agents": agents,
+BLOCKS = {"run-walker": run_walker, "arl0": arl0, "leaderboard": leaderboard, "leaderboard-100k": leaderboard_100k, "physics": physics, "dreamer": dreamer, "agents": agents,
           "detectors": detectors, "paper": experiments, "arms": arms,
           "other-arms": other_arms, "stop-rule": stop_rule, "again": again, "study": study, "two-agents": two_agents, "gradient": gradient, "ppo": ppo}
 
