@@ -16,7 +16,8 @@ GROWTH = 1.25               # of what weights and replays take: weights once mor
 def resident(need: int) -> int:
   """Bytes that a process grows to whose weights and replays take `need` bytes; of an accelerator's memory those alone.
 
-  By runs of ten seeds with native physics, peaks to their end: 2.7 GiB of 0.8 (two arms, 25,000 steps); up to a third save: 2.5 of 0.8 (one arm, 64,000).
+  By runs of ten seeds with native physics, peaks to their end: 2.7 GiB of 0.8 (two arms, 25,000 steps); up to a third save: 2.5 of 0.8 (one arm, 64,000). Larger ones
+  are not measured.
   """
   import jax
   return PROCESS + int(GROWTH * need) if jax.default_backend() == "cpu" else need

@@ -177,6 +177,20 @@ def arl0(results: pathlib.Path) -> str:
       makes residuals swing.""")
 
 
+def mute(rows) -> dict[str, set]:
+  """Detector -> robots on which no threshold brings it to the asked rate: its scores never alarmed on the tuning streams."""
+  silent: dict[str, set] = {}
+  for r in rows:
+    if not r["reference"] and r["arl0_alarms"] == 0:
+      silent.setdefault(r["detector"], set()).add(r["robot"])
+  return silent
+
+
+def dagger(marked: dict[str, set]) -> str:
+  """The note under a board on the detectors marked so."""
+  return f"† no threshold gives that rate of false alarms, it stays silent: {'; '.join(f'{name} on {joined(sorted(own))}' for name, own in marked.items())}."
+
+
 def leaderboard(results: pathlib.Path) -> str:
   """Detectors on the recorded streams: those that beat never alarming, and their own plain form, as a table, the others in a sentence."""
   meta = load(results / "leaderboard.json")
@@ -186,11 +200,7 @@ def leaderboard(results: pathlib.Path) -> str:
   alarms = statistics.mode(r["arl0_alarms"] for r in rows if not r["reference"])
   (low, high), minutes = meta["seeds"]["score"], meta["wall_s"] / 60
   asked = {r["robot"]: 3600 / r["control_s"] / meta["arl0_target"] for r in rows}
-  silent = {}  # detectors that no threshold brings to the asked rate: their scores never alarmed on the tuning streams
-  for r in rows:
-    if not r["reference"] and r["arl0_alarms"] == 0:
-      silent.setdefault(r["detector"], set()).add(r["robot"])
-  best = {}
+  silent, best = mute(rows), {}
   for robot in robots:
     means = {}
     for r in rows:
@@ -205,7 +215,7 @@ def leaderboard(results: pathlib.Path) -> str:
       alarming, 100 for alarming at the onset and at no other time, a mean over robots; intervals over seeds. Best on each robot:
       {joined([f"`{name}` {number(x)} ({robot})" for robot, (x, name) in best.items()])}. Mean ranks closer than {number(meta['critical_difference'], 1)} are not
       told apart (Nemenyi). `mjx-cl leaderboard` ({len(overall)} detectors;
-      {number(meta['stream_steps'] / 1e6, 1)} million stream-steps, {number(minutes, 1)} minutes on {meta['machine']['cores']} shared cores; goal 3
+      {number(meta['stream_steps'] / 1e6, 1)} million stream-steps, {number(minutes, 1)} minutes on {meta["machine"]["cores"]} shared cores; goal 3
       minutes{', missed' if minutes > 3 else ''}). The page: [results/leaderboard.html](results/leaderboard.html), one file, sortable, a page per
       fault.""")
   score = {r["detector"]: r["cost_standard"] for r in overall}
@@ -221,7 +231,7 @@ def leaderboard(results: pathlib.Path) -> str:
     rest += f" {words}: {', '.join(names)}." if names else ""
   marked = {name: own for name, own in silent.items() if kind(name) == "shown"}
   if marked:
-    rest = f" † no threshold gives that rate of false alarms, it stays silent: {'; '.join(f'{name} on {joined(sorted(own))}' for name, own in marked.items())}." + rest
+    rest = " " + dagger(marked) + rest
   board = grid(("detector", "score [95 %]", "within 1 s", "within 5 s", "missed", "false alarms/h", "mean rank"), shown)
   return "\n\n".join([text, "![leaderboard](results/leaderboard.png)", board, *([fill(rest)] if rest else [])])
 
@@ -240,11 +250,12 @@ def leaderboard_100k(results: pathlib.Path) -> str:
       Thresholds at ARL0 = {number(meta['arl0_target'])} control steps, calibrated on {number(alarms * like['arl0'])} healthy steps for each robot ({alarms} alarms for most: ARL0
       {number(like['arl0'])} {span((like["arl0_low"], like["arl0_high"]))}), {high - low + 1} scoring seeds; asked for are {joined([f"{number(x, 2)} ({robot})" for robot, x in sorted(asked.items())])} false alarms
       an hour. Score as on the board: 0 for never alarming, 100 for alarming at the onset and at no other time; detectors that score above 0. `mjx-cl leaderboard runs/streams-100k`:
-      {number(meta['stream_steps'] / 1e6)} million stream-steps, {number(minutes)} minutes on {meta['machine']['cores']} shared core{'s' if meta['machine']['cores'] > 1 else ''}.""")
+      {number(meta['stream_steps'] / 1e6)} million stream-steps, {number(minutes)} minutes on {meta["machine"]["cores"]} shared core{'s' if meta['machine']['cores'] > 1 else ''}.""")
   whole = lambda x: f"{percent(x)}%"
-  shown = [(r["detector"], f"{number(r['cost_standard'])} {span((r['cost_standard_low'], r['cost_standard_high']))}", number(held[r["detector"]]) if r["detector"] in held else "-",
+  marked = {name: own for name, own in mute(rows).items() if any(r["detector"] == name and r["cost_standard"] > 0 for r in overall)}
+  shown = [(r["detector"] + " †" * (r["detector"] in marked), f"{number(r['cost_standard'])} {span((r['cost_standard_low'], r['cost_standard_high']))}", number(held[r["detector"]]) if r["detector"] in held else "-",
             whole(r["detected_within_5s"]), whole(r["miss_probability"]), number(r["false_alarms_per_hour"], 1)) for r in overall if r["cost_standard"] > 0]
-  return text + "\n\n" + grid(("detector", "score [95 %]", "at ARL0 10,000", "within 5 s", "missed", "false alarms/h"), shown)
+  return text + "\n\n" + grid(("detector", "score [95 %]", "at ARL0 10,000", "within 5 s", "missed", "false alarms/h"), shown) + (f"\n\n{fill(dagger(marked))}" if marked else "")
 
 
 def physics(results: pathlib.Path) -> str:

@@ -340,7 +340,7 @@ class Runner:
   def keep(self) -> None:
     """Writes OUT/agents/ARM-SEED for every stream that has learnt: the weights that it acts by at the end, and the moments and counters of its learner.
 
-    The card is that of the agent it began with, and `adapted`: robot and fault it has lived with, arm, seed, control steps of the run, updates taken.
+    The card is that of the agent it began with but for what that scored, and `adapted`: robot and fault it has lived with, arm, seed, control steps of the run, updates taken.
     """
     block_of = [(i, g - block.start) for i, block in enumerate(self.crew.blocks) for g in range(block.start, block.stop)]
     for g, (arm, seed) in enumerate(self.labels):
@@ -348,7 +348,7 @@ class Runner:
         continue
       i, at = block_of[g]
       own = jax.tree.map(lambda x: np.asarray(x[at]), self.state.loop[i].train._replace(params=self.state.loop[i].acting))
-      card = (self.others[arm] if arm in self.others else self.trained).card
+      card = {k: v for k, v in (self.others[arm] if arm in self.others else self.trained).card.items() if k not in ("eval", "demonstrator_return")}
       adapted = {"env": self.config.env, "becomes": becomes(self.config), "fault": self.config.fault, "arm": arm, "seed": seed, "steps": self.config.steps,
                  "updates": int(self._updates[g])}
       try:
@@ -613,7 +613,9 @@ def clear(out: pathlib.Path) -> None:
     (out / name).unlink(missing_ok=True)
   for name in ("work", "checkpoints"):
     shutil.rmtree(out / name, ignore_errors=True)
-  for card in (out / "agents").glob("*/card.json"):  # of `keep`
+  for card in (out / "agents").glob("*/card.json"):
+    if '"adapted"' not in card.read_text(errors="replace"):  # not of `keep`
+      continue
     for name in ("agent.npz", "card.json"):
       (card.parent / name).unlink(missing_ok=True)
     for folder in (card.parent, card.parent.parent):

@@ -348,13 +348,15 @@ def test_what_a_stream_has_learnt_is_an_agent(whole, saved):
 
 
 def test_overwriting_a_run_removes_its_agents_and_no_other_file(tmp_path):
-  for name in ("detector-3", "mine"):
+  for name in ("detector-3", "mine", "other"):
     (tmp_path / "agents" / name).mkdir(parents=True)
   (tmp_path / "agents/mine/notes.txt").write_text("x")
   for name in ("agent.npz", "card.json"):
-    (tmp_path / "agents/detector-3" / name).write_text("{}")
+    (tmp_path / "agents/detector-3" / name).write_text('{"adapted": {}}')
+    (tmp_path / "agents/other" / name).write_text("{}")
   run.clear(tmp_path)
-  assert [str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*") if p.is_file()] == ["agents/mine/notes.txt"] and not (tmp_path / "agents/detector-3").exists()
+  assert sorted(str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*") if p.is_file()) == ["agents/mine/notes.txt", "agents/other/agent.npz", "agents/other/card.json"]
+  assert not (tmp_path / "agents/detector-3").exists()
 
 
 def test_resume_of_a_finished_run_changes_nothing(whole, saved, monkeypatch):
