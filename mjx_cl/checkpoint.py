@@ -55,7 +55,8 @@ class Checkpoints:
     try:
       out = self._manager.restore(number, args=ocp.args.Composite(tree=ocp.args.StandardRestore(packed), meta=ocp.args.JsonRestore()))
     except Exception as e:  # orbax raises many kinds for a broken or foreign folder
-      raise FileError(f"cannot read checkpoint {number} in {self.folder}: {(str(e).splitlines() or [type(e).__name__])[0]}") from None
+      why = (str(e).splitlines() or [type(e).__name__])[0]
+      raise FileError(f"cannot read checkpoint {number} in {self.folder}: {why}; it is broken, of another version or of another kind of device: --overwrite begins anew") from None
     same = jax.tree.map(lambda a, b: a.shape == b.shape, out["tree"], packed)
     if not all(jax.tree.leaves(same)):
       raise FileError(f"checkpoint {number} in {self.folder} belongs to another size or robot")
