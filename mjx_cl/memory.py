@@ -10,14 +10,14 @@ from mjx_cl.errors import UserError
 
 MARGIN = 0.85               # share of the free memory that may be planned for
 PROCESS = 7 * 2**28         # bytes of Python, its libraries, compiled programs and their scratch memory
-GROWTH = 1.25               # of what weights and replays take: weights once more while they are saved, traces, what the allocator cannot use
+GROWTH = 1.5                # of what weights and replays take: weights once more while they are saved, traces, what the allocator cannot use
 
 
 def resident(need: int) -> int:
   """Bytes that a process grows to whose weights and replays take `need` bytes; of an accelerator's memory those alone.
 
-  By runs of ten seeds with native physics, peaks to their end: 2.7 GiB of 0.8 (two arms, 25,000 steps); up to a third save: 2.5 of 0.8 (one arm, 64,000). Larger ones
-  are not measured.
+  By runs of ten walkers an arm, native physics: 2.7 GiB of 0.8 to the end (two arms, 25,000 steps); up to a third save, traces still short, 2.5 of 0.8
+  (one arm, 64,000) and 3.6 of 1.6 (two). Nothing larger was measured.
   """
   import jax
   return PROCESS + int(GROWTH * need) if jax.default_backend() == "cpu" else need
