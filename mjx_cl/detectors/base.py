@@ -20,7 +20,8 @@ class Alarm(NamedTuple):
 class Detector(NamedTuple):
   """Attributes:
     init: () -> state, a pytree of arrays.
-    update: (state, x) -> (state, Alarm), same structure, shapes and dtypes in and out: scannable and vmappable.
+    update: (state, x) -> (state, Alarm), same structure, shapes and dtypes in and out: scannable and vmappable. Where `update.skips` is set, a scalar x
+      that is nan leaves the state as it is and has no score; `combine.on` then need not compare a long state element by element at every sample.
 
   A factory's `threshold` is compared as score > threshold and may be traced, so that one compiled program serves a whole calibration. After an
   alarm the evidence starts from nothing, what was learnt of the healthy robot stays, unless the factory says otherwise.

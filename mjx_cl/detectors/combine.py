@@ -33,10 +33,12 @@ def on(channel: str, detector: Detector, log: bool = False) -> Detector:
   def update(state, residual):
     x = read(channel, residual)
     valid = jnp.isfinite(x) & (residual.valid | (channel in ("reward", "surprise")))
-    x = jnp.where(valid, x, 0.0)
+    skips = getattr(detector.update, "skips", False)
+    x = jnp.where(valid, x, jnp.nan if skips else 0.0)
     new, alarm = detector.update(state, jnp.log(jnp.maximum(x, 1e-9)) if log else x)
-    state = jax.tree.map(lambda a, b: jnp.where(valid, a, b), new, state)
-    return state, Alarm(alarm.fired & valid, jnp.where(valid, alarm.score, jnp.nan))
+    if not skips:
+      new = jax.tree.map(lambda a, b: jnp.where(valid, a, b), new, state)
+    return new, Alarm(alarm.fired & valid, jnp.where(valid, alarm.score, jnp.nan))
   return Detector(detector.init, update)
 
 
