@@ -28,12 +28,14 @@ class Entry(NamedTuple):
   Attributes:
     name: on the board. build: threshold -> Detector; None for a host detector or scores.
     calibrated: has a threshold. reference: looks at nothing. about: one line.
+    own: robot -> build where the settings are a robot's own, which is compiled for each robot; None: `build` serves all.
   """
   name: str
   build: Callable[[Any], Any] | None
   calibrated: bool
   reference: bool
   about: str
+  own: Callable[[str], Callable[[Any], Any]] | None = None
 
 
 class Found(NamedTuple):
@@ -96,8 +98,11 @@ def entry(name: str, settings: dict) -> Entry:
   parameters = inspect.signature(factory).parameters
   calibrated = "threshold" in parameters or any(p.kind is p.VAR_KEYWORD for p in parameters.values())
   about = (inspect.getdoc(factory) or "").split("\n")[0]
-  build = lambda threshold: detectors_lib.make(use, **settings, **({"threshold": threshold} if calibrated else {}))
-  return Entry(name, build, calibrated, bool(getattr(factory, "reference", False)), about)
+  build = lambda threshold, **more: detectors_lib.make(use, **(more | settings), **({"threshold": threshold} if calibrated else {}))
+  own = None
+  if use == "rolling_sigma":
+    own = lambda robot: lambda threshold: build(threshold, robot=robot, shared=True)
+  return Entry(name, build, calibrated, bool(getattr(factory, "reference", False)), about, own)
 
 
 def load(streams: StreamSet, robot: str) -> Data:
@@ -255,7 +260,7 @@ def score(streams: StreamSet, entries: list[Entry], robots=(), extra=(), progres
   begin = time.perf_counter()
   robots = streams.choose(robots)
   room = passes.room(streams, robots)
-  runners = {e.name: passes.Runner(e.build, room) for e in entries}
+  runners = {e.name: passes.Runner(e.build, room) for e in entries if not e.own}
   rows, curves, pages, n = [], {}, [], len(robots) * (len(entries) + len(extra) + 1)
   done = lived = 0
   for robot in robots:
@@ -267,7 +272,8 @@ def score(streams: StreamSet, entries: list[Entry], robots=(), extra=(), progres
     done += 1
     progress(robot, "oracles", done, n, time.perf_counter() - begin)
     alarms: dict[str, np.ndarray] = {}
-    jobs = [(e.name, lambda d, e=e: _guarded(e, d, runners[e.name], samples)) for e in entries] + list(extra)
+    runner = lambda e: passes.Runner(e.own(robot), room) if e.own else runners[e.name]
+    jobs = [(e.name, lambda d, e=e: _guarded(e, d, runner(e), samples)) for e in entries] + list(extra)
 
     def rated(name, get):
       result = get(data)

@@ -241,7 +241,7 @@ def test_arl0_of_three_sigma_is_the_published_370():
 
 
 @pytest.mark.parametrize("settings", [dict(window=1), dict(window=0), dict(patience=0), dict(threshold=0), dict(threshold=-1),
-                                      dict(threshold=float("nan")), dict(warmup=1), dict(warmup=-5), dict(smooth=0), dict(lag=-1)])
+                                      dict(threshold=float("nan")), dict(warmup=1), dict(warmup=-5), dict(smooth=0), dict(lag=-1), dict(unit=0.0)])
 def test_bad_settings_are_refused(settings):
   with pytest.raises(UserError, match="rolling_sigma needs"):
     rolling_sigma(**settings)
@@ -278,6 +278,21 @@ def test_each_robot_has_its_own_figures(robot):
   assert detectors.make("rolling_sigma", robot=robot, smooth=7).init()[0].recent.shape == (7,)
   assert detectors.make("rolling_sigma", window=300, lag=20).init()[0].buffer.shape == (320,)
   assert detectors.make("rolling_sigma_plain").init()[0].buffer.shape == (1000,)
+
+
+@pytest.mark.parametrize("robot", detectors.CALIBRATED)
+def test_one_threshold_for_both_residuals_is_both_thresholds_in_proportion(robot):
+  """What the leaderboard calibrates: at the calibrated threshold it is the detector of `mjx-cl run`, and its score tells when it fires."""
+  own = detectors.CALIBRATED[robot]
+  ratio = own.get("threshold_rpr", own["threshold"]) / own["threshold"]
+  small = dict(window=100, warmup=20, smooth=40, lag=2)  # long excursions: the car wants 20 samples in a row
+  xs = residuals(jax.random.key(6), 400, invalid=0.0)
+  run = lambda det: jax.lax.scan(det.update, det.init(), xs)[1]
+  assert detectors.one_threshold(robot) | {"threshold_rpr": 0, "unit_rpr": 0, "threshold": 0} == own | {"threshold_rpr": 0, "unit_rpr": 0, "threshold": 0}
+  one = run(detectors.make("rolling_sigma", robot=robot, shared=True, **small, threshold=0.8))
+  two = run(detectors.make("rolling_sigma", robot=robot, **small, threshold=0.8, threshold_rpr=0.8 * ratio))
+  np.testing.assert_array_equal(one.fired, two.fired)
+  assert one.fired.any() and (np.asarray(one.score)[one.fired] > 0.8).all() and detectors.one_threshold("a robot of mine") == detectors.one_threshold("walker")
 
 
 def echo(threshold):

@@ -29,11 +29,11 @@ from mjx_cl.detectors.z_score import z_score
 from mjx_cl.errors import UserError, choose
 
 
-def paper_rule(threshold: float = 3.0, threshold_rpr: float | None = None, **settings) -> Detector:
+def paper_rule(threshold: float = 3.0, threshold_rpr: float | None = None, unit_rpr: float = 1.0, **settings) -> Detector:
   """The paper's rule as written: `rolling_sigma` on OPR and on RPR, beyond three deviations of the mean, either one. `threshold_rpr`: another
-  threshold for RPR, None: the same."""
+  threshold for RPR, None: the same. `unit_rpr`: deviations of RPR that count as one."""
   other = threshold if threshold_rpr is None else threshold_rpr
-  return any_of(on("opr", rolling_sigma(threshold=threshold, **settings)), on("rpr", rolling_sigma(threshold=other, **settings)))
+  return any_of(on("opr", rolling_sigma(threshold=threshold, **settings)), on("rpr", rolling_sigma(threshold=other, unit=unit_rpr, **settings)))
 
 
 def calibrated_rule(**settings) -> Detector:
@@ -53,6 +53,14 @@ CALIBRATED = {
     # also where a car that has adapted must not take its own crashes for an event
     "car": {"window": 4000, "smooth": 1, "lag": 0, "threshold": 4.0, "threshold_rpr": 4.0, "patience": 20, "two_sided": False, "log": False},
 }
+
+def one_threshold(robot: str | None) -> dict:
+  """Settings of `rolling_sigma` on a robot, without a threshold: both residuals share one, RPR's deviations counted in the proportion of its
+  calibrated threshold to that of OPR. A single threshold can then be calibrated, as the leaderboard does."""
+  own = dict(CALIBRATED.get(robot, CALIBRATED["walker"]))
+  threshold = own.pop("threshold")
+  return own | {"threshold_rpr": None, "unit_rpr": own.get("threshold_rpr", threshold) / threshold}
+
 
 DETECTORS = {"rolling_sigma": calibrated_rule, "rolling_sigma_plain": paper_rule}
 DETECTORS |= {"z_score": z_score, "ewma": ewma, "cusum": cusum, "page_hinkley": page_hinkley, "shiryaev_roberts": shiryaev_roberts, "glr": glr}
@@ -81,7 +89,7 @@ DETECTORS |= _plugins()
 
 
 def make(name: str, channel: str | None = None, log: bool | None = None, whiten: int = 0, patience: int = 1, cool_down: int = 0,
-         robot: str | None = None, **settings) -> Detector:
+         robot: str | None = None, shared: bool = False, **settings) -> Detector:
   """Builds detector `name`, a map over monitor.Residual. Unknown settings are refused.
 
   Args:
@@ -95,13 +103,14 @@ def make(name: str, channel: str | None = None, log: bool | None = None, whiten:
       this name, or none.
     cool_down: samples after an alarm in which no other counts, of the channels together, see combine.cool_down.
     robot: whose figures `rolling_sigma` starts from, where CALIBRATED has them; default: the walker's.
+    shared: `rolling_sigma` has one threshold for both residuals, see `one_threshold`.
   """
   name, at, after = name.partition("@")
   if at:
     channel = after
   build = choose("detector", name, DETECTORS)
   if name == "rolling_sigma":
-    settings = CALIBRATED.get(robot, {}) | settings
+    settings = (one_threshold(robot) if shared else CALIBRATED.get(robot, {})) | settings
   try:
     if getattr(build, "takes", "residual") != "scalar":
       if channel is not None or log is not None or whiten:

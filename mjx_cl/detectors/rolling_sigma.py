@@ -50,11 +50,11 @@ def grown(moments: Moments, before: jax.Array, x: jax.Array) -> Moments:
 
 
 def rolling_sigma(window: int = 1000, threshold: float = 3.0, patience: int = 1, two_sided: bool = True, warmup: int = 500, smooth: int = 1,
-                  lag: int = 0, log: bool = False) -> Detector:
+                  lag: int = 0, log: bool = False, unit: float = 1.0) -> Detector:
   """Rolling mean and standard deviation of the `window` samples before the present one.
 
     y_t = mean of x_{t-smooth+1..t}, or of ln max(x, 1e-9);   mean, std over y_{t-lag-window..t-lag-1}
-    z = (y_t - mean) / max(std, 1e-6),  score = |z| (two-sided) or z
+    z = (y_t - mean) / max(unit * std, 1e-6),  score = |z| (two-sided) or z
     fired when score > threshold for the `patience`-th time in a row: one alarm per excursion, the next needs a score below first
 
   Every sample enters the window, alarms or not, as the paper's rolling statistics do. smooth = 1, lag = 0 and no logarithm are the paper's rule.
@@ -65,22 +65,23 @@ def rolling_sigma(window: int = 1000, threshold: float = 3.0, patience: int = 1,
 
   Args:
     window: samples of the rolling statistics [control steps]. The paper gives none.
-    threshold: decision level [rolling std]; 3 in the paper.
+    threshold: decision level [unit * rolling std]; 3 in the paper.
     patience: how many in a row.
     two_sided: also a fall below the mean fires, the literal "deviation"; False: a rise alone.
     warmup: reference samples needed before anything fires; at most `window`.
     smooth: samples of the trailing mean that is tested; a gait makes single residuals swing, so a shift shows in their mean.
     lag: the newest samples that the reference leaves out, so that a change cannot raise its own threshold.
     log: take the logarithm first; a residual is positive and skewed, and single large ones otherwise widen the deviation for a whole window.
+    unit: standard deviations that count as one, so that several of these can share a threshold.
   Returns:
     Detector whose update takes x, float32 (), and gives Alarm(fired: bool (), score: float32 ()).
   Cost: window / size + O(1) a sample, size the power of two at or below window / 12.
   Blind to: a change slower than window + lag, which the reference absorbs; with `patience`, a change that comes and goes faster.
   Reference: the paper, section on change detection.   Example: _, out = jax.lax.scan(det.update, det.init(), xs)
   """
-  if not (window >= 2 and patience >= 1 and above(threshold, 0) and min(warmup, window) >= 2 and smooth >= 1 and lag >= 0):
-    raise UserError("rolling_sigma needs window >= 2, patience >= 1, threshold > 0, warmup >= 2, smooth >= 1, lag >= 0; got "
-                    f"{window}, {patience}, {threshold}, {warmup}, {smooth}, {lag}")
+  if not (window >= 2 and patience >= 1 and above(threshold, 0) and min(warmup, window) >= 2 and smooth >= 1 and lag >= 0 and 0 < unit < float("inf")):
+    raise UserError("rolling_sigma needs window >= 2, patience >= 1, threshold > 0, warmup >= 2, smooth >= 1, lag >= 0, unit > 0; got "
+                    f"{window}, {patience}, {threshold}, {warmup}, {smooth}, {lag}, {unit}")
   warmup, held, smoothing = min(warmup, window), window + lag, max(1, smooth)
   shift = max(0, (window // 12).bit_length() - 1)
   size, number = 1 << shift, (window >> shift) + 1
@@ -119,7 +120,7 @@ def rolling_sigma(window: int = 1000, threshold: float = 3.0, patience: int = 1,
     about = lambda n, m: m.squares + n * jnp.square(m.mean - mean)
     squares = jnp.sum(jnp.where(whole, about(size, blocks), 0.0))
     squares += jnp.where(in_head > 0, about(in_head, head), 0.0) + jnp.where(in_tail > 0, about(in_tail, tail), 0.0)
-    z = (y - mean) / jnp.maximum(jnp.sqrt(squares / total), 1e-6)
+    z = (y - mean) / jnp.maximum(unit * jnp.sqrt(squares / total), 1e-6)
     score = jnp.abs(z) if two_sided else z
     ready = known & (end >= warmup)
     run = jnp.where(ready & (score > threshold), state.run + 1, 0)
