@@ -487,6 +487,42 @@ def study(results: pathlib.Path) -> str:
   return text + "\n\n" + grid(("severity", "train ratio", "seeds", "recovered", "restricted mean [steps]", "normalised recovery", "updates"), rows)
 
 
+def full(results: pathlib.Path) -> str:
+  """Fault by fault what the method does, of the finished parts of suite `full`, and how complete it is."""
+  from mjx_cl.scoring import bootstrap
+  folder = results / "full"
+  plan, entries = load(folder / "suite.json")["parts"], load(folder / "bench.json")["entries"]
+  lived = table(folder / "bench.parquet", ["part", "arm", "affected", "reward_pre", "reward_final"])
+
+  def left(part, arm):
+    """Reward of the affected streams over the last 2,000 steps as a share of that before the onset."""
+    shares = [r["reward_final"] / r["reward_pre"] for r in lived if (r["part"], r["arm"]) == (part, arm) and r["affected"]]
+    return f"{percent(bootstrap.iqm(shares))} %" if shares else "-"
+
+  rows, last = [], None
+  for part in (p for p in plan if p in entries):  # in the order of the suite
+    one, own, none = plan[part], entries[part]["arms"]["detector"], entries[part]["arms"]["none"]
+    worth = (entries[part]["scores"]["normalised"] or {}).get("detector")
+    of = lambda arm, name: f"{arm[name]} of {arm['affected']}" if arm["affected"] else "-"
+    rows.append((f"`{one['env']}`" if one["env"] != last else "", f"`{one['fault']}`" + ("" if "/" in one["fault"] else f" {one['severity']:g}"),
+                 f"{own['affected']} of {own['seeds']}", str(own["false_alarm_streams"]), f"{own['alarms']} of {own['seeds']}", of(own, "affected_alarmed_within_500"),
+                 both(own, "latency_median_steps"), of(none, "recovered"), of(own, "recovered"), left(part, "none"), left(part, "detector"),
+                 few(worth, "normalised", worth["seeds"], 2) if worth and worth["seeds"] else "-",
+                 f"{own['converged']} / {own['aborted_by_rule'] + own['aborted_by_budget']} / {own['adapting']}", number(own["updates_mean"])))
+    last = one["env"]
+  robots = {}
+  for part in plan:
+    robots.setdefault(plan[part]["env"], []).append(part in entries)
+  done = ", ".join(f"`{name}` {sum(have)} of {len(have)}" for name, have in robots.items())
+  text = fill(f"""
+      {len(entries)} of {len(plan)} parts of suite `full` are finished ({done}), seeds {one['first_seed']} to {one['first_seed'] + one['seeds'] - 1}. Affected streams; streams with a false alarm
+      before the onset; streams that alarm after it; affected ones that do within 500 steps; median latency of all streams, misses counted as infinite; affected streams
+      recovered before the run ends, without and with finetuning; their reward over the last 2,000 steps over that before the onset (interquartile mean); normalised recovery (0: arm
+      `none`, 1: the reward before onset, interquartile mean with 95 % bootstrap interval over the affected streams); finetunings that converge / are given up / still go on; updates a stream. {FEW if any(" to " in cell for row in rows for cell in row) else ""}""")
+  return text + "\n\n" + grid(("robot", "fault, severity", "affected", "false alarms", "alarm", "within 500", "latency [steps]", "recovered, `none`", "recovered",
+                                "reward left, `none`", "reward left", "normalised recovery", "converged / given up / going on", "updates"), rows)
+
+
 def two_agents(results: pathlib.Path) -> str:
   """The same run with two agents that were trained apart: what carries over."""
   rows = []
@@ -547,7 +583,7 @@ def ppo(results: pathlib.Path) -> str:
 
 BLOCKS = {"run-walker": run_walker, "arl0": arl0, "leaderboard": leaderboard, "leaderboard-100k": leaderboard_100k, "physics": physics, "dreamer": dreamer, "agents": agents,
           "detectors": detectors, "paper": experiments, "arms": arms,
-          "other-arms": other_arms, "stop-rule": stop_rule, "again": again, "study": study, "two-agents": two_agents, "gradient": gradient, "ppo": ppo}
+          "other-arms": other_arms, "stop-rule": stop_rule, "again": again, "study": study, "full": full, "two-agents": two_agents, "gradient": gradient, "ppo": ppo}
 
 
 # ---- pages -----------------------------------------------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ from flax import serialization
 
 from test_agent import shake
 
-from mjx_cl import agents, demonstrator, detectors, envs, store
+from mjx_cl import agents, demonstrator, detectors, envs, faults, store
 from mjx_cl.errors import UserError
 
 FOLDER = pathlib.Path(__file__).parent.parent / "benchmarks"
@@ -179,3 +179,40 @@ def test_settled_stretches_of_a_run(tmp_path):
   store.write_json(tmp_path / "config.json", config | {"first_seed": 0})
   with pytest.raises(SystemExit, match="those that tune"):
     calibrate.settled(tmp_path)
+
+
+def test_socks_at_the_healthy_grip_are_none_and_less_grip_costs(monkeypatch):
+  """Cars of two seeds at three coefficients in one program: the friction that MuJoCo gets, and cars without any fault beside the first column."""
+  from mjx_cl.config import PRESETS
+  from mjx_cl.dreamer.agent import Agent
+  from mjx_cl.rollout import Rollout, nest, start
+  socks = load("socks")
+  monkeypatch.setattr(socks, "CHUNK", 20)
+  env = envs.make("car_real")
+  agent = Agent(PRESETS["tiny"].dreamer, len(env.spec.obs), len(env.spec.act))
+  params = jax.vmap(lambda k: agent.init(k).params)(jax.random.split(jax.random.key(0), 2))
+  runner = types.SimpleNamespace(trained=types.SimpleNamespace(agent=agent), acting=params)
+  seen = []
+
+  class Watched(Rollout):
+    def __init__(self, *args):
+      super().__init__(*args)
+      chunk = self.chunk
+      self.chunk = lambda params, streams, length: seen.append((self, streams)) or chunk(params, streams, length)
+  monkeypatch.setattr(socks, "Rollout", Watched)
+  grips = (0.65, 0.3, 0.1)
+  reward, crashes = socks.drive(runner, [100, 101], grips, drives=3, steps=40)
+  assert reward.shape == crashes.shape == (2, 3) and np.isfinite(reward).all() and (crashes >= 0).all()
+  rollout, streams = seen[-1]
+  mj = jax.vmap(jax.vmap(lambda s: rollout._drive(s, s.key, jnp.zeros(2))[1].model))(streams).mj
+  wheel = {side: np.asarray(mj["geom_friction"])[..., env.mj_model.geom(f"wheel_{side}").id, 0] for side in ("front_left", "rear_right")}
+  np.testing.assert_allclose(wheel["rear_right"], np.tile(np.repeat(grips, 3).reshape(3, 3), (2, 1)), rtol=1e-6)  # float32
+  assert (wheel["front_left"] == wheel["front_left"][0, 0]).all()
+  none = faults.none(env)
+  streams = nest(lambda k: start(env, agent, none, k), 0, 0)(jnp.stack([jax.random.split(jax.random.fold_in(jax.random.key(s), socks.KEY), 3) for s in (100, 101)]))
+  rollout, own = Rollout(env, agent, none), []
+  for _ in range(2):
+    streams, rows = rollout.chunk(params, streams, 20)
+    own.append(np.asarray(rows.reward).mean((0, 2)))
+  np.testing.assert_allclose(reward[:, 0], np.mean(own, 0), rtol=1e-6)
+  assert (reward[:, 1:] != reward[:, :1]).all()

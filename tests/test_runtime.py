@@ -61,6 +61,30 @@ def test_freed_memory_is_kept_unless_the_user_has_decided(keeps):
   assert (int(out.stdout) < 4) is keeps
 
 
+GIVEN_BACK = """
+import os
+from mjx_cl import runtime
+assert runtime.keep_memory()
+import numpy as np
+held = lambda: int(open("/proc/self/statm").read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
+before = held()
+blocks = [np.ones(2**20, np.uint8) for _ in range(256)]
+del blocks
+kept = held()
+assert runtime.give_back()
+print(before, kept, held())
+"""
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="glibc's allocator")
+def test_kept_memory_is_given_back_when_asked():
+  """256 MiB that were freed stay with the process, and leave it at `give_back`."""
+  env = {k: v for k, v in os.environ.items() if not k.startswith("MALLOC_")}
+  out = subprocess.run([sys.executable, "-c", GIVEN_BACK], env=env, capture_output=True, text=True, check=True)
+  before, kept, after = map(float, out.stdout.split())
+  assert kept > before + 200 and after < before + 50
+
+
 def test_cache_dir_follows_the_environment(monkeypatch, tmp_path):
   monkeypatch.setenv("MJX_CL_CACHE", str(tmp_path / "here"))
   assert runtime.cache_dir() == tmp_path / "here"
