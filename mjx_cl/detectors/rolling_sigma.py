@@ -97,11 +97,12 @@ def rolling_sigma(window: int = 1000, threshold: float = 3.0, patience: int = 1,
     put = lambda array, at, value, where: array.at[jnp.where(known & where, at, array.shape[0])].set(value, mode="drop")
     recent = put(state.recent, state.count % smoothing, jnp.log(jnp.maximum(x, 1e-9)) if log else x, True)
     y = jnp.sum(recent) / jnp.minimum(state.count + 1, smoothing)
+    buffer = put(state.buffer, state.count % held, y, True)  # before it is read, else XLA copies it; what leaves it here nothing needs
     end = state.count - lag  # the window is samples [begin, end), of which those below 0 are none
     begin = end - window
     within = lambda i: i & (size - 1)
     # where it ends: the sample that enters, and a block that it completes
-    tail = grown(state.tail, within(end - 1), state.buffer[(end - 1) % held])
+    tail = grown(state.tail, within(end - 1), buffer[(end - 1) % held])
     tail = jax.tree.map(lambda a: jnp.where(end > 0, a, 0.0), tail)
     complete, at = (end > 0) & (within(end) == 0), ((end >> shift) - 1) % number
     blocks = jax.tree.map(lambda a, b: put(a, at, b, complete), state.blocks, tail)
@@ -109,7 +110,7 @@ def rolling_sigma(window: int = 1000, threshold: float = 3.0, patience: int = 1,
     # where it begins: while it leaves one block, the ends of the next are found, from the last sample backwards
     back, following = within(begin), (begin >> shift) + 1
     last = size - 1 - back
-    growing = grown(state.growing, back, state.buffer[(following * size + last) % held])
+    growing = grown(state.growing, back, buffer[(following * size + last) % held])
     heads = put(state.heads, (following & 1) * size + last, jnp.stack(growing), begin >= -size)
     first = jnp.maximum(begin, 0)
     head = Moments(*heads[((first >> shift) & 1) * size + within(first)])
@@ -125,7 +126,7 @@ def rolling_sigma(window: int = 1000, threshold: float = 3.0, patience: int = 1,
     ready = known & (end >= warmup)
     run = jnp.where(ready & (score > threshold), state.run + 1, 0)
     keep = lambda new, old: jax.tree.map(lambda a, b: jnp.where(known, a, b), new, old)
-    new = RollingSigmaState(recent, put(state.buffer, state.count % held, y, True), keep(state.count + 1, state.count), keep(run, state.run), blocks, numbers,
+    new = RollingSigmaState(recent, buffer, keep(state.count + 1, state.count), keep(run, state.run), blocks, numbers,
                             keep(tail, state.tail), heads, keep(growing, state.growing))
     return new, Alarm(known & (run == patience), jnp.where(ready, score, jnp.nan))
 
