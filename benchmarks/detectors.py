@@ -90,7 +90,8 @@ def main() -> None:
 
   xs = jax.random.normal(jax.random.key(0), (samples, streams))
   scalars = {name: f for name, f in detectors.DETECTORS.items() if getattr(f, "takes", "residual") == "scalar"}
-  built = {name: f() for name, f in scalars.items()} | {"cusum behind whitening of order 8": detectors.whitened(detectors.cusum(), 8)}
+  rolling = {"rolling_sigma_plain": detectors.rolling_sigma(), "rolling_sigma": detectors.rolling_sigma(**detectors.CALIBRATED["walker"])}  # of one residual
+  built = rolling | {name: f() for name, f in scalars.items()} | {"cusum behind whitening of order 8": detectors.whitened(detectors.cusum(), 8)}
   against = {name: scalars[name](warmup=0) for name in ("page_hinkley", "cusum", "ewma", "adwin")}  # no more work than the others do
   programs, taken = {}, {}
   for name, detector in (built | {f"{name}, standardised input": d for name, d in against.items()}).items():
