@@ -14,6 +14,7 @@ import itertools
 import json
 import os
 import pathlib
+import re
 import shutil
 import time
 import tomllib
@@ -87,7 +88,13 @@ def suite(name: str, change: dict | None = None) -> Suite:
     raise UserError(f"{where}: it needs tables [entries.NAME]")
   parts: list[Part] = []
   for key, entry in entries.items():
+    if not re.fullmatch(r"\w[\w .,=+-]*", key):
+      raise UserError(f"{where}: entry {key!r} is a folder's name and takes letters, digits and _ - + . , = alone")
     parts += grid(f"{where}, entry {key!r}", key, merged(merged(data.get("run", {}), entry), change or {}))
+  names = [p.name for p in parts]
+  twice = next((n for k, n in enumerate(names) if n in names[:k]), None)
+  if twice:
+    raise UserError(f"{where}: part {twice} is there twice")
   return Suite(str(data["name"]), str(data.get("about", "")), tuple(parts))
 
 
@@ -129,6 +136,8 @@ def config(where: str, values: dict) -> RunConfig:
     raise UserError(f"{where}: unknown setting {', '.join(map(repr, unknown))}; it takes: {', '.join(sorted(known))}")
   if "env" not in values:
     raise UserError(f"{where}: it needs an env")
+  check_kinds(where, RunConfig, values)
+  check_kinds(where, AdaptConfig, values.get("adapt", {}), "adapt.")
   try:
     if "adapt" in values:
       values["adapt"] = replace(AdaptConfig(), **values["adapt"])
@@ -139,6 +148,21 @@ def config(where: str, values: dict) -> RunConfig:
     raise UserError(f"{where}: {e}") from None
   except TypeError as e:
     raise UserError(f"{where}: a value of the wrong kind ({e})") from None
+
+
+def check_kinds(where: str, of, values, before: str = "") -> None:
+  """Raises UserError where a setting of the dataclass `of` has a value of another kind than its annotation says."""
+  kinds = {"bool": (bool,), "int": (int,), "float": (int, float), "str": (str,)}
+  for field in dataclasses.fields(of):
+    words = [w.strip() for w in str(field.type).split("|")]
+    allowed = tuple(k for w in words for k in kinds.get(w, ()))
+    if field.name not in values or not allowed or len(allowed) < len([w for w in words if w != "None"]):
+      continue  # not given, or of a kind of its own
+    value = values[field.name]
+    if value is None and "None" in words:
+      continue
+    if not isinstance(value, allowed) or isinstance(value, bool) and bool not in allowed:
+      raise UserError(f"{where}: {before}{field.name} takes {' or '.join(w for w in words if w != 'None')}; got {value!r}")
 
 
 # ---- the plan ------------------------------------------------------------------------------------------------------------------------

@@ -8,6 +8,7 @@ import contextlib
 import dataclasses
 import io
 import json
+import math
 import os
 import pathlib
 import re
@@ -172,6 +173,8 @@ class Leaderboard:
   streams: Positional[str | None] = None
   """Folder of `mjx-cl record`; default: the set that ships."""
   out: str = "runs/leaderboard"
+  overwrite: bool = False
+  """Replace an earlier board in --out."""
   """Result folder."""
   robot: tuple[str, ...] = ()
   """Only these robots of the set."""
@@ -376,9 +379,27 @@ def clock(seconds: float) -> str:
   return f"{seconds // 3600}:{seconds % 3600 // 60:02d}:{seconds % 60:02d}" if seconds >= 3600 else f"{seconds // 60}:{seconds % 60:02d}"
 
 
+RESULT = []  # standard output of a command with --json, while whatever else is printed goes to standard error
+
+
 def emit(value) -> None:
+  """The one JSON value of a command."""
   from mjx_cl.store import plain
-  print(json.dumps(value, allow_nan=False, default=plain))
+  print(json.dumps(value, allow_nan=False, default=plain), file=RESULT[-1] if RESULT else None)
+
+
+@contextlib.contextmanager
+def apart(command):
+  """With --json nothing but `emit` reaches standard output, also not what a user's detector or robot prints."""
+  if not getattr(command, "json", False):
+    yield
+    return
+  RESULT.append(sys.stdout)
+  try:
+    with contextlib.redirect_stdout(sys.stderr):
+      yield
+  finally:
+    RESULT.pop()
 
 
 class RunDisplay:
@@ -434,8 +455,12 @@ def do_run(args: Run) -> None:
       arms=args.arm, agent=args.agent, physics=args.physics, form=args.form, actions=args.actions, deterministic=args.deterministic, adapt=args.adapt,
       snapshots=args.snapshots, keep=args.keep)
   from mjx_cl import run
+  for text in run.doubts(config):
+    say(f"note: {text}")
   with RunDisplay() as display:
     summary = run.execute(config, args.out, args.resume, args.overwrite, display)
+  if args.keep and not os.path.isdir(os.path.join(args.out, "agents")):
+    say("note: --keep wrote no agent, since no stream has finetuned")
   if args.json:
     emit(summary)
   else:
@@ -466,22 +491,27 @@ def do_bench(args: Bench) -> None:
   k, sign, n = args.shard.partition("/")
   if not (sign and k.isdigit() and n.isdigit()):
     raise UserError(f"--shard takes K/N, such as 0/2; got {args.shard!r}")
+  if args.jobs is not None and args.jobs < 1:
+    raise UserError(f"--jobs must be above 0; got {args.jobs}")
+  for folder in args.merge:
+    if not os.path.isdir(folder):
+      raise UserError(f"--merge: no folder {folder}")
   parts = bench.pick(suite.parts, args.only, (int(k), int(n)))
   out = pathlib.Path(args.out or f"runs/bench/{suite.name}")
   done = {p.name for p in parts if bench.finished(out, p)}
   estimates = bench.estimates(parts)
+  for part in parts:  # whatever can be refused is refused before the first part runs
+    if part.name not in done:
+      bench.check(part)
   if args.plan:
     if args.json:
       emit([{"part": p.name, "finished": p.name in done, **estimates[p.name]._asdict()} for p in parts])
     else:
       print("\n".join(plan_lines(suite, parts, done, estimates)))
     return
-  for part in parts:  # whatever can be refused is refused before the first part runs
-    if part.name not in done:
-      bench.check(part)
   for folder in args.merge:
-    if not os.path.isdir(folder):
-      raise UserError(f"--merge: no folder {folder}")
+    if not any(os.path.isfile(os.path.join(folder, p.name, "config.json")) for p in parts):
+      raise UserError(f"--merge: {folder} holds none of the parts {', '.join(p.name for p in parts[:3])}{' ...' * (len(parts) > 3)}; it takes the OUT of a bench of this suite")
   try:
     out.mkdir(parents=True, exist_ok=True)
   except OSError as e:
@@ -600,6 +630,8 @@ def do_eval(args: Eval) -> None:
   env = envs.make(args.env, args.physics)
   trained = agents.load(args.agent, args.env, len(env.spec.obs), len(env.spec.act))
   result = evaluate.evaluate(env, trained.agent, trained.train.params, args.episodes, args.seed, int(trained.card.get("repeat", 1)), args.deterministic)
+  if not math.isfinite(result["return_mean"]):
+    raise FileError(f"agent {trained.path}: its return on {args.env} is {result['return_mean']}; its weights or the robot give what is no number")
   result = {"env": args.env, "agent": os.path.basename(os.path.normpath(trained.path)), **result}
   if args.json:
     emit(result)
@@ -661,7 +693,6 @@ def do_record(args: Record) -> None:
 
 
 def do_leaderboard(args: Leaderboard) -> None:
-  import math
   from mjx_cl import leaderboard, store, streams, submissions
   for flag, given, other in (("--set", args.set, args.add), ("--threshold", args.threshold, args.add), ("--log", args.log, args.add), ("--name", args.name, args.add or args.submit)):
     if given and not other:
@@ -674,6 +705,10 @@ def do_leaderboard(args: Leaderboard) -> None:
     files = submissions.export(held, args.export, robots)
     emit(files) if args.json else print("\n".join(files))
     return
+  if os.path.exists(args.out) and not os.path.isdir(args.out):
+    raise UserError(f"--out {args.out} is a file")
+  if os.path.exists(os.path.join(args.out, "leaderboard.json")) and not args.overwrite:
+    raise UserError(f"{args.out} holds a leaderboard; give --overwrite to replace it, or another --out")
   known, extra = leaderboard.variants(), []
   for name in args.detector:
     if name != "none":
@@ -825,11 +860,12 @@ def do_report(args: Report) -> None:
 def do_list(args: List) -> None:
   from mjx_cl import agents, bench, detectors, envs, fault_presets, faults, memory, streams
   first = lambda f: (f.__doc__ or "").strip().split("\n")[0]
-  tables = {"envs": {k: first(v) for k, v in envs.ENVS.items()}, "faults": {k: faults.about(k) for k in faults.FAULTS},
-            "detectors": {k: first(v) for k, v in detectors.DETECTORS.items()}, "presets": {k: p.about for k, p in PRESETS.items()},
-            "agents": {k: "shipped" for k in agents.shipped()}, "arms": {k: a.about for k, a in ARMS.items()}, "fault-presets": {k: f"{p.about} ({p.source})" for k, p in fault_presets.PRESETS.items()}, "schedules": fault_presets.SCHEDULES,
-            "sizes": memory.table(), "suites": streams.about(), "benches": bench.shipped()}
-  chosen = tables if args.what == "all" else {args.what: choose("list", args.what, tables)}
+  tables = {"envs": lambda: {k: first(v) for k, v in envs.ENVS.items()}, "faults": lambda: {k: faults.about(k) for k in faults.FAULTS},
+            "detectors": lambda: {k: first(v) for k, v in detectors.DETECTORS.items()}, "presets": lambda: {k: p.about for k, p in PRESETS.items()},
+            "agents": lambda: {k: "shipped" for k in agents.shipped()}, "arms": lambda: {k: a.about for k, a in ARMS.items()},
+            "fault-presets": lambda: {k: f"{p.about} ({p.source})" for k, p in fault_presets.PRESETS.items()}, "schedules": lambda: fault_presets.SCHEDULES,
+            "sizes": memory.table, "suites": streams.about, "benches": bench.shipped}
+  chosen = {k: make() for k, make in (tables if args.what == "all" else {args.what: choose("list", args.what, tables)}).items()}
   if args.json:
     emit(chosen)
     return
@@ -890,6 +926,11 @@ def attempt(do, again=lambda: "") -> int:
   except OSError as e:
     say(f"mjx-cl: {e.strerror or e}{f': {e.filename}' if e.filename else ''}")
     return FileError.exit_code
+  except (MemoryError, RuntimeError) as e:  # XLA's error is a RuntimeError
+    if isinstance(e, RuntimeError) and "RESOURCE_EXHAUSTED" not in str(e):
+      raise
+    say(f"mjx-cl: out of memory: {' '.join(str(e).split())[:200]}; fewer --seeds, arms or a smaller batch need less")
+    return FileError.exit_code
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -902,7 +943,8 @@ def main(argv: list[str] | None = None) -> int:
     if not isinstance(command, (Plot, Query, Report)):
       from mjx_cl import runtime
       runtime.setup()
-    DO[type(command)](command)
+    with apart(command):
+      DO[type(command)](command)
 
   def again():
     kind = type(command) if command else None

@@ -222,6 +222,8 @@ class AdaptConfig:
     positive(self, "ratio", "start_windows", "trend", "fluctuation", "excess", "near", "least", "give_up", "budget", "refit", "average", "period",
              "period_steps", "random_steps")
     fraction(self, "average")
+    if not self.warmup >= 0:
+      raise UserError(f"warmup must be 0 or above; got {self.warmup}")
     if self.patience < 4:
       raise UserError(f"patience must be at least 4 chunks; got {self.patience}")
     if self.period_steps >= self.period:

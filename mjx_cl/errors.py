@@ -6,6 +6,10 @@ class UserError(Exception):
   exit_code = 2
 
 
+class PluginError(UserError):
+  """What goes wrong inside a robot, fault or detector of another package."""
+
+
 class FileError(UserError):
   """A broken, foreign or missing file, a full disk, a numeric failure: exit code 1."""
   exit_code = 1

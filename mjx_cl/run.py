@@ -568,14 +568,31 @@ def summarise(rows: list[dict], config: RunConfig, control_s: float) -> dict:
   return out
 
 
+def doubts(config: RunConfig) -> list[str]:
+  """What a user may not have meant, one line each."""
+  warmup = config.adapt.warmup
+  if warmup >= config.steps:
+    return [f"the run ends at step {config.steps:,}, within adapt.warmup={warmup:,}: no alarm can start anything"]
+  if warmup > config.onset and any(ARMS[arm].trigger.listens for arm in config.arms):
+    return [f"onset {config.onset:,} lies within adapt.warmup={warmup:,}: an alarm before its end starts nothing, and without a reward before the onset no stream "
+            "counts as affected or recovered; a later --onset or a smaller --adapt.warmup would do"]
+  return []
+
+
 def execute(config: RunConfig, out, resume: bool = False, overwrite: bool = False, progress=lambda p: None, save_every_s: float = 60.0) -> dict:
   """Runs `config` into `out` and returns summary.json's value. A kill at any moment loses at most `save_every_s` seconds of work."""
   out = pathlib.Path(out)
+  fresh = not out.exists()
   state = store.claim_folder(out, resume, overwrite)
   if state == "done":
     check_same(out, {k: v for k, v in identity(config).items() if k != "physics"})  # `auto` is resolved there
     return json.loads((out / "summary.json").read_text())
-  runner = Runner(config, out)  # refuses wrong names and broken agents before anything of an earlier run is removed
+  try:
+    runner = Runner(config, out)  # refuses wrong names and broken agents before anything of an earlier run is removed
+  except UserError:
+    if fresh and not any(out.iterdir()):
+      out.rmdir()
+    raise
   values = runner.config_dict()
   if state == "resume":
     check_same(out, values)

@@ -160,6 +160,9 @@ def _least(alarms: Callable[[float], int], target: float, what: str) -> float:
   if high == 1.0:
     while high > 1 / HIGHEST and alarms(high / 8) <= target:
       high /= 8
+    if high <= 1 / HIGHEST:
+      raise UserError(f"{what}: even at {high:g} there are no more than the {target:.0f} alarms asked for, so that nothing is calibrated; its values lie above 0, larger ones mean "
+                      "fewer alarms: give the class a setting of that kind (a score that is negative wants an offset)")
   low = high / 8
   while high / low > FINE:
     middle = math.sqrt(low * high)

@@ -15,6 +15,7 @@ from mjx_cl import detectors, leaderboard, oracles, recording, store, streams, s
 from mjx_cl.detectors import Alarm, Detector
 from mjx_cl.detectors.host import HostDetector
 from mjx_cl.errors import FileError, UserError
+from mjx_cl.plugins import Registry
 from mjx_cl.scoring import healthy
 
 NEVER = [leaderboard.entry("never", {})]
@@ -248,12 +249,12 @@ def test_a_plug_in_is_scored(small, monkeypatch):  # noqa: F811
     assert row[k] == other[k], k  # the same detector by two ways in
 
 
-@pytest.mark.parametrize("load, text", [(lambda: 1 / 0, "cannot be loaded: ZeroDivisionError"), (lambda: 3, "is no factory")])
+@pytest.mark.parametrize("load, text", [(lambda: 1 / 0, "cannot be loaded: ZeroDivisionError"), (lambda: 3, "is nothing that can be called")])
 def test_plug_ins_that_cannot_be_loaded_get_one_line(monkeypatch, load, text):
   entry = type("Entry", (), {"name": "theirs", "value": "theirs:detector", "load": staticmethod(load)})
   monkeypatch.setattr(importlib.metadata, "entry_points", lambda group: [entry])
   with pytest.raises(UserError, match=f"detector 'theirs' of theirs:detector {text}") as e:
-    detectors._plugins()
+    Registry("mjx_cl.detectors", "detector", {"cusum": detectors.cusum})["cusum"]
   assert one_line(e)
 
 

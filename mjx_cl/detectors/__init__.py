@@ -1,8 +1,9 @@
 """Change detectors: pure `init` / `update` pairs over one stream. `DETECTORS` is the one table; entry points `mjx_cl.detectors` join it."""
 from __future__ import annotations
 
-import importlib.metadata
 import inspect
+
+import jax
 
 from mjx_cl.detectors import combine
 from mjx_cl.detectors import references
@@ -27,6 +28,7 @@ from mjx_cl.detectors.surprise import surprise
 from mjx_cl.detectors.shiryaev_roberts import shiryaev_roberts
 from mjx_cl.detectors.z_score import z_score
 from mjx_cl.errors import UserError, choose
+from mjx_cl.plugins import Registry
 
 
 def paper_rule(threshold: float = 3.0, threshold_rpr: float | None = None, unit_rpr: float = 1.0, **settings) -> Detector:
@@ -71,21 +73,15 @@ DETECTORS |= {"hotelling": hotelling, "mewma": mewma, "max_variables": max_varia
 DETECTORS |= {"never": references.never, "always": references.always, "periodic": references.periodic, "random": references.random}
 
 
-def _plugins() -> dict:
-  found = {}
-  for entry in importlib.metadata.entry_points(group="mjx_cl.detectors"):
-    if entry.name in DETECTORS or entry.name in found:
-      raise UserError(f"detector {entry.name!r} of {entry.value} is there already; a plug-in must have a name of its own")
-    try:
-      found[entry.name] = entry.load()
-    except Exception as e:  # whatever a foreign module raises
-      raise UserError(f"detector {entry.name!r} of {entry.value} cannot be loaded: {type(e).__name__}: {' '.join(str(e).split())}") from e
-    if not callable(found[entry.name]):
-      raise UserError(f"detector {entry.name!r} of {entry.value} is no factory: a function of settings that gives a Detector")
-  return found
+DETECTORS = Registry("mjx_cl.detectors", "detector", DETECTORS)
 
 
-DETECTORS |= _plugins()
+def known_settings(build) -> list[str]:
+  """Names of the settings of a factory; those of the paper's rule go on to `rolling_sigma`."""
+  own = inspect.signature(build).parameters.values()
+  more = [paper_rule, rolling_sigma] if build in (calibrated_rule, paper_rule) else []
+  found = [p.name for f in (build, *more) for p in inspect.signature(f).parameters.values() if p.kind is not p.VAR_KEYWORD]
+  return list(dict.fromkeys(found)) + ["..."] * (not more and any(p.kind is p.VAR_KEYWORD for p in own))
 
 
 def make(name: str, channel: str | None = None, log: bool | None = None, whiten: int = 0, patience: int = 1, cool_down: int = 0,
@@ -118,11 +114,13 @@ def make(name: str, channel: str | None = None, log: bool | None = None, whiten:
       detector = build(**(settings | ({} if patience == 1 else {"patience": patience})))
       return combine.cool_down(detector, cool_down) if cool_down else detector
     detector = build(**settings) if patience == 1 else combine.patience(build, patience, **settings)
-  except TypeError as e:
+  except UserError:
+    raise
+  except (TypeError, ValueError) as e:
+    values = ", ".join(f"{k}={v!r}" for k, v in settings.items() if not isinstance(v, jax.core.Tracer))
     if "argument" not in str(e):
-      raise
-    known = ", ".join(p for p in inspect.signature(build).parameters)
-    raise UserError(f"detector {name!r}: {e}; its settings are: {known}") from None
+      raise UserError(f"detector {name!r}: a setting of the wrong kind, {values or 'none given'} ({e}); its settings are: {', '.join(known_settings(build))}") from None
+    raise UserError(f"detector {name!r}: {e}; its settings are: {', '.join(known_settings(build))}") from None
   if whiten:
     detector = whitened(detector, whiten)
   members = [on(c, detector, c != "reward" if log is None else log) for c in (channel or "opr+rpr").split("+")]

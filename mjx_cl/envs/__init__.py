@@ -1,28 +1,34 @@
-"""Robots and their tasks. `ENVS` is the one table; `make(name)` builds one."""
+"""Robots and their tasks. `ENVS` is the one table, which entry points `mjx_cl.envs` join; `make(name)` builds one."""
 from __future__ import annotations
 
-import importlib.metadata
+import inspect
 
 from mjx_cl.envs.car import Car
 from mjx_cl.envs.car_real import CarReal
 from mjx_cl.envs.quadruped import Quadruped
 from mjx_cl.envs.walker import Walker
-from mjx_cl.errors import UserError, choose
+from mjx_cl.errors import PluginError, UserError, choose
+from mjx_cl.plugins import Registry, line
 
-ENVS = {"walker": Walker, "quadruped": Quadruped, "car": Car, "car_real": CarReal}
-
-
-def _plugins() -> None:
-  """Adds the robots of other packages (entry-point group `mjx_cl.envs`); a name that is taken is an error."""
-  for entry in importlib.metadata.entry_points(group="mjx_cl.envs"):
-    if entry.name in ENVS:
-      raise UserError(f"environment {entry.name!r} of {entry.value} has a name that is taken")
-    ENVS[entry.name] = entry.load()
-
-
-_plugins()
+ENVS = Registry("mjx_cl.envs", "environment", {"walker": Walker, "quadruped": Quadruped, "car": Car, "car_real": CarReal})
 
 
 def make(name: str, physics: str = "auto"):
-  """Builds environment `name` on a physics backend (`auto`, `native` or `mjx`)."""
-  return choose("environment", name, ENVS)(physics=physics)
+  """Builds environment `name` on a physics backend (`auto`, `native` or `mjx`). A class that takes no `physics` has none to choose from.
+
+  Raises:
+    UserError for an unknown name, a backend that the robot has not, and whatever goes wrong in a robot of another package.
+  """
+  build = choose("environment", name, ENVS)
+  if name in ENVS.own:
+    return build(physics=physics)
+  try:
+    parameters = inspect.signature(build).parameters.values()
+    takes = any(p.name == "physics" or p.kind is p.VAR_KEYWORD for p in parameters)
+    if not takes and physics != "auto":
+      raise UserError(f"environment {name!r} has no physics backend to choose; leave out --physics {physics}")
+    return build(physics=physics) if takes else build()
+  except UserError:
+    raise
+  except Exception as e:  # whatever a foreign class raises
+    raise PluginError(f"environment {name!r} cannot be built: {line(e)}") from e

@@ -5,13 +5,12 @@ severities, onsets, schedules and targets are arrays, so any mix over a batch of
 """
 from __future__ import annotations
 
-import importlib.metadata
 import inspect
 import re
 
 import jax.numpy as jnp
 
-from mjx_cl.errors import UserError, choose
+from mjx_cl.errors import PluginError, UserError, choose
 from mjx_cl.faults.actuator import ACTUATOR
 from mjx_cl.faults.base import (Fault, Injection, Ports, State, as_tuple, begin, drive, fault, none, owned_model, sense)
 from mjx_cl.faults.body import BODY
@@ -20,26 +19,15 @@ from mjx_cl.faults.schedule import FOREVER, SCHEDULES, Plan, plan
 from mjx_cl.faults.sensor import SENSOR
 from mjx_cl.faults.task import TASK
 from mjx_cl.faults.transfer import TRANSFER
+from mjx_cl.plugins import Registry, line
 
 FAMILIES = {"actuator": ACTUATOR, "body": BODY, "contact": CONTACT, "sensor": SENSOR, "transfer": TRANSFER, "task": TASK}
-FAULTS = {"none": none} | {name: make for family in FAMILIES.values() for name, make in family.items()}
-
-
-def _plugins() -> None:
-  """Adds the faults of other packages (entry-point group `mjx_cl.faults`); a name that is taken is an error."""
-  for entry in importlib.metadata.entry_points(group="mjx_cl.faults"):
-    if entry.name in FAULTS:
-      raise UserError(f"fault {entry.name!r} of {entry.value} has a name that is taken")
-    FAULTS[entry.name] = entry.load()
-    FAMILIES.setdefault("plugin", {})[entry.name] = FAULTS[entry.name]
-
-
-_plugins()
+FAULTS = Registry("mjx_cl.faults", "fault", {"none": none} | {name: make for family in FAMILIES.values() for name, make in family.items()})
 
 
 def family(name: str) -> str:
-  """Name of the family of fault `name`."""
-  return next((f for f, members in FAMILIES.items() if name in members), "none")
+  """Name of the family of fault `name`; those of other packages are of family `plugin`."""
+  return next((f for f, members in FAMILIES.items() if name in members), "plugin" if name in FAULTS.plugged() else "none")
 
 
 def about(name: str) -> str:
@@ -55,17 +43,33 @@ def make(name: str, env) -> Fault:
   """Builds fault `name` for the robot `env`.
 
   Raises:
-    UserError for an unknown name, or a fault that has nothing to act on in this robot.
+    UserError for an unknown name, a fault that has nothing to act on in this robot, and whatever goes wrong in one of another package.
   """
-  return choose("fault", name, FAULTS)(env)
+  build = choose("fault", name, FAULTS)
+  try:
+    return build(env)
+  except UserError:
+    raise
+  except AttributeError as e:
+    if getattr(e, "name", None) == "mj_model" and not hasattr(env, "mj_model"):
+      raise UserError(f"fault {name!r} acts on a MuJoCo model, which robot {env.spec.name!r} does not have") from None
+    if name in FAULTS.own:
+      raise
+    raise PluginError(f"fault {name!r} cannot be built for robot {env.spec.name!r}: {line(e)}") from e
+  except Exception as e:  # whatever a foreign function raises
+    if name in FAULTS.own:
+      raise
+    raise PluginError(f"fault {name!r} cannot be built for robot {env.spec.name!r}: {line(e)}") from e
 
 
 def available(env) -> dict[str, Fault]:
   """Every fault that `env` can have, by name."""
   out = {}
-  for name, build in FAULTS.items():
+  for name in FAULTS:
     try:
-      out[name] = build(env)
+      out[name] = make(name, env)
+    except PluginError:
+      raise
     except UserError:
       continue
   return out

@@ -1,0 +1,127 @@
+"""Robots, faults and detectors of other packages: the README's class as a robot, one module with all three, and broken ones."""
+import importlib.metadata
+import json
+import os
+import pathlib
+import re
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from mjx_cl import cli, detectors, envs, faults
+from mjx_cl.errors import PluginError, UserError
+from mjx_cl.plugins import Registry
+
+ROOT = pathlib.Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text()
+REACH = re.search(r"class Reach:.*?\n\n", README, re.S)[0]  # as a reader copies it
+PLUG = f'''import jax, jax.numpy as jnp
+from mjx_cl.detectors import Alarm, Detector, scalar
+from mjx_cl.faults.base import fault
+from mjx_cl.types import EnvState, Model, Spec, Step, Var
+
+{REACH}
+def sticky(env):
+  """The first command sticks at 0.
+
+  Severity: 1 holds it [1]. Target: the command. Owns `ctrl`. Source: made up.
+  """
+  return fault("sticky", env, ("ctrl",), ("all",), lambda hit, memory, severity, key, ports: (memory, {{"ctrl": ports.ctrl * (1.0 - severity)}}))
+
+@scalar
+def level(threshold: float = 3.0):
+  """A level."""
+  return Detector(lambda: (), lambda state, x: (state, Alarm(x > threshold, x)))
+
+def broken(env):
+  return 1 / 0
+'''
+
+
+@pytest.fixture
+def package(tmp_path):
+  """package(entries, code): environment variables in which a package `plug` with these entry points is installed."""
+  def make(entries: str, code: str = PLUG) -> dict:
+    (tmp_path / "plug.py").write_text(code)
+    info = tmp_path / "plug-1.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: plug\nVersion: 1\n")
+    (info / "entry_points.txt").write_text(entries)
+    return os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)]), "JAX_PLATFORMS": "cpu"}
+  return make
+
+
+def mjx(env, *argv):
+  return subprocess.run([sys.executable, "-m", "mjx_cl", *argv], env=env, capture_output=True, text=True, cwd=ROOT)
+
+
+def test_one_module_brings_robot_fault_and_detector(package):
+  """It imports this package's modules while these look for it, in whatever order the tables are used."""
+  env = package("[mjx_cl.envs]\nreach = plug:Reach\n[mjx_cl.faults]\nsticky = plug:sticky\n[mjx_cl.detectors]\nlevel = plug:level\n")
+  for what, name in (("envs", "reach"), ("faults", "sticky"), ("detectors", "level")):
+    out = mjx(env, "list", what, "--json")
+    assert out.returncode == 0 and name in json.loads(out.stdout)[what], out.stderr
+  code = """
+from mjx_cl import envs, faults, detectors
+env = envs.make("reach")
+print(type(env).__name__, faults.make("sticky", env).owns, faults.family("sticky"), "sticky" in faults.available(env), detectors.make("level", threshold=2.0) is not None)
+"""
+  out = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, cwd=ROOT)
+  assert out.stdout.split("\n")[0] == "Reach ('ctrl',) plugin True True", out.stderr
+  out = mjx(env, "eval", "reach", "--physics", "mjx")
+  assert out.returncode == 2 and out.stderr.strip().count("\n") == 0 and "no physics backend" in out.stderr
+
+
+@pytest.mark.parametrize("entries, argv, words", [
+    ("[mjx_cl.envs]\nx = nowhere:Robot\n", ("list", "envs"), "environment 'x' of nowhere:Robot cannot be loaded: ModuleNotFoundError"),
+    ("[mjx_cl.faults]\nboom = plug:broken\n", ("run", "walker", "--fault", "boom", "--out", os.devnull + "/x"), "fault 'boom' cannot be built for robot 'walker': ZeroDivisionError"),
+    ("[mjx_cl.faults]\ngear = plug:sticky\n", ("list", "faults"), "fault 'gear' of plug:sticky is there already")])
+def test_a_broken_plug_in_is_one_line(package, tmp_path, entries, argv, words):
+  out = mjx(package(entries), *[str(tmp_path / "out") if a.startswith(os.devnull) else a for a in argv])
+  assert out.returncode == 2 and words in out.stderr and out.stderr.strip().count("\n") == 0 and not out.stdout
+
+
+def test_what_is_not_used_breaks_nothing(package):
+  assert mjx(package("[mjx_cl.envs]\nx = nowhere:Robot\n"), "list", "detectors").returncode == 0
+
+
+def test_the_readme_robot_is_built_with_and_without_physics(monkeypatch):
+  space = {}
+  exec("import jax, jax.numpy as jnp\nfrom mjx_cl.types import EnvState, Model, Spec, Step, Var\n" + REACH, space)
+
+  class Choosy(space["Reach"]):
+    def __init__(self, physics="auto"):
+      self.physics = physics
+  entry = lambda name, value: type("Entry", (), {"name": name, "value": f"mine:{name}", "load": staticmethod(lambda: value)})
+  monkeypatch.setattr(importlib.metadata, "entry_points", lambda group: [entry("reach", space["Reach"]), entry("choosy", Choosy), entry("bad", lambda: 1 / 0)])
+  monkeypatch.setattr(envs, "ENVS", Registry("mjx_cl.envs", "environment", {name: dict.__getitem__(envs.ENVS, name) for name in envs.ENVS.own}))
+  robot = envs.make("reach")
+  state, obs = robot.init(robot.model, jax.random.key(0))
+  assert robot.step(robot.model, state, jnp.ones(1))[1].obs.shape == obs.shape == (2,)
+  assert envs.make("choosy", "native").physics == "native" and envs.ENVS.plugged() == ["reach", "choosy", "bad"]
+  with pytest.raises(UserError, match="no physics backend"):
+    envs.make("reach", "mjx")
+  with pytest.raises(PluginError, match="'bad' cannot be built: ZeroDivisionError"):
+    envs.make("bad")
+
+
+def test_a_registry_is_read_like_a_dict_and_filled_once(monkeypatch):
+  loads = []
+  entry = type("Entry", (), {"name": "b", "value": "mine:b", "load": staticmethod(lambda: loads.append(len(table)) or (lambda: "b"))})
+  monkeypatch.setattr(importlib.metadata, "entry_points", lambda group: [entry] if group == "g" else [])
+  table = Registry("g", "thing", {"a": print})
+  assert sorted({**table}) == ["a", "b"] and len(table) == 2 and "b" in table and table.get("c") is None and [*table.items()][0] == ("a", print)
+  assert loads == [1]  # what looks into the table while it is filled sees what is there
+  assert set(detectors.DETECTORS.own) <= set(detectors.DETECTORS) and faults.FAULTS.plugged() == []
+
+
+def test_settings_of_a_wrong_kind_are_one_line(capsys, tmp_path):
+  for argv, words in (((), "threshold='abc'"), (("--detector", "cusum"), "threshold='abc'"), (("--detector", "ewma"), "threshold='abc'")):
+    assert cli.main(["run", "walker", "--set", "threshold=abc", "--out", str(tmp_path / "r"), *argv]) == 2
+    err = capsys.readouterr().err
+    assert words in err and "its settings are" in err and err.strip().count("\n") == 0
+  assert cli.main(["run", "walker", "--set", "foo=3", "--out", str(tmp_path / "r")]) == 2
+  assert "window" in (err := capsys.readouterr().err) and "threshold_rpr" in err and not (tmp_path / "r").exists()
