@@ -457,6 +457,7 @@ def do_run(args: Run) -> None:
   from mjx_cl import run
   for text in run.doubts(config):
     say(f"note: {text}")
+  say(f"{len(config.arms) * config.seeds} streams of {config.steps:,} control steps; what is not compiled yet is compiled first, a minute or two")
   with RunDisplay() as display:
     summary = run.execute(config, args.out, args.resume, args.overwrite, display)
   if args.keep and not os.path.isdir(os.path.join(args.out, "agents")):
@@ -825,7 +826,7 @@ def do_query(args: Query) -> None:
   if args.json:
     for k, name in enumerate(names):  # two columns of one name would be one in JSON
       names[k] = name if name not in names[:k] else f"{name}_{k}"
-    print(json.dumps([{n: None if isinstance(x, float) and not math.isfinite(x) else x for n, x in zip(names, r)} for r in rows], default=str))
+    emit(json.loads(json.dumps([{n: None if isinstance(x, float) and not math.isfinite(x) else x for n, x in zip(names, r)} for r in rows], default=str)))
     return
   from rich.console import Console
   from rich.table import Table

@@ -104,6 +104,10 @@ fault = ["walker/gear-half", "none"]
 
 BAD = {
     "unknown suite": (None, ["papre", "paper"]),
+    "entry outside": ('name = "x"\n[entries."../../evil"]\nenv = "walker"', ["../../evil", "letters, digits"]),
+    "a truth for a number": ('name = "x"\n[entries.a]\nenv = "walker"\nseverity = true', ["severity takes float", "True"]),
+    "a word in adapt": ('name = "x"\n[entries.a]\nenv = "walker"\n[entries.a.adapt]\nbudget = "long"', ["adapt.budget takes int", "'long'"]),
+    "twice": ('name = "x"\n[entries.a]\nenv = "walker"\nseverity = [0.5, 0.5]', ["a/severity=0.5", "twice"]),
     "no TOML": ("name = ", ["TOML"]),
     "unknown key": ('name = "x"\nruns = 1\n[entries.a]\nenv = "walker"', ["runs", "entries"]),
     "no name": ('[entries.a]\nenv = "walker"', ["no name"]),
@@ -112,7 +116,7 @@ BAD = {
     "unknown setting of adapt": ('name = "x"\n[entries.a]\nenv = "walker"\n[entries.a.adapt]\nrate = 1', ["'a'", "rate", "ratio"]),
     "no robot": ('name = "x"\n[entries.a]\nsteps = 5', ["env"]),
     "out of range": ('name = "x"\n[entries.a]\nenv = "walker"\nseverity = [0.5, 1.5]', ["severity", "1.5"]),
-    "wrong kind": ('name = "x"\n[entries.a]\nenv = "walker"\nsteps = "many"', ["'a'", "kind"]),
+    "wrong kind": ('name = "x"\n[entries.a]\nenv = "walker"\nsteps = "many"', ["'a'", "steps takes int", "'many'"]),
     "empty list": ('name = "x"\n[entries.a]\nenv = "walker"\nseverity = []', ["severity", "empty"]),
     "unknown robot": ('name = "x"\n[entries.a]\nenv = "wlker"', ["wlker", "walker"]),
     "unknown fault": ('name = "x"\n[entries.a]\nenv = "walker"\nfault = "geer"', ["geer", "gear"]),

@@ -278,6 +278,8 @@ def test_the_threshold_of_a_class_is_found_at_any_scale():
     assert (scale * score > value).sum() <= 20 < (scale * score > value / 1.01).sum() + 3 and len(calls) < 25
   with pytest.raises(UserError, match="--threshold x: .*larger values must mean fewer alarms"):
     submissions._least(lambda v: 1000, 20, "--threshold x")
+  with pytest.raises(UserError, match="--threshold x: even at .* nothing is calibrated"):  # a score that is always below 0
+    submissions._least(lambda v: 0, 20, "--threshold x")
 
 
 # ---- files of scores -----------------------------------------------------------------------------------------------------------------

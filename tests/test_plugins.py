@@ -125,3 +125,56 @@ def test_settings_of_a_wrong_kind_are_one_line(capsys, tmp_path):
     assert words in err and "its settings are" in err and err.strip().count("\n") == 0
   assert cli.main(["run", "walker", "--set", "foo=3", "--out", str(tmp_path / "r")]) == 2
   assert "window" in (err := capsys.readouterr().err) and "threshold_rpr" in err and not (tmp_path / "r").exists()
+
+
+def test_json_is_one_value_whatever_a_detector_prints(tmp_path, capsys):
+  """A user's class prints at every sample; standard output holds the JSON value alone, and is whole again afterwards."""
+  (tmp_path / "mine.py").write_text("class Prints:\n  def update(self, x):\n    print('seen', x)\n    return False\n")
+  rows = "\n".join(["a,b"] + [f"{k % 7},{k % 5}" for k in range(400)])
+  for name in ("log", "nominal"):
+    (tmp_path / f"{name}.csv").write_text(rows + "\n")
+  argv = ["detect", str(tmp_path / "log.csv"), "--nominal", str(tmp_path / "nominal.csv"), "--detector", f"{tmp_path}/mine.py:Prints", "--out", str(tmp_path / "out")]
+  assert cli.main([*argv, "--json"]) == 0
+  out, err = capsys.readouterr()
+  assert isinstance(json.loads(out), dict) and "seen 3.0" in err
+  assert cli.main(["list", "arms", "--json"]) == 0 and "detector" in json.loads(capsys.readouterr().out)["arms"]
+
+
+def test_what_a_run_takes_with_a_doubt_and_what_it_refuses(capsys, tmp_path):
+  from mjx_cl import run
+  from mjx_cl.config import AdaptConfig, RunConfig, replace
+  config = lambda **adapt: RunConfig("walker", onset=600, steps=1500, adapt=replace(AdaptConfig(), **adapt))
+  assert "onset 600 lies within adapt.warmup=1,000" in run.doubts(config())[0] and not run.doubts(config(warmup=500))
+  assert "the run ends at step 1,500, within" in run.doubts(config(warmup=5000))[0]
+  assert not run.doubts(replace(config(), arms=("none",)))  # nobody listens
+  for argv, words in ((("--adapt.warmup", "-1"), "warmup must be 0 or above"), (("--fault", "gera"), "unknown fault")):
+    assert cli.main(["run", "walker", "--out", str(tmp_path / "r"), *argv]) == 2
+    assert words in capsys.readouterr().err and not (tmp_path / "r").exists()  # an empty folder is no run either
+
+
+def test_a_board_is_not_replaced_unasked(capsys, tmp_path):
+  (tmp_path / "board").mkdir()
+  (tmp_path / "board" / "leaderboard.json").write_text("{}")
+  assert cli.main(["leaderboard", "--out", str(tmp_path / "board")]) == 2 and "--overwrite" in capsys.readouterr().err
+  (tmp_path / "file").write_text("")
+  assert cli.main(["leaderboard", "--out", str(tmp_path / "file")]) == 2 and "is a file" in capsys.readouterr().err
+  assert (tmp_path / "board" / "leaderboard.json").read_text() == "{}"
+
+
+def test_an_agent_of_nan_has_no_return(capsys, tmp_path, monkeypatch):
+  from mjx_cl import evaluate
+  monkeypatch.setattr(evaluate, "evaluate", lambda *a: {"return_mean": float("nan"), "return_iqm": float("nan"), "return_ci": None, "terminations": 0})
+  for more in ((), ("--json",)):
+    assert cli.main(["eval", "walker", "--episodes", "1", *more]) == 1
+    out, err = capsys.readouterr()
+    assert not out and "no number" in err and err.strip().count("\n") == 0
+
+
+def test_what_does_not_fit_is_one_line(capsys, monkeypatch):
+  """XLA's own words for it; other errors of the run time stay what they are."""
+  from mjx_cl import doctor
+  monkeypatch.setattr(doctor, "report", lambda: (_ for _ in ()).throw(RuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 8029696929576 bytes.")))
+  assert cli.main(["doctor"]) == 1 and "out of memory" in (err := capsys.readouterr().err) and err.strip().count("\n") == 0
+  monkeypatch.setattr(doctor, "report", lambda: (_ for _ in ()).throw(RuntimeError("a bug")))
+  with pytest.raises(RuntimeError, match="a bug"):
+    cli.main(["doctor"])
