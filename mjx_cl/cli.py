@@ -455,11 +455,8 @@ def do_run(args: Run) -> None:
       arms=args.arm, agent=args.agent, physics=args.physics, form=args.form, actions=args.actions, deterministic=args.deterministic, adapt=args.adapt,
       snapshots=args.snapshots, keep=args.keep)
   from mjx_cl import run
-  for text in run.doubts(config):
-    say(f"note: {text}")
-  say(f"{len(config.arms) * config.seeds} streams of {config.steps:,} control steps; what is not compiled yet is compiled first, a minute or two")
   with RunDisplay() as display:
-    summary = run.execute(config, args.out, args.resume, args.overwrite, display)
+    summary = run.execute(config, args.out, args.resume, args.overwrite, display, tell=say)
   if args.keep and not os.path.isdir(os.path.join(args.out, "agents")):
     say("note: --keep wrote no agent, since no stream has finetuned")
   if args.json:

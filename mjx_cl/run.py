@@ -579,7 +579,8 @@ def doubts(config: RunConfig) -> list[str]:
   return []
 
 
-def execute(config: RunConfig, out, resume: bool = False, overwrite: bool = False, progress=lambda p: None, save_every_s: float = 60.0) -> dict:
+def execute(config: RunConfig, out, resume: bool = False, overwrite: bool = False, progress=lambda p: None, save_every_s: float = 60.0,
+            tell=lambda text: None) -> dict:
   """Runs `config` into `out` and returns summary.json's value. A kill at any moment loses at most `save_every_s` seconds of work."""
   out = pathlib.Path(out)
   fresh = not out.exists()
@@ -593,6 +594,9 @@ def execute(config: RunConfig, out, resume: bool = False, overwrite: bool = Fals
     if fresh and not any(out.iterdir()):
       out.rmdir()
     raise
+  for text in doubts(config):
+    tell(f"note: {text}")
+  tell(f"{runner.groups} streams of {config.steps:,} control steps; what is not compiled yet is compiled first, a minute or two")
   values = runner.config_dict()
   if state == "resume":
     check_same(out, values)

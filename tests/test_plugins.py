@@ -13,6 +13,7 @@ import pytest
 
 from mjx_cl import cli, detectors, envs, faults
 from mjx_cl.errors import PluginError, UserError
+from mjx_cl.monitor import unknown
 from mjx_cl.plugins import Registry
 
 ROOT = pathlib.Path(__file__).parents[1]
@@ -178,3 +179,16 @@ def test_what_does_not_fit_is_one_line(capsys, monkeypatch):
   monkeypatch.setattr(doctor, "report", lambda: (_ for _ in ()).throw(RuntimeError("a bug")))
   with pytest.raises(RuntimeError, match="a bug"):
     cli.main(["doctor"])
+
+
+def test_a_pure_detector_of_a_file_is_made_and_a_plain_class_is_told_where_to_go(tmp_path, capsys):
+  (tmp_path / "mine.py").write_text(PLUG + "\nclass Plain:\n  def update(self, x):\n    return x > 1\n")
+  detector = detectors.make(f"{tmp_path}/mine.py:level", channel="opr", log=False, threshold=2.0)
+  residual = unknown((), 4)._replace(valid=jnp.bool_(True))
+  fired = [bool(detector.update(detector.init(), residual._replace(opr=jnp.float32(x)))[1].fired) for x in (1.0, 3.0)]
+  assert fired == [False, True]
+  for name, words in (("Plain", "leaderboard --add"), ("Nobody", "has no class 'Nobody'"), ("level", "wrong_setting")):
+    more = ("--set", "wrong_setting=1") if name == "level" else ()
+    assert cli.main(["run", "walker", "--detector", f"{tmp_path}/mine.py:{name}", "--out", str(tmp_path / "r"), *more]) == 2
+    err = capsys.readouterr().err
+    assert words in err and err.strip().count("\n") == 0 and not (tmp_path / "r").exists()

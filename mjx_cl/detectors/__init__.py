@@ -1,6 +1,7 @@
 """Change detectors: pure `init` / `update` pairs over one stream. `DETECTORS` is the one table; entry points `mjx_cl.detectors` join it."""
 from __future__ import annotations
 
+import functools
 import inspect
 
 import jax
@@ -84,12 +85,26 @@ def known_settings(build) -> list[str]:
   return list(dict.fromkeys(found)) + ["..."] * (not more and any(p.kind is p.VAR_KEYWORD for p in own))
 
 
+def _pure(name: str, factory):
+  """`factory`, held to giving Detectors; a class in plain Python is told where it can go instead."""
+  @functools.wraps(factory)
+  def build(*args, **settings):
+    detector = factory(*args, **settings)
+    if not isinstance(detector, Detector):
+      plain = callable(getattr(detector, "update", None))
+      raise UserError(f"detector {name!r} gives {type(detector).__name__} in place of a Detector" + (
+          ": plain Python cannot run inside the compiled loop; score it by `mjx-cl leaderboard --add` or use it in `mjx-cl detect`, or write it as a pure "
+          "init/update pair, as mjx_cl/detectors/cusum.py" if plain else ", a pure init/update pair as in mjx_cl/detectors/cusum.py"))
+    return detector
+  return build
+
+
 def make(name: str, channel: str | None = None, log: bool | None = None, whiten: int = 0, patience: int = 1, cool_down: int = 0,
          robot: str | None = None, shared: bool = False, **settings) -> Detector:
   """Builds detector `name`, a map over monitor.Residual. Unknown settings are refused.
 
   Args:
-    name: of DETECTORS, or `name@channel`, short for channel=...
+    name: of DETECTORS, or `name@channel`, short for channel=...; or path/to/file.py:factory, module:factory, a factory of one's own that gives a Detector.
     channel: what a single-residual detector watches: one of combine.CHANNELS, or several joined by `+`, each with a detector of its own; the
       alarm of any counts. Default: `opr+rpr`.
     log: take the logarithm of the channel first; default: of all but the reward, which may be negative.
@@ -104,7 +119,11 @@ def make(name: str, channel: str | None = None, log: bool | None = None, whiten:
   name, at, after = name.partition("@")
   if at:
     channel = after
-  build = choose("detector", name, DETECTORS)
+  if ":" in name:
+    from mjx_cl.detectors import host
+    build = _pure(name, host.find(name)[0])
+  else:
+    build = choose("detector", name, DETECTORS)
   if name == "rolling_sigma":
     settings = (one_threshold(robot) if shared else CALIBRATED.get(robot, {})) | settings
   try:

@@ -44,19 +44,25 @@ def load(source: str, settings: dict | None = None, host_name: str | None = None
     UserError, one line: no such module, file, class or channel, refused settings, an object without `update`.
   Example: load("river.drift:PageHinkley", {"threshold": 20.0, "mode": "up"})
   """
-  where, colon, name = source.rpartition(":")
-  if not colon or not where or not name:
-    raise UserError(f"a host detector is module:Class or path/to/file.py:Class; got {source!r}")
   if channel not in CHANNELS:
     raise UserError(f"unknown channel {channel!r}; choose from: {', '.join(CHANNELS)}")
-  module = _file(where) if where.endswith(".py") else _module(where)
-  build = getattr(module, name, None)
-  if not callable(build):
-    raise UserError(f"host detector {source}: {where} has no class {name!r}")
+  build, name = find(source)
   settings = dict(settings or {})
   host = HostDetector(lambda: build(**settings), host_name or name, channel, log)
   _fresh(host.factory, host.host_name)
   return host
+
+
+def find(source: str) -> tuple[Callable, str]:
+  """What "module:Class" or "path/to/file.py:Class" names, and the name after the colon; UserError, one line, where there is none."""
+  where, colon, name = source.rpartition(":")
+  if not colon or not where or not name:
+    raise UserError(f"a host detector is module:Class or path/to/file.py:Class; got {source!r}")
+  module = _file(where) if where.endswith(".py") else _module(where)
+  build = getattr(module, name, None)
+  if not callable(build):
+    raise UserError(f"host detector {source}: {where} has no class {name!r}")
+  return build, name
 
 
 def _module(name: str):
