@@ -594,9 +594,6 @@ def execute(config: RunConfig, out, resume: bool = False, overwrite: bool = Fals
     if fresh and not any(out.iterdir()):
       out.rmdir()
     raise
-  for text in doubts(config):
-    tell(f"note: {text}")
-  tell(f"{runner.groups} streams of {config.steps:,} control steps; what is not compiled yet is compiled first, a minute or two")
   values = runner.config_dict()
   if state == "resume":
     check_same(out, values)
@@ -607,6 +604,9 @@ def execute(config: RunConfig, out, resume: bool = False, overwrite: bool = Fals
       clear(out)
     runner.open()
     store.write_json(out / "config.json", values)
+  for text in doubts(config):
+    tell(f"note: {text}")
+  tell(f"{runner.groups} streams of {config.steps:,} control steps; what is not compiled yet is compiled first, a minute or two")
   saved = time.monotonic()
   with Interruptible() as interrupt:
     last = None

@@ -235,7 +235,7 @@ def begun(mjx, saved, tmp_path, monkeypatch):  # noqa: F811
   monkeypatch.setattr(run.Runner, "step", cut)
   argv = ["run", "walker", "--agent", saved, "--seeds", "1", "--out", tmp_path / "out"]
   code, out, err = mjx(*argv)
-  assert (code, out) == (130, "") and err.count("\n") == 1 and "--resume" in err
+  assert (code, out) == (130, "") and err.count("mjx-cl: ") == 1 and "--resume" in err.splitlines()[-1]
   return argv, tmp_path / "out"
 
 
