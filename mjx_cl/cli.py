@@ -379,6 +379,12 @@ def clock(seconds: float) -> str:
   return f"{seconds // 3600}:{seconds % 3600 // 60:02d}:{seconds % 60:02d}" if seconds >= 3600 else f"{seconds // 60}:{seconds % 60:02d}"
 
 
+def show(table) -> None:
+  """Prints a rich table; as wide as it likes where no terminal says how wide that is, so that no cell is cut."""
+  from rich.console import Console
+  Console(width=None if sys.stdout.isatty() else 200).print(table)
+
+
 RESULT = []  # standard output of a command with --json, while whatever else is printed goes to standard error
 
 
@@ -738,7 +744,6 @@ def do_leaderboard(args: Leaderboard) -> None:
   if args.json:
     emit([{k: v for k, v in r.items() if not k.startswith("stream_")} for r in board.rows])
     return
-  from rich.console import Console
   from rich.table import Table
   table = Table(title=f"{len(board.rows):,} rows, ARL0 {held.suite.arl0:,.0f} steps, means over robots, faults and severities", title_justify="left")
   for k, heading in enumerate(("detector", "score", "95 %", "within 1 s", "within 5 s", "missed", "false alarms/h", "mean rank")):
@@ -749,7 +754,7 @@ def do_leaderboard(args: Leaderboard) -> None:
     table.add_row(r["detector"], number(r["cost_standard"], ".1f"), f"{number(ci[0], '.1f')} to {number(ci[1], '.1f')}" if ci else "-",
                   number(r["detected_within_1s"], ".0%"), number(r["detected_within_5s"], ".0%"), number(r["miss_probability"], ".0%"),
                   number(r["false_alarms_per_hour"], ".1f"), number(r["mean_rank"], ".1f"))
-  Console().print(table)
+  show(table)
   print(f"{board.stream_steps:,} stream-steps scored in {clock(board.seconds)}; files: {', '.join(files)}")
 
 

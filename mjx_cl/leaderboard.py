@@ -312,7 +312,7 @@ def _guarded(one: Entry, data: Data, runner: passes.Runner, samples) -> Found:
   except jax.errors.ConcretizationTypeError as e:
     raise UserError(f"detector {one.name!r} cannot be calibrated: its threshold is traced, several run side by side, so no Python `if` may look at it "
                     "or at a sample (jnp.where does)") from e
-  except Exception as e:
+  except (Exception, SystemExit) as e:
     raise UserError(f"detector {one.name!r} failed: {type(e).__name__}: {(str(e).strip() or 'without a message').splitlines()[0]}") from e
 
 

@@ -79,6 +79,10 @@ def read_submission(path, streams: StreamSet, robots=()) -> dict[int, np.ndarray
   number, step, score = (_numbers(path, table, k) for k in ("stream", "step", "score"))
   if not (np.isfinite(number).all() and np.isfinite(step).all()):
     raise FileError(f"{path}: row {int(np.flatnonzero(~np.isfinite(number + step))[0])} names no stream or no step")
+  known = np.asarray(streams.meta["stream"], float)
+  for strange, word in ((~np.isin(number, known), f"of the set {streams.folder}; its streams are {known.min():.0f} to {known.max():.0f}, some left out"), (step != np.floor(step), "with a whole step")):
+    if strange.any():
+      raise FileError(f"{path}: row {int(strange.argmax())}, stream {number[strange][0]:g}, step {step[strange][0]:g}, is none {word}")
   raw = pyarrow.parquet.read_table(path, columns=["score"])["score"]
   nan = np.asarray(pyarrow.compute.fill_null(pyarrow.compute.is_nan(raw), False)) if pyarrow.types.is_floating(raw.type) else np.zeros(len(raw), bool)
   for wrong, word in ((nan, "nan"), (np.isinf(score), "infinite")):

@@ -307,7 +307,9 @@ def spoiled(held, path, column, edit):
     ("score", lambda x: x[:40] + [float("nan")] + x[41:], "a score is nan in stream 0, step 40"),
     ("score", lambda x: ["high"] * len(x), "column 'score' must hold numbers"),
     ("stream", lambda x: [None] + x[1:], "row 0 names no stream or no step"),
-    ("step", lambda x: [0.0] + [float("nan")] + x[2:], "row 1 names no stream or no step")])
+    ("step", lambda x: [0.0] + [float("nan")] + x[2:], "row 1 names no stream or no step"),
+    ("stream", lambda x: x[:7] + [605.5] + x[8:], "row 7, stream 605.5, step 7, is none of the set"),
+    ("step", lambda x: x[:7] + [7.5] + x[8:], "row 7, stream 0, step 7.5, is none with a whole step")])
 def test_odd_columns_get_one_line(small, tmp_path, column, edit, text):  # noqa: F811
   with pytest.raises(FileError, match=text) as e:
     submissions.read_submission(spoiled(small[0], tmp_path / "s.parquet", column, edit), small[0])
