@@ -93,7 +93,7 @@ def test_what_is_read(tmp_path, text, columns):
 
 def test_clock_and_words_are_no_columns(tmp_path):
   log = text_log(tmp_path, "step,a,mode,time\n4,1,walk,0\n6,2,3,0.5\n")
-  assert log.step.tolist() == [4, 6] and log.time.tolist() == [0, 0.5] and log.ignored == {"mode": "walk"} and list(log.columns) == ["a"]
+  assert log.step.tolist() == [4, 6] and log.time.tolist() == [0, 0.5] and log.ignored == {"mode": (2, "walk")} and list(log.columns) == ["a"]
 
 
 @pytest.mark.parametrize("text, words", [
