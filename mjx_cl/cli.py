@@ -773,7 +773,7 @@ def do_detect(args: Detect) -> None:
   for row in rows if wide else ():
     groups.setdefault(", ".join(row["columns"]) or "no column", []).append(row["detector"])
   for columns, names in groups.items():
-    print(f"{', '.join(names)}: {columns}")
+    print(f"{', '.join(names)}: alarms in {columns}")
   if any(row["calibrated"] is False for row in result.summary["detectors"]):
     print("* not calibrated")
 

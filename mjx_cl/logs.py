@@ -48,7 +48,7 @@ def read(path) -> Log:
   taken as `time` if there is none and it rises throughout. A column with a cell that is no number is left out.
   """
   text, notes = _text(path)
-  head = text.partition("\n")[0].rstrip("\r")
+  head = _first_line(text)
   sign = next((s for s in ",;\t" if s in head), ",")
   try:
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=sign)
@@ -76,13 +76,16 @@ def read(path) -> Log:
     else:
       values = np.array(values, np.float64)
       columns[name] = np.where(np.isfinite(values), values, np.nan)
-  clocks, told = tuple(name for name in columns if _words(labels[name]) in (["time"], ["step"])), {}
+  clocks, told = tuple(name for name in columns if _told(name, labels[name])), {}
   for name in clocks:
-    told[_words(name)[0]] = at = columns.pop(name)
+    told[_told(name, labels[name])] = at = columns.pop(name)
     if len(at) and not _throughout(at):
       raise FileError(f"{path}: column {name} must rise from row to row and have no gap")
-  seconds = (x for name, x in columns.items() if _of_seconds(labels[name]) and _throughout(x))
-  return Log(columns, told.get("time", next(seconds, None)), told.get("step"), ignored, clocks, labels, tuple(notes))
+  seconds = {name: x for name, x in columns.items() if _of_seconds(labels[name])} if "time" not in told else {}
+  told |= {"time": x for x in list(filter(_throughout, seconds.values()))[:1]}
+  if seconds and "time" not in told and cells:
+    notes.append(f"{path}: column {next(iter(seconds))} tells no times, as it does not rise at every row")
+  return Log(columns, told.get("time"), told.get("step"), ignored, clocks, labels, tuple(notes))
 
 
 def _text(path) -> tuple[str, list[str]]:
@@ -101,10 +104,14 @@ def _text(path) -> tuple[str, list[str]]:
       raise FileError(f"{path} is no CSV file: {e}; save it as UTF-8") from None
     text = raw.decode("latin-1")
     notes.append(f"{path}: no UTF-8, so it is read as Latin-1")
-  strange = [c for c in text.partition("\n")[0].rstrip("\r").replace("\t", " ") if unicodedata.category(c)[0] == "C"]
+  strange = [c for c in _first_line(text).replace("\t", " ") if unicodedata.category(c) == "Cc" or c == "\ufeff"]
   if strange:
     raise FileError(f"{path} is no CSV file: {strange[0]!r} in its first line is no text; save it as UTF-8, with commas between the cells")
   return text, notes
+
+
+def _first_line(text: str) -> str:
+  return re.split(r"\r\n?|\n", text, maxsplit=1)[0]
 
 
 def _header(path, head: str, names: list[str]) -> list[str]:
@@ -175,6 +182,12 @@ def _words(label: str) -> list[str]:
   return [word.lower() for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-zµ]+|\d+", label.replace("μ", "µ"))]
 
 
+def _told(name: str, label: str) -> str | None:
+  """"time" where a column of that name has seconds or no unit, "step" where it is called so."""
+  role = "".join(_words(name)[:1])
+  return role if role in ("time", "step") and (_words(label) == [role] or _words(name) == [role] == ["time"] and _of_seconds(label)) else None
+
+
 def _of_seconds(label: str) -> bool:
   """Whether a name tells a clock in seconds: `time_s`, `t [s]`, `seconds`; not `t` or `timestamp`, whose unit nobody knows."""
   *rest, last = _words(label) or [""]
@@ -199,8 +212,9 @@ def _rises(x: np.ndarray, least: int = LEAST) -> bool:
 
 
 def _evenly(x: np.ndarray) -> bool:
-  """Whether 95 % of the increments lie within half of their median; a clock that is written with few digits has uneven ones."""
-  steps = np.diff(x[np.isfinite(x)])
+  """Whether 95 % of the increments per row lie within half of their median; a clock that is written with few digits has uneven ones."""
+  at = np.flatnonzero(np.isfinite(x))
+  steps = np.diff(x[at]) / np.diff(at)
   return not len(steps) or float(np.mean(np.abs(steps - np.median(steps)) <= 0.501 * np.median(steps))) >= 0.95
 
 
@@ -285,6 +299,7 @@ def _left_out(files, clocks: list[str], unfit: dict[str, tuple[str, str]]) -> li
     for name in other.labels:
       if name not in one.labels:
         reasons.setdefault(name, f"missing in {at}")
+  for one, at in files:
     for name, (line, cell) in one.ignored.items():
       reasons.setdefault(name, f"line {line} of {at} holds {cell!r}")
   reasons |= {name: note for name, (note, _) in unfit.items()}
