@@ -279,16 +279,19 @@ class Render:
 class Detect:
   """Watches a CSV log of one's own: thresholds from a nominal log, alarms in another.
 
-  A header row, columns of numbers; an empty cell or nan is a missing sample; `time` [s] or `step` tell when samples were taken. The nominal log counts
-  as the past of the other: detectors warm up on its first third (1,000 samples at most) and are calibrated on the rest. Every column has a
-  detector of its own, the alarm of any counts. Writes detect.json, alarms.csv and detect.png into --out.
+  Read are CSV files, also .csv.gz, with a header row (a row of units may follow) and cells between commas, semicolons (then with a decimal comma too)
+  or tabulators; an empty cell or nan is a missing sample, `time` [s] or `step` tell when samples were taken. Not watched are clocks and counters,
+  columns that are constant in the nominal log, that hold text or that one log lacks; all of it is printed, --column watches even a clock.
+
+  The nominal log counts as the past of the other: detectors warm up on its first third (1,000 samples at most) and are calibrated on the rest. Every
+  column has a detector of its own, the alarm of any counts. Writes detect.json, alarms.csv and detect.png into --out.
   """
   file: Positional[str]
-  """Log to judge, .csv."""
+  """Log to judge, .csv or .csv.gz."""
   nominal: str
-  """Log of the healthy system, .csv, same columns; three times --arl0 samples or more."""
+  """Log of the healthy system, same columns; three times --arl0 samples or more."""
   column: tuple[str, ...] = ()
-  """Columns to watch; default: all columns of numbers that both files have."""
+  """Columns to watch; default: all columns of numbers that both files have, less clocks and constant ones."""
   detector: tuple[str, ...] = ()
   """Detectors of one number per sample, default: all; or module:Class, file.py:Class, a Python class with update(x) and a threshold of its own."""
   set: tuple[str, ...] = ()
@@ -296,9 +299,9 @@ class Detect:
   arl0: float = 10_000
   """Wanted mean number of samples between false alarms of one detector, all columns together."""
   rate: float | None = None
-  """Samples (or steps of the column `step`) per second; default: from the column `time`."""
+  """Samples (or steps of the column `step`) per second; default: from the column `time`, or one of seconds (`time_s`)."""
   logarithm: bool = False
-  """Watch the logarithm; for residuals, which are positive and skewed."""
+  """Watch the logarithm; for residuals, which are positive and skewed. A sample of 0 or less is refused."""
   out: str | None = None
   """Folder for the results; default: only the table."""
   json: bool = False
@@ -799,19 +802,33 @@ def do_detect(args: Detect) -> None:
     emit(result.summary)
     return
   from rich.console import Console
+  console, rows = Console(), result.summary["detectors"]
+  table = detect_table(rows, True)
+  if wide := console.measure(table, options=console.options.update(width=100_000)).maximum > console.width:
+    table = detect_table(rows, False)
+  console.print(table)
+  groups: dict[str, list[str]] = {}
+  for row in rows if wide else ():
+    groups.setdefault(", ".join(row["columns"]) or "no column", []).append(row["detector"])
+  for columns, names in groups.items():
+    print(f"{', '.join(names)}: alarms in {columns}")
+  if any(row["calibrated"] is False for row in result.summary["detectors"]):
+    print("* not calibrated")
+
+
+def detect_table(rows: list[dict], columns: bool):
+  """Rows of a detection's summary as a table in which cells wrap and nothing is cut, with or without the columns that alarms are in."""
   from rich.table import Table
   from rich.text import Text
   table = Table()
-  for name in ("detector", "threshold", "nominal alarms", "first alarm", "at [s]", "alarms", "columns"):
-    table.add_column(Text(name), justify="left" if name in ("detector", "columns") else "right", no_wrap=name == "detector")
-  for row in result.summary["detectors"]:
+  for name in ("detector", "threshold", "nominal\nalarms", "first\nalarm", "at [s]", "alarms") + ("columns",) * columns:
+    table.add_column(Text(name), justify="left" if name in ("detector", "columns") else "right", overflow="fold")
+  for row in rows:
     mark = "" if row["calibrated"] else " own" if row["calibrated"] is None else " *"
     shown = ("-" if row["threshold"] is None else f"{row['threshold']:.4g}") + mark, f"{row['nominal_alarms']:,}", *(
         "-" if x is None else f"{x:,}" if isinstance(x, int) else f"{x:,.3f}" for x in (row["first_alarm"], row["first_alarm_s"], row["alarms"]))
-    table.add_row(Text(row["detector"]), *shown, Text(", ".join(row["columns"])))
-  Console().print(table)
-  if any(row["calibrated"] is False for row in result.summary["detectors"]):
-    print("* not calibrated")
+    table.add_row(Text(row["detector"]), *shown, *[Text(", ".join(row["columns"]))] * columns)
+  return table
 
 
 def do_query(args: Query) -> None:
@@ -830,13 +847,12 @@ def do_query(args: Query) -> None:
       names[k] = name if name not in names[:k] else f"{name}_{k}"
     emit(json.loads(json.dumps([{n: None if isinstance(x, float) and not math.isfinite(x) else x for n, x in zip(names, r)} for r in rows], default=str)))
     return
-  from rich.console import Console
   from rich.table import Table
   from rich.text import Text
   table = Table(*names)
   for r in rows:
     table.add_row(*(Text(str(x)) for x in r))
-  Console().print(table)
+  show(table)
 
 
 def do_report(args: Report) -> None:

@@ -6,7 +6,6 @@ counts. Samples are handed on in nominal deviations, (x - mean) / std of the nom
 """
 from __future__ import annotations
 
-import csv
 import inspect
 import pathlib
 from typing import Any, Callable, NamedTuple
@@ -18,110 +17,14 @@ import numpy as np
 from mjx_cl import store
 from mjx_cl.detectors import DETECTORS, Alarm, Detector, host, rolling_sigma
 from mjx_cl.errors import FileError, UserError, choose
+from mjx_cl.logs import Log, choose_columns, read
 
-LEAST = 100     # finite nominal samples that a column needs
 EXPECTED = 3    # nominal alarms below which the wanted ARL0 cannot be read off the nominal log
 FEW = 50        # alarms below which a measured run length is marked
 MARGIN = 0.25   # of the way from the median to the highest nominal score, added to the latter where nothing can be calibrated
 LEVELS = 8      # thresholds tried side by side
 CHUNK = 2048    # rows of one call of a program
 FARTHEST = 1e6  # nominal deviations at which a sample is cut, so that no sum of squares overflows float32
-
-
-# ---- files ---------------------------------------------------------------------------------------------------------------------------
-
-class Log(NamedTuple):
-  """Attributes:
-    columns: name -> float64 (T,), nan = missing. time: float64 (T,) [s], or None. step: float64 (T,), or None. ignored: names of columns that hold
-    something else than numbers, with the first such cell.
-  """
-  columns: dict[str, np.ndarray]
-  time: np.ndarray | None
-  step: np.ndarray | None
-  ignored: dict[str, str]
-
-
-def read(path) -> Log:
-  """Reads a CSV file: a header row, then numbers; an empty cell, `nan` or anything infinite is a missing sample.
-
-  The separator is the comma, or where the header has none the semicolon or the tabulator. A column `time` [s] or `step` tells when samples were
-  taken and is not watched. A column with a cell that is no number is left out.
-  """
-  try:
-    with open(path, newline="", encoding="utf-8-sig") as f:
-      head = f.readline()
-      sign = next((s for s in ",;\t" if s in head), ",")
-      f.seek(0)
-      rows = list(csv.reader(f, delimiter=sign))
-  except OSError as e:
-    raise FileError(f"cannot read {path}: {e.strerror or e}") from None
-  except (UnicodeDecodeError, csv.Error) as e:
-    raise FileError(f"{path} is no CSV file: {e}") from None
-  while rows and not rows[-1]:
-    rows.pop()
-  names = [cell.strip() for cell in rows[0]] if rows else []
-  if not names or all(_number(cell) is not None for cell in names):
-    raise FileError(f"{path} has no header row with the names of its columns")
-  if "" in names or len(set(names)) < len(names):
-    raise FileError(f"{path}: every column needs a name of its own; got {', '.join(map(repr, names))}")
-  cells = []
-  for line, row in enumerate(rows[1:], 2):
-    if not row and len(names) > 1:
-      continue
-    row = row or [""]  # in a file of one column an empty line is a missing sample
-    if len(row) != len(names):
-      raise FileError(f"{path}, line {line}: {len(row)} cells under {len(names)} names")
-    cells.append(row)
-  columns, ignored = {}, {}
-  for name, column in zip(names, zip(*cells) if cells else [()] * len(names)):
-    values = [_number(cell) for cell in column]
-    if None in values:
-      ignored[name] = column[values.index(None)]
-    else:
-      values = np.array(values, np.float64)
-      columns[name] = np.where(np.isfinite(values), values, np.nan)
-  clock = {}
-  for name in list(columns):
-    if name.lower() in ("time", "step"):
-      clock[name.lower()] = at = columns.pop(name)
-      if len(at) and (np.isnan(at).any() or (np.diff(at) <= 0).any()):
-        raise FileError(f"{path}: column {name} must rise from row to row and have no gap")
-  return Log(columns, clock.get("time"), clock.get("step"), ignored)
-
-
-def _number(cell: str) -> float | None:
-  """nan where the cell is empty, None where it is no number."""
-  cell = cell.strip()
-  try:
-    return float(cell) if cell else float("nan")
-  except ValueError:
-    return None
-
-
-def choose_columns(log: Log, nominal: Log, names: tuple[str, ...], path, nominal_path) -> list[str]:
-  """Columns that are watched: those named, or all that both files hold as numbers."""
-  for one, at in ((nominal, nominal_path), (log, path)):
-    for name in names:
-      if name in one.ignored:
-        raise FileError(f"{at}: column {name} holds {one.ignored[name]!r}, which is no number")
-      if name not in one.columns:
-        raise UserError(f"{at} has no column {name!r}; choose from: {', '.join(sorted(one.columns)) or 'none'}")
-    if not one.columns:
-      raise FileError(f"{at} has no column of numbers to watch")
-  found = list(dict.fromkeys(names)) or [name for name in log.columns if name in nominal.columns]
-  if not found:
-    raise FileError(f"{path} and {nominal_path} share no column of numbers: {', '.join(log.columns)} against {', '.join(nominal.columns)}")
-  for name in found:
-    known = nominal.columns[name][np.isfinite(nominal.columns[name])]
-    if len(known) < LEAST:
-      raise FileError(f"{nominal_path} is too short: column {name} has {len(known)} samples, at least {LEAST} are needed")
-    if np.ptp(known) == 0:
-      others = ", ".join(n for n in found if n != name)
-      raise FileError(f"{nominal_path}: column {name} is constant ({known[0]:g}), nothing can be calibrated on it"
-                      + (f"; name the others by --column: {others}" if others else ""))
-    if not np.isfinite(log.columns[name]).any():
-      raise FileError(f"{path}: column {name} has no sample")
-  return found
 
 
 # ---- detectors -----------------------------------------------------------------------------------------------------------------------
@@ -239,16 +142,17 @@ def detect(path, nominal_path, columns: tuple[str, ...] = (), detectors: tuple[s
   """Calibrates detectors on one CSV file and runs them on another.
 
   Args:
-    columns: default: all columns of numbers that both files have.
+    columns: default: all columns of numbers that both files have, less clocks and those that are constant in the nominal log.
     detectors: of `table()`, default all of them; or host detectors, module:Class or file.py:Class, which bring a threshold of their own and see
       samples in the file's own units.
     arl0: wanted mean number of samples between false alarms, of all columns of one detector together.
-    rate: samples per second, for times; default: from the column `time`, otherwise times are unknown. With a column `step`: steps per second.
-    logarithm: watch ln max(x, 1e-9); for residuals, which are positive and skewed.
+    rate: samples per second, for times; default: from the column `time` or one of seconds, otherwise times are unknown. With a column `step`:
+      steps per second.
+    logarithm: watch ln max(x, 1e-9); for residuals, which are positive and skewed. A sample of 0 or less is refused.
     settings: of the host detectors.
   """
-  if not arl0 > 1:
-    raise UserError(f"arl0 must be above 1 sample; got {arl0}")
+  if not (arl0 > 1 and np.isfinite(arl0)):
+    raise UserError(f"arl0 must be a finite number above 1 sample; got {arl0}")
   if rate is not None and not (rate > 0 and np.isfinite(rate)):
     raise UserError(f"rate must be above 0 samples a second; got {rate}")
   names = list(dict.fromkeys(detectors)) or list(table())
@@ -258,13 +162,14 @@ def detect(path, nominal_path, columns: tuple[str, ...] = (), detectors: tuple[s
   for name in names:
     name in hosts or choose("detector", name, table())
   log, nominal = read(path), read(nominal_path)
-  found = choose_columns(log, nominal, columns, path, nominal_path)
+  found, left = choose_columns(log, nominal, columns, path, nominal_path)
   xs, past = (np.stack([one.columns[c] for c in found], 1) for one in (log, nominal))
   if logarithm:
-    xs, past = (np.where(np.isnan(x), np.nan, np.log(np.maximum(x, 1e-9))) for x in (xs, past))
+    xs, past = _logarithm(xs, found, path), _logarithm(past, found, nominal_path)
   middle, spread = np.nanmean(past, 0), np.nanstd(past, 0)
   if not (spread > 0).all():
-    raise FileError(f"{nominal_path}: column {found[int(np.argmin(spread))]} is constant once its logarithm is taken")
+    raise FileError(f"{nominal_path}: column {found[int(np.argmin(spread))]} varies too little to be told from a constant"
+                    + (" once its logarithm is taken" if logarithm else ""))
   standard = [np.clip((x - middle) / spread, -FARTHEST, FARTHEST) for x in (xs, past)]
   warmup = min(1000, len(past) // 3)
   seconds, rate = _clock(log, rate, len(xs))
@@ -278,8 +183,18 @@ def detect(path, nominal_path, columns: tuple[str, ...] = (), detectors: tuple[s
   summary = {"log": str(path), "nominal": str(nominal_path), "columns": found, "ignored": sorted({*log.ignored, *nominal.ignored}),
              "samples": len(xs), "nominal_samples": len(past), "missing": int(np.isnan(xs).sum()),
              "nominal_missing": int(np.isnan(past).sum()), "warmup": warmup,
-             "counted": counted, "arl0": arl0, "rate_hz": rate, "logarithm": logarithm, "detectors": rows, "notes": _notes(rows, counted, arl0)}
+             "counted": counted, "arl0": arl0, "rate_hz": rate, "logarithm": logarithm, "detectors": rows,
+             "notes": [*dict.fromkeys(nominal.notes + log.notes), *left, *_notes(rows, counted, arl0)]}
   return Detection(summary, xs, past, fired, scores, before, seconds)
+
+
+def _logarithm(x: np.ndarray, names: list[str], path) -> np.ndarray:
+  """ln max(x, 1e-9) of x (T, C); nan stays, anything else that is not positive is refused."""
+  for name, column in zip(names, x.T):
+    if (column <= 0).any():
+      raise FileError(f"{path}: column {name} has samples without a logarithm, the smallest is {np.nanmin(column):g}; "
+                      "name the others by --column, or leave out --logarithm")
+  return np.log(np.maximum(x, 1e-9))
 
 
 def _clock(log: Log, rate: float | None, samples: int) -> tuple[np.ndarray | None, float | None]:
@@ -291,13 +206,23 @@ def _clock(log: Log, rate: float | None, samples: int) -> tuple[np.ndarray | Non
 
 
 def _registered(name: str, xs: np.ndarray, past: np.ndarray, warmup: int, arl0: float):
-  """(threshold, calibrated, nominal alarms (N,), alarms (T, C), scores (T, C))."""
-  program = Program(name, warmup, xs.shape[1], min(CHUNK, len(past)))
+  """(threshold, calibrated, nominal alarms (N,), alarms (T, C), scores (T, C)); what goes wrong inside a detector, which may be anybody's, becomes
+  one line that names it."""
   try:
-    threshold, calibrated = calibrate(program, past, warmup, arl0)
+    return _examined(name, xs, past, warmup, arl0)
+  except UserError:
+    raise
   except jax.errors.ConcretizationTypeError:
     raise UserError(f"detector {name!r} cannot be calibrated here: its factory asks for a threshold that is a number; "
                     "use base.above to check it") from None
+  except (Exception, SystemExit) as e:
+    raise UserError(f"detector {name!r} failed: {type(e).__name__}: {(str(e).strip() or 'without a message').splitlines()[0]}") from e
+
+
+def _examined(name: str, xs: np.ndarray, past: np.ndarray, warmup: int, arl0: float):
+  """`_registered`, as it goes."""
+  program = Program(name, warmup, xs.shape[1], min(CHUNK, len(past)))
+  threshold, calibrated = calibrate(program, past, warmup, arl0)
   if threshold is None:
     return None, False, np.zeros(len(past), bool), np.zeros(xs.shape, bool), np.full(xs.shape, np.nan)
   levels = np.full(LEVELS, threshold)

@@ -99,6 +99,8 @@ def read_arrow(path):
   import pyarrow.parquet
   try:
     return pyarrow.parquet.read_table(path)
+  except FileNotFoundError:
+    raise FileError(f"cannot read {path}: no such file") from None
   except (OSError, pyarrow.ArrowException) as e:
     raise FileError(f"cannot read {path}: {str(e).splitlines()[0]}") from None
 

@@ -1,8 +1,10 @@
 """Detection on CSV logs: what is read, thresholds against a loop, the past that counts, what is written, and one line for bad input."""
 import csv
+import gzip
 import inspect
 import json
 import os
+import sys
 
 import chex
 import jax
@@ -83,7 +85,15 @@ def text_log(tmp_path, text):
     ("a\n1\n\n3\n\n", {"a": [1, np.nan, 3]}),
     ("a,word,b\n1,x,2\n", {"a": [1], "b": [2]}),
     ("a,Time,b\n1,0.5,2\n3,0.75,4\n", {"a": [1, 3], "b": [2, 4]}),
-    ("a,b\n", {"a": [], "b": []})])
+    ("a,b\n", {"a": [], "b": []}),
+    ("a;b\n0,5;1\n-1,5e3;2,25\n", {"a": [0.5, -1500], "b": [1, 2.25]}), ("a\tb\n0,5\t1\n", {"a": [0.5], "b": [1]}),
+    ("a;b;c\n0,5;1,0;1.5\n0,25;2;2.5\n", {"a": [0.5, 0.25], "b": [1, 2]}),  # one decimal sign for the whole file, that of most
+    ("a;b;c\n0.5;1,5;1.5\n", {"a": [0.5], "c": [1.5]}), ('a,b\n"0,5",1\n', {"b": [1]}),
+    ("a;b\n1,234.5;0,5\n1,5;1,5\n", {"b": [0.5, 1.5]}),  # thousands are never guessed
+    ("a,b\ns,Nm\n1,2\n", {"a": [1], "b": [2]}), ("a,b,c\nA,,[-]\n1,2,x\n", {"a": [1], "b": [2]}),
+    ("a;b\nA;V\n0,5;1\n", {"a": [0.5], "b": [1]}),
+    ("a,b\r1,2\r3,4\r", {"a": [1, 3], "b": [2, 4]}), ("\u200ba,b\n1,2\n", {"\u200ba": [1], "b": [2]}),
+    ("mode,a\nwalk,\nwalk,1\n", {"a": [np.nan, 1]})])
 def test_what_is_read(tmp_path, text, columns):
   log = text_log(tmp_path, text)
   assert list(log.columns) == list(columns)
@@ -93,16 +103,155 @@ def test_what_is_read(tmp_path, text, columns):
 
 def test_clock_and_words_are_no_columns(tmp_path):
   log = text_log(tmp_path, "step,a,mode,time\n4,1,walk,0\n6,2,3,0.5\n")
-  assert log.step.tolist() == [4, 6] and log.time.tolist() == [0, 0.5] and log.ignored == {"mode": "walk"} and list(log.columns) == ["a"]
+  assert log.step.tolist() == [4, 6] and log.time.tolist() == [0, 0.5] and log.ignored == {"mode": (2, "walk")} and list(log.columns) == ["a"]
 
 
 @pytest.mark.parametrize("text, words", [
-    ("", ["header"]), ("1,2\n3,4\n", ["header"]), ("a,a\n1,2\n", ["name of its own"]), ("a,\n1,2\n", ["name of its own"]),
-    ("a,b\n1,2\n3\n", ["line 3", "1 cells under 2"]), ("a,time\n1,2\n1,2\n", ["time", "rise"]), ("a,step\n1,2\n1,\n", ["step", "gap"])])
+    ("", ["header"]), ("1,2\n3,4\n", ["header", "put a line of names before it, e.g. x1,x2"]),
+    ("1.5;2;3;4\n", ["header", "e.g. x1;x2;x3;..."]),
+    ("0,5;0,6\n", ["header", "e.g. x1;x2"]), ("a\0,b\n1,2\n", ["no CSV", "UTF-8"]),
+    ("a,a\n1,2\n", ["name of its own"]), ("a,\n1,2\n", ["name of its own"]),
+    ("a,b\n1,2\n3\n", ["line 3", "1 cells under 2"]), ("a,time\n1,2\n1,2\n", ["time", "rise"]), ("a,time\nA,s\n1,2\n1,2\n", ["time", "rise"]),
+    ("a,step\n1,2\n1,\n", ["step", "gap"])])
 def test_a_broken_file_is_one_line(tmp_path, text, words):
   with pytest.raises(FileError) as error:
     text_log(tmp_path, text)
   assert all(word in one_line(error) for word in words + ["x.csv"])
+
+
+def test_units_and_decimal_comma_are_said(tmp_path):
+  units, comma = (text_log(tmp_path, text) for text in ("time,a,n\ns,A,\n0,1,2\n1,3,4\n", "a;b\n0,5;1\n"))
+  assert units.time.tolist() == [0, 1]
+  assert [note.partition(": ")[2] for note in units.notes] == ["line 2 holds no number and is taken for units: s, A"]
+  assert [note.partition(": ")[2] for note in comma.notes] == ["numbers are read with a decimal comma"]
+  assert text_log(tmp_path, "a;b\n0.5;1\n").notes == ()
+
+
+@pytest.mark.parametrize("head, time", [
+    ("time_s", True), ("Time [s]", True), ("t (s)", True), ("seconds", True), ("timestamp_s", True), ("time\ns", True), ("t\nsec", True),
+    ("t", False), ("timestamp", False), ("time_ms", False), ("time\nms", False), ("s", False), ("epoch", False)])
+def test_only_seconds_are_time(tmp_path, head, time):
+  name, *unit = head.split("\n")
+  log = text_log(tmp_path, "\n".join([f"{name},x", *(f"{u},A" for u in unit), "5,1", "5.5,2", "6,1"]) + "\n")
+  assert (log.time is not None and log.time.tolist() == [5, 5.5, 6]) == time and log.step is None
+  assert log.clocks == ("time",) * (head == "time\ns")
+
+
+def test_seconds_that_do_not_rise_are_no_times(tmp_path):
+  log = text_log(tmp_path, "t_s,time_s,a\n0,0,1\n1,0,2\n")
+  assert log.time.tolist() == [0, 1] and log.notes == ()
+  log = text_log(tmp_path, "time_s,a\n0,1\n0,2\n")
+  assert log.time is None and [note.partition(": ")[2] for note in log.notes] == ["column time_s tells no times, as it does not rise at every row"]
+
+
+@pytest.mark.parametrize("write", [
+    lambda p, text: p.write_bytes(gzip.compress(text.encode())), lambda p, text: p.write_bytes(text.encode("utf-16")),
+    lambda p, text: p.write_bytes(text.encode("latin-1")), lambda p, text: p.write_bytes(gzip.compress(text.encode("utf-16")))])
+def test_how_a_file_is_written(tmp_path, write):
+  path = tmp_path / "x.csv.gz"
+  write(path, "α°,b\n1,2\n".replace("α", "µ"))
+  log = detect.read(path)
+  assert {name: x.tolist() for name, x in log.columns.items()} == {"µ°": [1], "b": [2]}
+  assert [note.partition(": ")[2] for note in log.notes] == ["no UTF-8, so it is read as Latin-1"] * (path.read_bytes()[:1] == b"\xb5")
+
+
+@pytest.mark.parametrize("content, words", [
+    (gzip.compress(b"a,b\n1,2\n" * 99)[:-9], ["cannot read", "ended"]), ("a,b\n1,2\n".encode("utf-16-le"), ["no CSV", "UTF-8"]),
+    (b"\xff\xfea", ["no CSV", "UTF-8"]), (b"PAR1\x15\x04\x15\xd0", ["no CSV"])])
+def test_what_cannot_be_read_is_one_line(tmp_path, content, words):
+  (tmp_path / "x.csv").write_bytes(content)
+  with pytest.raises(FileError) as error:
+    detect.read(tmp_path / "x.csv")
+  assert all(word in one_line(error) for word in words + ["x.csv"])
+
+
+# ---- columns that are not watched ------------------------------------------------------------------------------------------------------
+
+def chosen(tmp_path, log, nominal, names=()):
+  """(columns, notes) of two logs, t.csv and n.csv, without their folder."""
+  log, nominal = save(tmp_path / "t.csv", **log), save(tmp_path / "n.csv", **nominal)
+  found, notes = detect.choose_columns(detect.read(log), detect.read(nominal), names, log, nominal)
+  return found, [note.replace(f"{tmp_path}/", "") for note in notes]
+
+
+@pytest.mark.parametrize("name", ["time_s", "time [s]", "t", "T_ms", "timestamp", "Stamp", "Time", "sample", "Index", "seconds", "epoch", "frame",
+                                  "simTime", "header.stamp.sec", "step", "TIME"])
+def test_a_clock_is_known_by_its_name(tmp_path, name):
+  """However uneven; in the log that is judged it may even stand still, unless it is `time` or `step`."""
+  uneven = np.cumsum(np.random.default_rng(0).exponential(size=300)) + 1
+  still = uneven[:200] if name.lower() in ("time", "step") else np.repeat(uneven[:100], 2)
+  for x in (uneven[:200], still):
+    found, notes = chosen(tmp_path, {name: x, "a": noise(200)}, {name: uneven, "a": noise(300)})
+    assert found == ["a"] and notes == [f"column {name} is not watched: rising like a clock or counter"]
+  found, notes = chosen(tmp_path, {name: uneven[:200], "a": noise(200)}, {"a": noise(300)})
+  assert found == ["a"] and notes == [f"column {name} is not watched: rising like a clock or counter"]
+
+
+def test_a_name_alone_makes_no_clock(tmp_path):
+  uneven = np.cumsum(np.random.default_rng(0).exponential(size=300))
+  signals = {"t": noise(300), "sample": noise(300, 1), "step_length": noise(300, 2), "torque": uneven}
+  assert chosen(tmp_path, signals, signals) == (list(signals), [])
+
+
+def test_a_clock_is_known_by_its_even_steps(tmp_path):
+  """Whatever its name: seconds with jitter and a gap, two digits of 1/30 s, a counter with missing rows; both logs must show it."""
+  k = np.arange(300.0)
+  jitter = np.random.default_rng(0).uniform(-0.2, 0.2, 300)
+  clocks = {"ros": 1.7e5 + 0.01 * (k + jitter + 50 * (k > 100)), "zeit": np.floor(100 * k / 30) / 100, "n": np.where(k % 9 == 4, np.nan, k)}
+  found, notes = chosen(tmp_path, clocks | {"a": noise(300)}, clocks | {"a": noise(300)})
+  assert found == ["a"] and notes == ["columns ros, zeit, n are not watched: rising like a clock or counter"]
+  assert chosen(tmp_path, clocks | {"a": noise(300)}, clocks | {"a": noise(300)}, ("n", "a")) == (["n", "a"], [])  # named, it is watched
+  one = chosen(tmp_path, {"n": noise(300), "a": noise(300)}, {"n": k, "a": noise(300)})
+  assert one == (["n", "a"], []) == chosen(tmp_path, {"n": k, "a": noise(300)}, {"n": noise(300), "a": noise(300)})
+
+
+def test_each_column_left_out_is_said(tmp_path):
+  flat, words = np.full(300, 3.0), ["walk"] * 299 + ["run"]
+  broken = [f"{x:.3g}" for x in noise(300)]
+  broken[120] = "oops"
+  same = {"a": noise(300), "mode": words}
+  nan, few = np.full(300, np.nan), np.where(np.arange(300) < 99, noise(300), np.nan)
+  found, notes = chosen(tmp_path,
+                        same | {"flat": flat, "stuck": flat + noise(300), "current": broken, "new": flat, "dead": nan, "few": flat},
+                        same | {"flat": flat, "stuck": flat, "current": noise(300), "old": words, "dead": noise(300), "few": few})
+  assert found == ["a"] and sorted(notes) == [
+      "column current is not watched: line 122 of t.csv holds 'oops'", "column dead is not watched: no sample in t.csv",
+      "column few is not watched: n.csv has 99 samples, at least 100 are needed", "column flat is not watched: constant in n.csv",
+      "column mode is not watched: line 2 of n.csv holds 'walk'", "column new is not watched: missing in n.csv",
+      "column old is not watched: missing in t.csv", "column stuck is not watched: constant in n.csv, but not in t.csv"]
+
+
+@pytest.mark.parametrize("names, words", [
+    (("flat",), ["n.csv", "flat is constant (3)"]), (("a", "flat"), ["flat is constant", "--column: a"]),
+    (("current",), ["t.csv", "current", "'oops'", "line 4"]), (("time",), ["column time tells when", "choose from: a, current, flat, t"]),
+    (("time_s",), ["no column 'time_s'"])])
+def test_a_column_that_is_named_must_be_watched(tmp_path, names, words):
+  k = np.arange(300)
+  columns = {"a": noise(300), "flat": np.full(300, 3.0), "time": k, "t": k}
+  with pytest.raises(UserError) as error:
+    chosen(tmp_path, columns | {"current": ["1", "2", "oops"] * 100}, columns | {"current": noise(300)}, names)
+  assert all(word in one_line(error) for word in words) and ("no column" in one_line(error)) == (names == ("time_s",))
+  assert chosen(tmp_path, columns, columns, ("t",)) == (["t"], [])
+
+
+def test_nothing_left_to_watch_is_one_line(tmp_path):
+  k, flat = np.arange(300), np.full(300, 3.0)
+  for log, nominal, words in [
+      ({"t": k, "x": flat}, {"t": k, "x": flat}, ["n.csv", "x is constant"]),
+      ({"t": k, "k": k}, {"t": k, "k": k}, ["clock or counter: t, k", "--column"]),
+      ({"x": ["1,5"] * 300, "y": k}, {"x": k, "z": k}, ["'1,5'", "line 2"])]:
+    with pytest.raises(FileError) as error:
+      chosen(tmp_path, {n: [f'"{c}"' if isinstance(c, str) else c for c in x] for n, x in log.items()}, nominal)
+    assert all(word in one_line(error) for word in words), one_line(error)
+
+
+def test_notes_are_printed_and_written(tmp_path, mjx):
+  k = np.arange(600)
+  paths = [save(tmp_path / f"{name}.csv", time_s=0.02 * k, x=noise(600, seed), mode=["walk"] * 600) for seed, name in enumerate("tn")]
+  code, text, err = mjx(paths[0], "--nominal", paths[1], "--detector", "z_score", "--arl0", 100, "--json")
+  summary = json.loads(text)
+  assert code == 0 and summary["columns"] == ["x"] and summary["rate_hz"] == pytest.approx(50) and summary["ignored"] == ["mode"]
+  assert len(summary["notes"]) == 2 and err.splitlines() == [f"mjx-cl: {note}" for note in summary["notes"]]
 
 
 # ---- thresholds ------------------------------------------------------------------------------------------------------------------------
@@ -197,6 +346,19 @@ def test_a_threshold_that_must_be_a_number_is_one_line(logs, monkeypatch):
   assert "stubborn" in one_line(error) and "base.above" in one_line(error)
 
 
+@pytest.mark.parametrize("update, words", [
+    (lambda n, x: (n, x), "AttributeError"), (lambda n, x: x > 1, "Type"), (lambda n, x: (n, Alarm(x > 1, None)), "failed"),
+    (lambda n, x: 1 / 0, "ZeroDivisionError"), (lambda n, x: sys.exit(3), "SystemExit")])
+def test_a_registered_detector_that_breaks_is_one_line(logs, monkeypatch, update, words):
+  @scalar
+  def foreign(threshold=1.0):
+    return Detector(lambda: jnp.int32(0), update)
+  monkeypatch.setitem(detectors.DETECTORS, "foreign", foreign)
+  with pytest.raises(UserError) as error:
+    detect.detect(*logs, detectors=("foreign",), arl0=100)
+  assert "detector 'foreign' failed" in one_line(error) and words in one_line(error)
+
+
 # ---- samples ---------------------------------------------------------------------------------------------------------------------------
 
 def test_a_missing_sample_changes_nothing(tmp_path, logs):
@@ -264,6 +426,15 @@ def test_the_logarithm(tmp_path):
   two = detect.detect(*files(np.log, "ln"), detectors=("z_score",), arl0=50)
   np.testing.assert_array_equal(one.fired["z_score"], two.fired["z_score"])
   np.testing.assert_allclose(one.scores["z_score"], two.scores["z_score"], rtol=1e-4, atol=1e-4)  # nine digits in the files
+
+
+def test_a_logarithm_of_what_is_not_positive_is_refused(tmp_path):
+  for k, (low, other) in enumerate([(-0.25, 1.0), (1.0, 0.0)]):
+    files = [save(tmp_path / f"{name}.csv", b=np.exp(noise(301)), a=np.r_[np.exp(noise(300)), x]) for name, x in (("t", low), ("n", other))]
+    with pytest.raises(FileError) as error:
+      detect.detect(*files, detectors=("z_score",), arl0=50, logarithm=True)
+    assert all(word in one_line(error) for word in ("tn"[k] + ".csv", "column a", ("-0.25", "is 0;")[k], "--column", "--logarithm"))
+  assert detect.detect(*files, ("b",), ("z_score",), 50, logarithm=True).summary["columns"] == ["b"]
 
 
 def test_seconds_of_time_step_and_rate(tmp_path):
@@ -367,16 +538,27 @@ def test_a_name_with_a_comma_is_one_cell(tmp_path, mjx):
     assert {row["column"] for row in csv.DictReader(f)} == {'torque, "left"'}
 
 
+@pytest.mark.parametrize("width", [80, 400])
+def test_the_table_cuts_nothing(tmp_path, mjx, monkeypatch, width):
+  monkeypatch.setenv("COLUMNS", str(width))
+  names = ["left_hip_motor_current_filtered", "left_knee_joint_position_error"]
+  paths = [save(tmp_path / f"{k}.csv", **{name: noise(600, k) + 9 * (k == 1) for name in names}) for k in range(2)]
+  code, text, _ = mjx(paths[1], "--nominal", paths[0], "--detector", "cusum", "rolling_sigma_plain", "--arl0", 50)
+  assert code == 0 and "…" not in text and all(name in text for name in [*names, "rolling_sigma_plain"])
+  assert max(map(len, (line for line in text.splitlines() if line[:1] in "│┃"))) <= width
+
+
 @pytest.mark.parametrize("change, code, words", [
-    (dict(log="none.csv"), 1, ["none.csv", "No such file"]), (dict(nominal="none.csv"), 1, ["none.csv"]), (dict(log="."), 1, ["directory"]),
-    (dict(log="words.csv"), 1, ["words.csv", "no column of numbers"]), (dict(nominal="short.csv"), 1, ["short.csv", "too short", "99", "100"]),
+    (dict(log="none.csv"), 1, ["none.csv", "No such file"]), (dict(nominal="none.csv"), 1, ["none.csv"]),
+    (dict(log="."), 1, ["directory"]), (dict(log="words.csv"), 1, ["words.csv", "no column of numbers", "line 2 holds 'a'"]),
+    (dict(nominal="short.csv"), 1, ["short.csv", "too short", "99", "100"]),
     (dict(nominal="flat.csv"), 1, ["flat.csv", "x is constant"]), (dict(log="other.csv"), 1, ["share no column", "y against x"]),
     (dict(log="empty.csv"), 1, ["empty.csv", "no sample"]), (dict(log="bytes.csv"), 1, ["bytes.csv", "no CSV"]),
     (dict(more=["--column", "z"]), 2, ["no column 'z'", "x"]),
     (dict(log="half.csv", nominal="half.csv", more=["--column", "mode"]), 1, ["mode", "'walk'"]),
     (dict(more=["--detector", "cusumm"]), 2, ["cusumm", "cusum"]), (dict(more=["--detector", "hotelling"]), 2, ["hotelling"]),
     (dict(more=["--detector", "no_such_module_here:X"]), 2, ["no_such_module_here"]), (dict(more=["--arl0", "1"]), 2, ["arl0"]),
-    (dict(more=["--arl0", "nan"]), 2, ["arl0"]),
+    (dict(more=["--arl0", "nan"]), 2, ["arl0"]), (dict(more=["--arl0", "inf"]), 2, ["arl0", "finite", "above 1"]),
     (dict(more=["--rate", "0"]), 2, ["rate"]), (dict(more=["--out", "log.csv"]), 2, ["is a file"]), (dict(more=["--set", "a=1"]), 2, ["host"])])
 def test_bad_input_is_one_line(tmp_path, logs, mjx, monkeypatch, change, code, words):
   monkeypatch.chdir(tmp_path)

@@ -1,4 +1,6 @@
 """Detectors in plain Python: river's as they are, one's own, and what a mistake in them prints."""
+import sys
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -233,7 +235,24 @@ def test_load_names_and_settings(tmp_path):
   assert host.load("river.drift:PageHinkley").host_name == "PageHinkley"
 
 
+class Leaves:
+  """Ends the program at its third sample."""
+  n = 0
+
+  def update(self, x):
+    self.n += 1
+    if self.n == 3:
+      sys.exit(5)
+    return False
+
+
+def test_a_class_that_ends_the_program_is_one_line():
+  with pytest.raises(UserError, match="Leaves failed at step 2 of stream 0: SystemExit: 5"):
+    host.run_host(Leaves, streams(10, 1))
+
+
 FILES = {"syntax.py": "class D(:\n", "raises.py": "raise RuntimeError('first\\nsecond')\n", "imports.py": "import no_such_module_here\n",
+         "leaves.py": "import sys\nsys.exit()\n", "unbuilt.py": "class D:\n  def __init__(self): raise SystemExit(3)\n",
          "plain.py": "class D:\n  pass\nclass Needs:\n  def __init__(self, k): pass\n  def update(self, x): return False\nx = 3\n"}
 
 
@@ -242,11 +261,15 @@ FILES = {"syntax.py": "class D(:\n", "raises.py": "raise RuntimeError('first\\ns
     ("no_such_module_here:X", {}, 2, ["no_such_module_here", "path/to/file.py"]), ("river.no_part:X", {}, 2, ["river.no_part"]),
     ("river.drift:Nothing", {}, 2, ["Nothing", "river.drift"]), ("river.drift:PageHinkley", {"thresh": 1}, 2, ["thresh", "cannot be built"]),
     ("{}/none.py:D", {}, 1, ["none.py"]), ("{}/syntax.py:D", {}, 2, ["SyntaxError"]), ("{}/raises.py:D", {}, 2, ["RuntimeError: first second"]),
+    ("{}/leaves.py:D", {}, 2, ["importing", "SystemExit"]), ("leaves_mjx:D", {}, 2, ["importing leaves_mjx failed", "SystemExit"]),
+    ("{}/unbuilt.py:D", {}, 2, ["D cannot be built", "SystemExit: 3"]),
     ("{}/imports.py:D", {}, 2, ["no_such_module_here"]), ("{}/plain.py:D", {}, 2, ["D has no method update"]),
     ("{}/plain.py:x", {}, 2, ["no class 'x'"]), ("{}/plain.py:Needs", {}, 2, ["Needs cannot be built", "'k'"])])
-def test_what_cannot_be_loaded_is_one_line(tmp_path, source, settings, code, words):
+def test_what_cannot_be_loaded_is_one_line(tmp_path, monkeypatch, source, settings, code, words):
   for name, text in FILES.items():
     (tmp_path / name).write_text(text)
+  (tmp_path / "leaves_mjx.py").write_text(FILES["leaves.py"])
+  monkeypatch.syspath_prepend(tmp_path)
   with pytest.raises(UserError) as error:
     host.load(source.format(tmp_path), settings)
   assert all(word in one_line(error) for word in words), one_line(error)

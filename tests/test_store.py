@@ -96,6 +96,11 @@ def test_read_table_gives_null_as_nan(tmp_path):
   np.testing.assert_array_equal(store.read_table(tmp_path / "x.parquet")["a"], TABLE["a"])
 
 
+def test_read_table_of_a_missing_file_says_so(tmp_path):
+  with pytest.raises(FileError, match="^cannot read .*none.csv: no such file$"):
+    store.read_table(tmp_path / "none.csv")
+
+
 @pytest.mark.parametrize("content", [None, b"", b"PAR1 no table PAR1"])
 def test_read_table_of_no_table_is_one_line(tmp_path, content):
   if content is not None:

@@ -72,7 +72,7 @@ def _module(name: str):
     if e.name and (name == e.name or name.startswith(e.name + ".")):
       raise UserError(f"host detector: no module {e.name!r} is installed; a file of your own is given as path/to/file.py:Class") from None
     raise UserError(f"host detector: importing {name} failed: {_line(e)}") from None
-  except Exception as e:  # whatever a foreign module raises
+  except (Exception, SystemExit) as e:  # whatever a foreign module raises
     raise UserError(f"host detector: importing {name} failed: {_line(e)}") from None
 
 
@@ -87,7 +87,7 @@ def _file(name: str):
   sys.modules[inner] = module  # dataclasses look their module up there
   try:
     spec.loader.exec_module(module)
-  except Exception as e:
+  except (Exception, SystemExit) as e:
     del sys.modules[inner]
     raise UserError(f"host detector: importing {name} failed: {_line(e)}") from None
   return module
@@ -95,13 +95,13 @@ def _file(name: str):
 
 def _line(e: BaseException) -> str:
   """An exception in one line."""
-  return f"{type(e).__name__}: {' '.join(str(e).split())}"
+  return f"{type(e).__name__}: {' '.join(str(e).split()) or 'without a message'}"
 
 
 def _fresh(factory: Callable[[], Any], host_name: str) -> Any:
   try:
     detector = factory()
-  except Exception as e:
+  except (Exception, SystemExit) as e:
     raise UserError(f"host detector {host_name} cannot be built: {_line(e)}") from None
   if not callable(getattr(detector, "update", None)) or isinstance(detector, type):
     raise UserError(f"host detector {host_name}: {type(detector).__name__} has no method update(x)")
@@ -152,7 +152,7 @@ def run_host(factory: Callable[[], Any], xs: np.ndarray, host_name: str | None =
     for t in np.flatnonzero(np.isfinite(xs[:, s])):
       try:
         fired[t, s], scores[t, s] = _step(detector, float(xs[t, s]))
-      except Exception as e:
+      except (Exception, SystemExit) as e:
         raise UserError(f"host detector {type(detector).__name__} failed at step {t} of stream {s}: {_line(e)}") from None
   return fired, scores
 
