@@ -127,6 +127,7 @@ def survival(out, parts: list[str], columns: int = 3) -> pathlib.Path | None:
       axis.step(x, level + level[-1:], where="post", color=f"C{k}", lw=1.6, label=f"{arm}, {int(seen.sum())} of {len(seen)}")
       axis.plot(time[~seen], [level[int(np.searchsorted(curve.time, t, "right"))] for t in time[~seen]], "|", color=f"C{k}", ms=7)
     axis.set(title=part, xlabel="control steps since onset", ylim=(-0.03, 1.05))
+    axis.locator_params(axis="x", nbins=5)
     axis.legend(fontsize=7, title="recovered", title_fontsize=7)
   axes[0, 0].set_ylabel("share not yet recovered")
   tmp = out / "recovery.tmp.png"

@@ -36,6 +36,7 @@ SOURCES = {
     "stop-rule": ("stop/bench.json",),
     "again": ("again/bench.json",),
     "study": ("study/bench.json", "study/suite.json", "study/bench.parquet"),
+    "full": ("full/bench.json", "full/suite.json", "full/bench.parquet"),
     "two-agents": ("walker_gear/summary.json", "walker_plain/summary.json"),
     "gradient": ("policy_gradient.json",),
     "ppo": ("ppo_finetune.json", "paper/bench.json"),
