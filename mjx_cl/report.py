@@ -492,7 +492,7 @@ def full(results: pathlib.Path) -> str:
   from mjx_cl.scoring import bootstrap
   folder = results / "full"
   plan, entries = load(folder / "suite.json")["parts"], load(folder / "bench.json")["entries"]
-  lived = table(folder / "bench.parquet", ["part", "arm", "affected", "reward_pre", "reward_final"])
+  lived = table(folder / "bench.parquet", ["part", "arm", "seed", "affected", "alarm_step", "reward_pre", "reward_final"])
 
   def left(part, arm):
     """Reward of the affected streams over the last 2,000 steps as a share of that before the onset."""
@@ -514,8 +514,11 @@ def full(results: pathlib.Path) -> str:
   for part in plan:
     robots.setdefault(plan[part]["env"], []).append(part in entries)
   done = ", ".join(f"`{name}` {sum(have)} of {len(have)}" for name, have in robots.items())
+  hit, back, alone = (sum(entries[p]["arms"][arm][what] for p in plan if p in entries) for arm, what in (
+      ("detector", "affected"), ("detector", "recovered"), ("none", "recovered")))
+  first = {(p, r["seed"]) for p in plan if p in entries for r in lived if r["part"] == p and r["arm"] == "detector" and r["affected"] and r["alarm_step"] is not None}
   text = fill(f"""
-      {len(entries)} of {len(plan)} parts of suite `full` are finished ({done}), seeds {one['first_seed']} to {one['first_seed'] + one['seeds'] - 1}. Affected streams; streams with a false alarm
+      Of {hit} affected streams {len(first)} alarm; {back} recover with finetuning, {alone} without. {len(entries)} of {len(plan)} parts of suite `full` are finished ({done}), seeds {one['first_seed']} to {one['first_seed'] + one['seeds'] - 1}. Affected streams; streams with a false alarm
       before the onset; streams that alarm after it; affected ones that do within 500 steps; median latency of all streams, misses counted as infinite; affected streams
       recovered before the run ends, without and with finetuning; their reward over the last 2,000 steps over that before the onset (interquartile mean); normalised recovery (0: arm
       `none`, 1: the reward before onset, interquartile mean with 95 % bootstrap interval over the affected streams); finetunings that converge / are given up / still go on; updates a stream. {FEW if any(" to " in cell for row in rows for cell in row) else ""}""")
