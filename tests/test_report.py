@@ -65,7 +65,7 @@ def write(path, rows):
 def results(tmp_path):
   """A copy of results/ in which no file of any block is missing: the experiments of the paper are the walker's run, the car's with two changes."""
   out = tmp_path / "results"
-  shutil.copytree(RESULTS, out, ignore=shutil.ignore_patterns("*.png", "*.html", "paper", "arms", "stop", "again", "study", "detectors.json", "policy_gradient.json"))
+  shutil.copytree(RESULTS, out, ignore=shutil.ignore_patterns("*.png", "*.html", "paper", "arms", "stop", "again", "study", "full", "detectors.json", "policy_gradient.json"))
   rows = [{"name": "cusum: 1000 streams", "value": 0.4567, "unit": "s", "goal": "<= 1", "holds": True},
           {"name": "adwin: 1000 streams", "value": 23.4, "unit": "s", "goal": "<= 20", "holds": False},
           {"name": "ewma: a sample", "value": 1234.5, "unit": "ns", "goal": None, "holds": None}]
@@ -103,6 +103,11 @@ def results(tmp_path):
            for name, factor in (("walker", 1.0), ("less", 0.8)) for r in runs]
   write(out / "study/bench.parquet", lived)
   (out / "study/bench.json").write_text(json.dumps({"suite": "study", "parts": 2, "finished": 2, "entries": {"walker": entry, "less": entry}}))
+  (out / "full").mkdir()
+  plan = {"walker": part | {"fault": "gear"}, "other": part | {"fault": "walker/damping-easy"}, "car": part | {"env": "car"}}
+  (out / "full/suite.json").write_text(json.dumps({"suite": "full", "parts": {k: v | {"first_seed": 31, "seeds": 10} for k, v in plan.items()}}))
+  write(out / "full/bench.parquet", [r for r in lived if r["part"] == "walker"])
+  (out / "full/bench.json").write_text(json.dumps({"suite": "full", "parts": 3, "finished": 1, "entries": {"walker": entry}}))
   for suite, value in entries.items():
     (out / suite).mkdir(exist_ok=True)
     (out / suite / "bench.json").write_text(json.dumps({"suite": suite, "parts": 1, "finished": 1, "entries": {"walker": value}}))
@@ -273,6 +278,8 @@ def change(path):
   rows = [changed(r) for r in parquet.read_table(path).to_pylist()]
   if path.name == "runs.parquet":  # counts of rows are numbers too
     rows += rows
+  elif path == path.parent.parent / "full" / "bench.parquet":
+    rows += [r | {"seed": r["seed"] + 1000} for r in rows]
   elif path.name == "leaderboard.parquet":
     rows += [r | {"fault": "another"} for r in rows]
   elif path.name == "leaderboard_overall.parquet":
@@ -298,6 +305,7 @@ CONSTANTS = {  # what a block says of itself: windows of the definitions, sizes 
     "stop-rule": {"95", "1", "768", "1,536", "3,072"},
     "again": {"95", "2,000"},
     "study": {"1", "2,000"},
+    "full": {"95", "500", "2,000", "1", "2", "3"},
     "two-agents": {"95", "500", "10,000", "2,000"},
     "gradient": {"95"},
     "ppo": {"95", "3"},
