@@ -606,7 +606,7 @@ def execute(config: RunConfig, out, resume: bool = False, overwrite: bool = Fals
     store.write_json(out / "config.json", values)
   for text in doubts(config):
     tell(f"note: {text}")
-  tell(f"{runner.groups} streams of {config.steps:,} control steps; what is not compiled yet is compiled first, a minute or two")
+  tell(f"{len(config.arms) * config.seeds} streams of {config.steps:,} control steps; what is not compiled yet is compiled first, a minute or two")
   saved = time.monotonic()
   with Interruptible() as interrupt:
     last = None
