@@ -56,6 +56,8 @@ class Checkpoints:
       out = self._manager.restore(number, args=ocp.args.Composite(tree=ocp.args.StandardRestore(packed), meta=ocp.args.JsonRestore()))
     except Exception as e:  # orbax raises many kinds for a broken or foreign folder
       why = (str(e).splitlines() or [type(e).__name__])[0]
+      if "truth value" in why:  # orbax fails to print how two trees differ
+        why = "its contents are not those that are asked for"
       raise FileError(f"cannot read checkpoint {number} in {self.folder}: {why}; it is broken, of another version or of another kind of device: --overwrite begins anew") from None
     same = jax.tree.map(lambda a, b: a.shape == b.shape, out["tree"], packed)
     if not all(jax.tree.leaves(same)):

@@ -1,6 +1,7 @@
 """Result files: Parquet written to a temporary name and renamed, DuckDB views to query them."""
 from __future__ import annotations
 
+import functools
 import importlib.metadata
 import json
 import os
@@ -224,8 +225,9 @@ def provenance() -> dict:
           "machine": {"cpu": _cpu(), "cores": len(workers.cores()), "system": platform.system(), "arch": platform.machine()}}
 
 
+@functools.cache
 def _commit() -> str | None:
-  """Commit of the source tree this package runs from, None outside a checkout."""
+  """Commit of the source tree this package runs from, None outside a checkout; asked once, since a later one is not what this process has loaded."""
   try:
     out = subprocess.run(["git", "rev-parse", "HEAD"], cwd=pathlib.Path(__file__).parent, capture_output=True, text=True, timeout=5)
   except (OSError, subprocess.SubprocessError):

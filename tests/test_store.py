@@ -7,6 +7,8 @@ import pathlib
 
 import numpy as np
 import pyarrow.parquet
+import types
+
 import pytest
 
 from mjx_cl import store, workers
@@ -312,6 +314,16 @@ def test_claim_that_cannot_make_the_folder(tmp_path, monkeypatch):
   with pytest.raises(FileError) as error:
     claim(tmp_path / "a")
   assert "No space left" in one_line(error)
+
+
+def test_a_long_process_names_the_commit_that_it_began_with(monkeypatch):
+  """Commits may come while it runs, and it has loaded none of them."""
+  first = store.provenance()["git_commit"]
+  monkeypatch.setattr(store.subprocess, "run", lambda *a, **k: types.SimpleNamespace(stdout="another\n"))
+  assert store.provenance()["git_commit"] == first
+  store._commit.cache_clear()
+  assert store.provenance()["git_commit"] == "another"
+  store._commit.cache_clear()
 
 
 def test_provenance_names_versions_and_machine():
