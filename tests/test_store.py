@@ -4,6 +4,7 @@ import json
 import math
 import os
 import pathlib
+import types
 
 import numpy as np
 import pyarrow.parquet
