@@ -136,6 +136,9 @@ def config(where: str, values: dict) -> RunConfig:
     raise UserError(f"{where}: unknown setting {', '.join(map(repr, unknown))}; it takes: {', '.join(sorted(known))}")
   if "env" not in values:
     raise UserError(f"{where}: it needs an env")
+  for name in ("adapt", "settings"):
+    if not isinstance(values.get(name, {}), dict):
+      raise UserError(f"{where}: {name} is a table of settings; got {values[name]!r}")
   check_kinds(where, RunConfig, values)
   check_kinds(where, AdaptConfig, values.get("adapt", {}), "adapt.")
   try:

@@ -173,9 +173,9 @@ class Leaderboard:
   streams: Positional[str | None] = None
   """Folder of `mjx-cl record`; default: the set that ships."""
   out: str = "runs/leaderboard"
+  """Result folder."""
   overwrite: bool = False
   """Replace an earlier board in --out."""
-  """Result folder."""
   robot: tuple[str, ...] = ()
   """Only these robots of the set."""
   detector: tuple[str, ...] = ()

@@ -107,6 +107,8 @@ BAD = {
     "entry outside": ('name = "x"\n[entries."../../evil"]\nenv = "walker"', ["../../evil", "letters, digits"]),
     "a truth for a number": ('name = "x"\n[entries.a]\nenv = "walker"\nseverity = true', ["severity takes float", "True"]),
     "a word in adapt": ('name = "x"\n[entries.a]\nenv = "walker"\n[entries.a.adapt]\nbudget = "long"', ["adapt.budget takes int", "'long'"]),
+    "no table": ('name = "x"\n[entries.a]\nenv = "walker"\nadapt = 5', ["adapt is a table", "5"]),
+    "no table of the detector": ('name = "x"\n[entries.a]\nenv = "walker"\nsettings = "low"', ["settings is a table", "low"]),
     "twice": ('name = "x"\n[entries.a]\nenv = "walker"\nseverity = [0.5, 0.5]', ["a/severity=0.5", "twice"]),
     "no TOML": ("name = ", ["TOML"]),
     "unknown key": ('name = "x"\nruns = 1\n[entries.a]\nenv = "walker"', ["runs", "entries"]),

@@ -185,6 +185,9 @@ def test_a_pure_detector_of_a_file_is_made_and_a_plain_class_is_told_where_to_go
   (tmp_path / "mine.py").write_text(PLUG + "\nclass Plain:\n  def update(self, x):\n    return x > 1\n")
   detector = detectors.make(f"{tmp_path}/mine.py:level", channel="opr", log=False, threshold=2.0)
   residual = unknown((), 4)._replace(valid=jnp.bool_(True))
+  (tmp_path / "a@b").mkdir()
+  (tmp_path / "a@b" / "mine.py").write_text(PLUG)
+  assert isinstance(detectors.make(f"{tmp_path}/a@b/mine.py:level@rpr"), detectors.Detector)
   fired = [bool(detector.update(detector.init(), residual._replace(opr=jnp.float32(x)))[1].fired) for x in (1.0, 3.0)]
   assert fired == [False, True]
   for name, words in (("Plain", "leaderboard --add"), ("Nobody", "has no class 'Nobody'"), ("level", "wrong_setting")):

@@ -8,8 +8,6 @@ import types
 
 import numpy as np
 import pyarrow.parquet
-import types
-
 import pytest
 
 from mjx_cl import store, workers

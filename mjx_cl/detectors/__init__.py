@@ -116,9 +116,8 @@ def make(name: str, channel: str | None = None, log: bool | None = None, whiten:
     robot: whose figures `rolling_sigma` starts from, where CALIBRATED has them; default: the walker's.
     shared: `rolling_sigma` has one threshold for both residuals, see `one_threshold`.
   """
-  name, at, after = name.partition("@")
-  if at:
-    channel = after
+  if "@" in name.rpartition(":")[2]:  # a file's path may hold one too
+    name, _, channel = name.rpartition("@")
   if ":" in name:
     from mjx_cl.detectors import host
     build = _pure(name, host.find(name)[0])
@@ -137,8 +136,10 @@ def make(name: str, channel: str | None = None, log: bool | None = None, whiten:
     raise
   except (TypeError, ValueError) as e:
     values = ", ".join(f"{k}={v!r}" for k, v in settings.items() if not isinstance(v, jax.core.Tracer))
+    if not settings:
+      raise UserError(f"detector {name!r} cannot be built: {type(e).__name__}: {e}") from None
     if "argument" not in str(e):
-      raise UserError(f"detector {name!r}: a setting of the wrong kind, {values or 'none given'} ({e}); its settings are: {', '.join(known_settings(build))}") from None
+      raise UserError(f"detector {name!r}: a setting of the wrong kind among {values} ({e}); its settings are: {', '.join(known_settings(build))}") from None
     raise UserError(f"detector {name!r}: {e}; its settings are: {', '.join(known_settings(build))}") from None
   if whiten:
     detector = whitened(detector, whiten)
