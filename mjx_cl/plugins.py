@@ -1,13 +1,14 @@
 """Tables that other packages add to: robots, faults and detectors by entry points of their packages."""
 from __future__ import annotations
 
+import collections
 import importlib.metadata
 
 from mjx_cl.errors import PluginError
 
 
-class Registry(dict):
-  """A dict that the entry points of `group` join at its first use, so that a plug-in may import whatever it likes of this package.
+class Registry(collections.UserDict):
+  """A table that the entry points of `group` join at its first use, so that a plug-in may import whatever it likes of this package.
 
   Args:
     group: of entry points, such as `mjx_cl.faults`. kind: what a message calls a member. own: the members that are there already.
@@ -16,8 +17,13 @@ class Registry(dict):
   """
 
   def __init__(self, group: str, kind: str, own: dict):
-    super().__init__(own)
-    self.group, self.kind, self.own, self.filled = group, kind, frozenset(own), False
+    self.group, self.kind, self.own, self.filled, self.members = group, kind, frozenset(own), False, dict(own)
+
+  @property
+  def data(self) -> dict:
+    """What UserDict reads and writes."""
+    self.fill()
+    return self.members
 
   def fill(self) -> None:
     """Loads the plug-ins unless that is done, or is being done: a plug-in that looks into the table meanwhile sees what is there."""
@@ -38,45 +44,13 @@ class Registry(dict):
     except BaseException:
       self.filled = False
       raise
-    self.update(found)
+    self.members |= found
 
   def plugged(self) -> list[str]:
     """Names that are not this package's own."""
     return [name for name in self if name not in self.own]
 
-  def __getitem__(self, name):
-    self.fill()
-    return super().__getitem__(name)
-
-  def __contains__(self, name):
-    self.fill()
-    return super().__contains__(name)
-
-  def __iter__(self):
-    self.fill()
-    return super().__iter__()
-
-  def __len__(self):
-    self.fill()
-    return super().__len__()
-
-  def get(self, name, default=None):
-    self.fill()
-    return super().get(name, default)
-
-  def keys(self):
-    self.fill()
-    return super().keys()
-
-  def values(self):
-    self.fill()
-    return super().values()
-
-  def items(self):
-    self.fill()
-    return super().items()
-
 
 def line(e: BaseException) -> str:
   """An exception in one line."""
-  return f"{type(e).__name__}: {' '.join(str(e).split())}"
+  return f"{type(e).__name__}: {' '.join(str(e).split()) or 'without a message'}"

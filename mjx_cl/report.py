@@ -518,7 +518,7 @@ def full(results: pathlib.Path) -> str:
       ("detector", "affected"), ("detector", "recovered"), ("none", "recovered")))
   first = {(p, r["seed"]) for p in plan if p in entries for r in lived if r["part"] == p and r["arm"] == "detector" and r["affected"] and r["alarm_step"] is not None}
   text = fill(f"""
-      Of {hit} affected streams {len(first)} alarm; {back} recover with finetuning, {alone} without. {len(entries)} of {len(plan)} parts of suite `full` are finished ({done}), seeds {one['first_seed']} to {one['first_seed'] + one['seeds'] - 1}. Affected streams; streams with a false alarm
+      Of {hit} affected streams {len(first)} alarm; {back} recover in arm `detector`, {alone} in arm `none`. {len(entries)} of {len(plan)} parts of suite `full` are finished ({done}), seeds {one['first_seed']} to {one['first_seed'] + one['seeds'] - 1}. Affected streams; streams with a false alarm
       before the onset; streams that alarm after it; affected ones that do within 500 steps; median latency of all streams, misses counted as infinite; affected streams
       recovered before the run ends, without and with finetuning; their reward over the last 2,000 steps over that before the onset (interquartile mean); normalised recovery (0: arm
       `none`, 1: the reward before onset, interquartile mean with 95 % bootstrap interval over the streams that end a tenth or more below it without adaptation); finetunings that converge / are given up / still go on; updates a stream. {FEW if any(" to " in cell for row in rows for cell in row) else ""}""")

@@ -98,7 +98,7 @@ def test_the_readme_robot_is_built_with_and_without_physics(monkeypatch):
       self.physics = physics
   entry = lambda name, value: type("Entry", (), {"name": name, "value": f"mine:{name}", "load": staticmethod(lambda: value)})
   monkeypatch.setattr(importlib.metadata, "entry_points", lambda group: [entry("reach", space["Reach"]), entry("choosy", Choosy), entry("bad", lambda: 1 / 0)])
-  monkeypatch.setattr(envs, "ENVS", Registry("mjx_cl.envs", "environment", {name: dict.__getitem__(envs.ENVS, name) for name in envs.ENVS.own}))
+  monkeypatch.setattr(envs, "ENVS", Registry("mjx_cl.envs", "environment", {name: envs.ENVS.members[name] for name in envs.ENVS.own}))
   robot = envs.make("reach")
   state, obs = robot.init(robot.model, jax.random.key(0))
   assert robot.step(robot.model, state, jnp.ones(1))[1].obs.shape == obs.shape == (2,)

@@ -132,8 +132,6 @@ def make(name: str, channel: str | None = None, log: bool | None = None, whiten:
       detector = build(**(settings | ({} if patience == 1 else {"patience": patience})))
       return combine.cool_down(detector, cool_down) if cool_down else detector
     detector = build(**settings) if patience == 1 else combine.patience(build, patience, **settings)
-  except UserError:
-    raise
   except (TypeError, ValueError) as e:
     values = ", ".join(f"{k}={v!r}" for k, v in settings.items() if not isinstance(v, jax.core.Tracer))
     if not settings:

@@ -15,6 +15,7 @@ import numpy as np
 from mjx_cl.detectors.base import Alarm, Detector
 from mjx_cl.detectors.combine import CHANNELS, on
 from mjx_cl.errors import FileError, UserError
+from mjx_cl.plugins import line
 
 
 class HostDetector(NamedTuple):
@@ -71,9 +72,9 @@ def _module(name: str):
   except ModuleNotFoundError as e:
     if e.name and (name == e.name or name.startswith(e.name + ".")):
       raise UserError(f"host detector: no module {e.name!r} is installed; a file of your own is given as path/to/file.py:Class") from None
-    raise UserError(f"host detector: importing {name} failed: {_line(e)}") from None
+    raise UserError(f"host detector: importing {name} failed: {line(e)}") from None
   except (Exception, SystemExit) as e:  # whatever a foreign module raises
-    raise UserError(f"host detector: importing {name} failed: {_line(e)}") from None
+    raise UserError(f"host detector: importing {name} failed: {line(e)}") from None
 
 
 def _file(name: str):
@@ -89,20 +90,15 @@ def _file(name: str):
     spec.loader.exec_module(module)
   except (Exception, SystemExit) as e:
     del sys.modules[inner]
-    raise UserError(f"host detector: importing {name} failed: {_line(e)}") from None
+    raise UserError(f"host detector: importing {name} failed: {line(e)}") from None
   return module
-
-
-def _line(e: BaseException) -> str:
-  """An exception in one line."""
-  return f"{type(e).__name__}: {' '.join(str(e).split()) or 'without a message'}"
 
 
 def _fresh(factory: Callable[[], Any], host_name: str) -> Any:
   try:
     detector = factory()
   except (Exception, SystemExit) as e:
-    raise UserError(f"host detector {host_name} cannot be built: {_line(e)}") from None
+    raise UserError(f"host detector {host_name} cannot be built: {line(e)}") from None
   if not callable(getattr(detector, "update", None)) or isinstance(detector, type):
     raise UserError(f"host detector {host_name}: {type(detector).__name__} has no method update(x)")
   return detector
@@ -153,7 +149,7 @@ def run_host(factory: Callable[[], Any], xs: np.ndarray, host_name: str | None =
       try:
         fired[t, s], scores[t, s] = _step(detector, float(xs[t, s]))
       except (Exception, SystemExit) as e:
-        raise UserError(f"host detector {type(detector).__name__} failed at step {t} of stream {s}: {_line(e)}") from None
+        raise UserError(f"host detector {type(detector).__name__} failed at step {t} of stream {s}: {line(e)}") from None
   return fired, scores
 
 

@@ -82,21 +82,21 @@ def rolling_sigma(window: int = 1000, threshold: float = 3.0, patience: int = 1,
   if not (window >= 2 and patience >= 1 and above(threshold, 0) and min(warmup, window) >= 2 and smooth >= 1 and lag >= 0 and 0 < unit < float("inf")):
     raise UserError("rolling_sigma needs window >= 2, patience >= 1, threshold > 0, warmup >= 2, smooth >= 1, lag >= 0, unit > 0; got "
                     f"{window}, {patience}, {threshold}, {warmup}, {smooth}, {lag}, {unit}")
-  warmup, held, smoothing = min(warmup, window), window + lag, max(1, smooth)
+  warmup, held = min(warmup, window), window + lag
   shift = max(0, (window // 12).bit_length() - 1)
   size, number = 1 << shift, (window >> shift) + 1
 
   def init():
     zero = Moments(jnp.float32(0), jnp.float32(0))
-    return RollingSigmaState(jnp.zeros(smoothing), jnp.zeros(held), jnp.int32(0), jnp.int32(0), Moments(jnp.zeros(number), jnp.zeros(number)),
+    return RollingSigmaState(jnp.zeros(smooth), jnp.zeros(held), jnp.int32(0), jnp.int32(0), Moments(jnp.zeros(number), jnp.zeros(number)),
                              jnp.full(number, -1, jnp.int32), zero, jnp.zeros((2 * size, 2)), zero)
 
   def update(state, x):
     x = jnp.asarray(x, jnp.float32)
     known = ~jnp.isnan(x)
     put = lambda array, at, value, where: array.at[jnp.where(known & where, at, array.shape[0])].set(value, mode="drop")
-    recent = put(state.recent, state.count % smoothing, jnp.log(jnp.maximum(x, 1e-9)) if log else x, True)
-    y = jnp.sum(recent) / jnp.minimum(state.count + 1, smoothing)
+    recent = put(state.recent, state.count % smooth, jnp.log(jnp.maximum(x, 1e-9)) if log else x, True)
+    y = jnp.sum(recent) / jnp.minimum(state.count + 1, smooth)
     buffer = put(state.buffer, state.count % held, y, True)  # before it is read, else XLA copies it; what leaves it here nothing needs
     end = state.count - lag  # the window is samples [begin, end), of which those below 0 are none
     begin = end - window

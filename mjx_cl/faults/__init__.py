@@ -50,13 +50,9 @@ def make(name: str, env) -> Fault:
     return build(env)
   except UserError:
     raise
-  except AttributeError as e:
+  except Exception as e:  # whatever a foreign function raises
     if getattr(e, "name", None) == "mj_model" and not hasattr(env, "mj_model"):
       raise UserError(f"fault {name!r} acts on a MuJoCo model, which robot {env.spec.name!r} does not have") from None
-    if name in FAULTS.own:
-      raise
-    raise PluginError(f"fault {name!r} cannot be built for robot {env.spec.name!r}: {line(e)}") from e
-  except Exception as e:  # whatever a foreign function raises
     if name in FAULTS.own:
       raise
     raise PluginError(f"fault {name!r} cannot be built for robot {env.spec.name!r}: {line(e)}") from e
