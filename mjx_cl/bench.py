@@ -204,7 +204,7 @@ def estimate(part: Part, rate: float) -> Estimate:
   from mjx_cl import agents, envs, memory, run
   c = part.config
   spec = envs.make(c.env).spec
-  trained = agents.load(c.agent, c.env, len(spec.obs), len(spec.act)).agent.config
+  trained = agents.load(c.agent, spec.name, len(spec.obs), len(spec.act)).agent.config
   batch, starts = c.adapt.batch or trained.batch, c.adapt.last_starts
   size = memory.parameters(trained.size, len(spec.obs), len(spec.act), trained.bins)[0] / 640_867  # of size1m on a walker
   streams = len(c.arms) * c.seeds

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_cl import agents, envs, faults as faults_lib, store
+from mjx_cl import agents, envs, fault_presets, faults as faults_lib, store
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.faults import certificate
 from mjx_cl.monitor import Monitor
@@ -94,11 +94,11 @@ def certify(name: str, physics: str = "auto", episodes: int = 20, agent: str | N
   for fault in only:
     if not faults_lib.make(fault, env).owns:
       raise UserError(f"fault {fault!r} changes nothing by design; choose from: {', '.join(faults)}")
-  faults = {k: f for k, f in faults.items() if not only or k in only}
+  faults = {k: f for k, f in faults.items() if k in only} | {k: faults_lib.make(k, env) for k in only if ":" in k} if only else faults
   have = {name, getattr(env, "agents_of", None)} & set(agents.shipped())
-  trained = agents.load(agent, name, len(env.spec.obs), len(env.spec.act)) if episodes and (agent or have) else None
+  trained = agents.load(agent, env.spec.name, len(env.spec.obs), len(env.spec.act)) if episodes and (agent or have) else None
   progress(f"{name}: {len(faults)} faults, acting under the same commands")
-  rows = [c._asdict() | {"physics": env.physics.name, "agent": None, "episodes": 0, "return_nominal": None, "return_mean": None, "return_lost": None,
+  rows = [c._asdict() | {"physics": envs.physics_of(env).name, "agent": None, "episodes": 0, "return_nominal": None, "return_mean": None, "return_lost": None,
                          "return_lost_low": None, "return_lost_high": None, "kl_nats": None} for c in certificate.certify(env, faults)]
   if trained is None:
     return rows
@@ -198,7 +198,7 @@ def summary(rows: list[dict]) -> list[dict]:
   for robot in dict.fromkeys(r["robot"] for r in rows):
     mine = [certificate.Certificate(*(r[k] for k in fields)) for r in rows if r["robot"] == robot]
     wrong = certificate.faulty(mine)
-    names = {c.fault for c in mine if c.fault != "none" and "/" not in c.fault}
+    names = {c.fault for c in mine if c.fault != "none" and not fault_presets.named(c.fault)}
     out += [{"name": f"{robot}: faults certified", "value": len(names), "unit": "faults", "goal": None, "holds": None},
             {"name": f"{robot}: faults that fail", "value": len(wrong), "unit": "lanes", "goal": "== 0", "holds": not wrong}]
   return out

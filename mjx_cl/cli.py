@@ -574,7 +574,7 @@ def do_train(args: Train) -> None:
   if args.demonstrator not in (None, "ppo"):  # whatever can be refused is refused before an earlier training is touched
     train.expert(env, args.demonstrator)
   if args.agent:
-    agents.load(args.agent, args.env, len(env.spec.obs), len(env.spec.act))
+    agents.load(args.agent, env.spec.name, len(env.spec.obs), len(env.spec.act))
   state = store.claim_folder(args.out, args.resume, args.overwrite, done_marker="agent/card.json")
   if state == "done":
     say(f"{args.out}: this training is finished")
@@ -635,7 +635,7 @@ def do_eval(args: Eval) -> None:
     raise UserError(f"episodes must be above 0; got {args.episodes}")
   from mjx_cl import agents, envs, evaluate
   env = envs.make(args.env, args.physics)
-  trained = agents.load(args.agent, args.env, len(env.spec.obs), len(env.spec.act))
+  trained = agents.load(args.agent, env.spec.name, len(env.spec.obs), len(env.spec.act))
   result = evaluate.evaluate(env, trained.agent, trained.train.params, args.episodes, args.seed, int(trained.card.get("repeat", 1)), args.deterministic)
   if not math.isfinite(result["return_mean"]):
     raise FileError(f"agent {trained.path}: its return on {args.env} is {result['return_mean']}; its weights or the robot give what is no number")
@@ -770,7 +770,7 @@ def do_plot(args: Plot) -> None:
 
 def do_render(args: Render) -> None:
   from mjx_cl import adapters, agents, envs, render
-  out = args.out or f"{args.env}.gif"
+  out = args.out or f"{args.env.rpartition(':')[2]}.gif"
   render.check(out, args.steps, args.width, args.height, args.fps, args.seed)
   env = envs.make(args.env, args.physics)
   acting = {"seed": args.seed, "deterministic": args.deterministic, "severity": args.severity, "onset": args.onset, "duration": args.duration}
@@ -779,7 +779,7 @@ def do_render(args: Render) -> None:
   elif args.agent is None and not {args.env, getattr(envs.ENVS.get(args.env), "agents_of", None)} & set(agents.shipped()):
     raise UserError(f"no agent is shipped for {args.env}; give a folder, or --agent none (stands still), --agent random")
   else:
-    trained = agents.load(args.agent, args.env, len(env.spec.obs), len(env.spec.act))
+    trained = agents.load(args.agent, env.spec.name, len(env.spec.obs), len(env.spec.act))
     acting |= {"agent": trained.agent, "params": trained.train.params, "repeat": int(trained.card.get("repeat", 1))}
   result = render.render(env, out, args.steps, args.width, args.height, args.fps, args.fault, args.target, view=args.view,
                          say=lambda text: say(f"mjx-cl: {text}"), **acting)

@@ -281,7 +281,7 @@ class RunConfig:
 
   def __post_init__(self):
     last = self.steps
-    if "/" in self.fault:
+    if fault_presets.named(self.fault):
       preset = fault_presets.find(self.fault, self.env)
       if self.severity is not None or self.target is not None:
         raise UserError(f"preset {self.fault!r} brings its own severity and target; leave --severity and --target out")
@@ -323,12 +323,12 @@ class RunConfig:
 
 def becomes(config: RunConfig) -> str | None:
   """The environment that the robot of a run becomes, None: stays what it is."""
-  return fault_presets.find(config.fault, config.env).becomes if "/" in config.fault else None
+  return fault_presets.find(config.fault, config.env).becomes if fault_presets.named(config.fault) else None
 
 
 def changes(config: RunConfig) -> tuple[fault_presets.Change, ...]:
   """The faults of a run, with its duration where the preset leaves it open; of a robot that becomes another one, those of that other one."""
-  if "/" in config.fault:
+  if fault_presets.named(config.fault):
     preset = fault_presets.find(config.fault, config.env)
     if preset.becomes:
       return preset.then or (fault_presets.Change("none"),)

@@ -98,6 +98,11 @@ for _level, _damping, _grip in (("easy", 0.05, 0.2), ("medium", 0.25, 0.5), ("ha
 # lengths of limbs are excluded: MuJoCo calls a change of geom_size at run time unsafe
 
 
+def named(fault: str) -> bool:
+  """Whether this names a preset (robot/name) and not a fault; a fault may stand in a file, path/to/file.py:name."""
+  return "/" in fault and ":" not in fault
+
+
 def find(name: str, env_name: str) -> Preset:
   """The preset `name` for a robot; `any/...` fits every robot.
 

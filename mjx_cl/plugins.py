@@ -1,19 +1,28 @@
-"""Tables that other packages add to: robots, faults and detectors by entry points of their packages."""
+"""Tables that others add to: robots, faults and detectors, by entry points of their packages or out of a file, path/to/file.py:Name."""
 from __future__ import annotations
 
 import collections
+import functools
+import hashlib
+import importlib
 import importlib.metadata
+import importlib.util
+import pathlib
+import sys
+from typing import Callable
 
-from mjx_cl.errors import PluginError
+from mjx_cl.errors import FileError, PluginError, UserError
 
 
 class Registry(collections.UserDict):
-  """A table that the entry points of `group` join at its first use, so that a plug-in may import whatever it likes of this package.
+  """A table that the entry points of `group` join at its first use, so that a plug-in may import whatever it likes of this package. A name with a
+  colon, "path/to/file.py:Name" or "module:Name", is what stands there, see `find`; the table does not list it.
 
   Args:
     group: of entry points, such as `mjx_cl.faults`. kind: what a message calls a member. own: the members that are there already.
   Raises:
-    PluginError at each use, one line: a name that is taken, a module that cannot be loaded, a member that cannot be called.
+    PluginError at each use, one line: a name that is taken, a module that cannot be loaded, a member that cannot be called; UserError for a name
+    with a colon where nothing of that name is.
   """
 
   def __init__(self, group: str, kind: str, own: dict):
@@ -46,6 +55,14 @@ class Registry(collections.UserDict):
       raise
     self.members |= found
 
+  def __contains__(self, name) -> bool:
+    return ":" in name or name in self.data
+
+  def __missing__(self, name: str):
+    if ":" in name:
+      return find(name, self.kind)
+    raise KeyError(name)
+
   def plugged(self) -> list[str]:
     """Names that are not this package's own."""
     return [name for name in self if name not in self.own]
@@ -54,3 +71,47 @@ class Registry(collections.UserDict):
 def line(e: BaseException) -> str:
   """An exception in one line."""
   return f"{type(e).__name__}: {' '.join(str(e).split()) or 'without a message'}"
+
+
+def find(source: str, kind: str) -> Callable:
+  """What "module:Name" or "path/to/file.py:Name" names; UserError, one line that begins with `kind`, where there is nothing that can be called."""
+  where, colon, name = source.rpartition(":")
+  if not colon or not where or not name:
+    raise UserError(f"{kind} {source!r}: give module:Name or path/to/file.py:Name")
+  if where.endswith(".py"):
+    path = pathlib.Path(where).expanduser().resolve()
+    if not path.is_file():
+      raise FileError(f"{kind} {source}: no file {where}")
+    load = lambda: _file(path, path.stat().st_mtime_ns)
+  else:
+    load = lambda: importlib.import_module(where)
+  try:
+    module = load()
+  except UserError:
+    raise
+  except ModuleNotFoundError as e:
+    if e.name and (where == e.name or where.startswith(e.name + ".")):
+      raise UserError(f"{kind} {source}: no module {e.name!r} is installed; a file of your own is given as path/to/file.py:Name") from None
+    raise PluginError(f"{kind} {source}: importing {where} failed: {line(e)}") from None
+  except (Exception, SystemExit) as e:  # whatever a foreign module raises
+    raise PluginError(f"{kind} {source}: importing {where} failed: {line(e)}") from None
+  found = getattr(module, name, None)
+  if not callable(found):
+    raise UserError(f"{kind} {source}: {where} has nothing of the name {name!r} that can be called")
+  return found
+
+
+@functools.lru_cache(maxsize=None)
+def _file(path: pathlib.Path, changed: int):
+  """The module in a file, loaded once for each time that it was written (`changed` [ns])."""
+  # under a name of its own: two files of one name must not be taken for each other
+  inner = f"mjx_cl_file_{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:12]}"
+  spec = importlib.util.spec_from_file_location(inner, path)
+  module = importlib.util.module_from_spec(spec)
+  sys.modules[inner] = module  # dataclasses look their module up there
+  try:
+    spec.loader.exec_module(module)
+  except BaseException:
+    del sys.modules[inner]
+    raise
+  return module

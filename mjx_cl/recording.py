@@ -161,7 +161,7 @@ def prepare(suite_: Suite, robots, physics: str, agent: str | None) -> dict[str,
     for key in (k for table in suite_.robots[robot].values() for k in table):
       fault, _, target = key.partition(":")
       faults_lib.target_index(faults_lib.make(fault, env), target or None)
-    out[robot] = env, agents.load(agent, robot, len(env.spec.obs), len(env.spec.act))
+    out[robot] = env, agents.load(agent, env.spec.name, len(env.spec.obs), len(env.spec.act))
     if int(out[robot][1].card.get("repeat", 1)) != 1:
       raise UserError(f"the agent of {robot!r} holds its actions; streams are recorded with agents that act in every control step")
   return out

@@ -13,7 +13,7 @@ import textwrap
 from collections import Counter
 from typing import NamedTuple
 
-from mjx_cl import paper, store
+from mjx_cl import fault_presets, paper, store
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.paper import number, span
 
@@ -504,7 +504,7 @@ def full(results: pathlib.Path) -> str:
     one, own, none = plan[part], entries[part]["arms"]["detector"], entries[part]["arms"]["none"]
     worth = (entries[part]["scores"]["normalised"] or {}).get("detector")
     of = lambda arm, name: f"{arm[name]} of {arm['affected']}" if arm["affected"] else "-"
-    rows.append((f"`{one['env']}`" if one["env"] != last else "", f"`{one['fault']}`" + ("" if "/" in one["fault"] else f" {one['severity']:g}"),
+    rows.append((f"`{one['env']}`" if one["env"] != last else "", f"`{one['fault']}`" + ("" if fault_presets.named(one["fault"]) else f" {one['severity']:g}"),
                  f"{own['affected']} of {own['seeds']}", str(own["false_alarm_streams"]), f"{own['alarms']} of {own['seeds']}", of(own, "affected_alarmed_within_500"),
                  both(own, "latency_median_steps"), of(none, "recovered"), of(own, "recovered"), left(part, "none"), left(part, "detector"),
                  few(worth, "normalised", worth["seeds"], 2) if worth and worth["seeds"] else "-",

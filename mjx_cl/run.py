@@ -85,7 +85,7 @@ class Runner:
     self.other = envs.make(becomes(config), config.physics) if becomes(config) else None  # what the robot becomes
     self.robots = [self.env] + [self.other] * (self.other is not None)
     spec = self.env.spec
-    self.trained = agents.load(config.agent, config.env, len(spec.obs), len(spec.act), lr=config.adapt.lr, policy_lr=config.adapt.policy_lr,
+    self.trained = agents.load(config.agent, spec.name, len(spec.obs), len(spec.act), lr=config.adapt.lr, policy_lr=config.adapt.policy_lr,
                                anchor=config.adapt.anchor, last_starts=config.adapt.last_starts, batch=config.adapt.batch)
     agent, self.repeat = self.trained.agent, int(self.trained.card.get("repeat", 1))
     self.others = arm_agents(config, spec)
@@ -183,7 +183,7 @@ class Runner:
                     digest.phase, digest.signals[:, 2], self._alarms, digest.updates)
 
   def _physics_seconds(self) -> float:
-    return sum(getattr(robot.physics, "seconds", 0.0) for robot in self.robots)
+    return sum(getattr(envs.physics_of(robot), "seconds", 0.0) for robot in self.robots)
 
   def _acceptance(self, streams, now: int):
     """Level (groups,) of the robot that each stream has after `now` control steps; None where robots stay what they are."""
@@ -292,7 +292,7 @@ class Runner:
   def config_dict(self) -> dict:
     """What config.json holds."""
     return {"command": "run", **identity(self.config),
-            "physics": "+".join(dict.fromkeys(robot.physics.name for robot in self.robots)),
+            "physics": "+".join(dict.fromkeys(envs.physics_of(robot).name for robot in self.robots)),
             "agent_card": self.trained.card, **({"arm_cards": {arm: other.card for arm, other in self.others.items()}} if self.others else {}), "agent_path": pathlib.Path(self.trained.path).name, "repeat": self.repeat,
             "control_s": self.env.spec.control_s, **store.provenance()}
 
@@ -501,11 +501,11 @@ def arm_agents(config: RunConfig, spec) -> dict[str, agents.Trained]:
   """
   out = {}
   for arm in (a for a in config.arms if ARMS[a].agent):
-    trained = agents.load(config.agent, config.env, len(spec.obs), len(spec.act))
+    trained = agents.load(config.agent, spec.name, len(spec.obs), len(spec.act))
     given = config.agent and pathlib.Path(config.agent).exists()
     name = f"{trained.path if given else pathlib.Path(trained.path).name}-{ARMS[arm].agent}"
     try:
-      other = agents.load(name, config.env, len(spec.obs), len(spec.act))
+      other = agents.load(name, spec.name, len(spec.obs), len(spec.act))
     except UserError as e:
       raise UserError(f"arm {arm!r}: {e}") from None
     same = lambda t: (t.agent.config.size, t.agent.config.obs_scale, int(t.card.get("repeat", 1)))

@@ -190,8 +190,39 @@ def test_a_pure_detector_of_a_file_is_made_and_a_plain_class_is_told_where_to_go
   assert isinstance(detectors.make(f"{tmp_path}/a@b/mine.py:level@rpr"), detectors.Detector)
   fired = [bool(detector.update(detector.init(), residual._replace(opr=jnp.float32(x)))[1].fired) for x in (1.0, 3.0)]
   assert fired == [False, True]
-  for name, words in (("Plain", "leaderboard --add"), ("Nobody", "has no class 'Nobody'"), ("level", "wrong_setting")):
+  for name, words in (("Plain", "leaderboard --add"), ("Nobody", "nothing of the name 'Nobody'"), ("level", "wrong_setting")):
     more = ("--set", "wrong_setting=1") if name == "level" else ()
     assert cli.main(["run", "walker", "--detector", f"{tmp_path}/mine.py:{name}", "--out", str(tmp_path / "r"), *more]) == 2
     err = capsys.readouterr().err
     assert words in err and err.strip().count("\n") == 0 and not (tmp_path / "r").exists()
+
+
+def test_robot_and_fault_of_a_file(tmp_path, capsys, tiny):
+  """As of a package: built, proven to act, trained agents fit by the robot's own name; the robot names no physics."""
+  import dataclasses
+
+  from mjx_cl import agents, certify, run
+  from mjx_cl.config import RunConfig, changes
+  (tmp_path / "mine.py").write_text(PLUG)
+  robot, broken = (f"{tmp_path}/mine.py:{name}" for name in ("Reach", "sticky"))
+  env = envs.make(robot)
+  assert type(env) is type(envs.make(robot)) and type(env).__name__ == "Reach" and robot in envs.ENVS and robot not in [*envs.ENVS]
+  assert faults.make(broken, env).owns == ("ctrl",) and faults.family(broken) == "plugin" and faults.family("none") == "none" and faults.family("gear") == "actuator"
+  assert "plugin: The first command sticks" in faults.about(broken)
+  rows = certify.certify(robot, episodes=0, only=(broken,))
+  acts = [r for r in rows if r["fault"] == broken and r["severity"] > 0]
+  assert acts and all(not r["identical"] and r["first_step"] == 0 and r["physics"] == "jax" for r in acts) and not certify.certificate.faulty(
+    [certify.certificate.Certificate(*(r[k] for k in certify.certificate.Certificate._fields)) for r in rows])
+
+  config = RunConfig(robot, fault=broken, steps=256, onset=128, seeds=1, agent=str(tmp_path / "agent"))
+  assert config.severity == 0.5 and changes(config)[0].fault == broken  # no preset, for all its slashes
+  agents.save(tmp_path / "agent", jax.jit(type(tiny)(tiny.config, 2, 1).init)(jax.random.key(0)),
+              {"env": "reach", "preset": "tiny", "repeat": 1, "dreamer": dataclasses.asdict(tiny.config)})
+  assert run.Runner(config, tmp_path / "run").config_dict()["physics"] == "jax"
+
+  for argv, words in ((("eval", f"{tmp_path}/mine.py:Nobody"), "nothing of the name 'Nobody'"), (("eval", "nowhere.py:Robot"), "no file nowhere.py"),
+                      (("eval", "no_such_module:Robot"), "no module 'no_such_module' is installed"), (("eval", ":x"), "give module:Name or"),
+                      (("run", "walker", "--fault", f"{tmp_path}/mine.py:broken", "--out", str(tmp_path / "r")), "cannot be built for robot 'walker': ZeroDivisionError")):
+    code = cli.main([*argv])
+    err = capsys.readouterr().err
+    assert code in (1, 2) and words in err and err.strip().count("\n") == 0 and not (tmp_path / "r").exists(), err

@@ -118,11 +118,9 @@ def make(name: str, channel: str | None = None, log: bool | None = None, whiten:
   """
   if "@" in name.rpartition(":")[2]:  # a file's path may hold one too
     name, _, channel = name.rpartition("@")
+  build = choose("detector", name, DETECTORS)
   if ":" in name:
-    from mjx_cl.detectors import host
-    build = _pure(name, host.find(name)[0])
-  else:
-    build = choose("detector", name, DETECTORS)
+    build = _pure(name, build)
   if name == "rolling_sigma":
     settings = (one_threshold(robot) if shared else CALIBRATED.get(robot, {})) | settings
   try:

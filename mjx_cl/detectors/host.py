@@ -1,11 +1,6 @@
 """Detectors of one's own in plain Python, run over recorded streams on the host: no JAX, no vmap, one object per stream."""
 from __future__ import annotations
 
-import hashlib
-import importlib
-import importlib.util
-import pathlib
-import sys
 from typing import Any, Callable, NamedTuple
 
 import jax
@@ -14,8 +9,8 @@ import numpy as np
 
 from mjx_cl.detectors.base import Alarm, Detector
 from mjx_cl.detectors.combine import CHANNELS, on
-from mjx_cl.errors import FileError, UserError
-from mjx_cl.plugins import line
+from mjx_cl.errors import UserError
+from mjx_cl.plugins import find, line
 
 
 class HostDetector(NamedTuple):
@@ -47,51 +42,11 @@ def load(source: str, settings: dict | None = None, host_name: str | None = None
   """
   if channel not in CHANNELS:
     raise UserError(f"unknown channel {channel!r}; choose from: {', '.join(CHANNELS)}")
-  build, name = find(source)
+  build, name = find(source, "host detector"), source.rpartition(":")[2]
   settings = dict(settings or {})
   host = HostDetector(lambda: build(**settings), host_name or name, channel, log)
   _fresh(host.factory, host.host_name)
   return host
-
-
-def find(source: str) -> tuple[Callable, str]:
-  """What "module:Class" or "path/to/file.py:Class" names, and the name after the colon; UserError, one line, where there is none."""
-  where, colon, name = source.rpartition(":")
-  if not colon or not where or not name:
-    raise UserError(f"a host detector is module:Class or path/to/file.py:Class; got {source!r}")
-  module = _file(where) if where.endswith(".py") else _module(where)
-  build = getattr(module, name, None)
-  if not callable(build):
-    raise UserError(f"host detector {source}: {where} has no class {name!r}")
-  return build, name
-
-
-def _module(name: str):
-  try:
-    return importlib.import_module(name)
-  except ModuleNotFoundError as e:
-    if e.name and (name == e.name or name.startswith(e.name + ".")):
-      raise UserError(f"host detector: no module {e.name!r} is installed; a file of your own is given as path/to/file.py:Class") from None
-    raise UserError(f"host detector: importing {name} failed: {line(e)}") from None
-  except (Exception, SystemExit) as e:  # whatever a foreign module raises
-    raise UserError(f"host detector: importing {name} failed: {line(e)}") from None
-
-
-def _file(name: str):
-  path = pathlib.Path(name).expanduser()
-  if not path.is_file():
-    raise FileError(f"host detector: no file {name}")
-  # under a name of its own: two files of one name must not be taken for each other
-  inner = f"mjx_cl_host_{path.stem}_{hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:12]}"
-  spec = importlib.util.spec_from_file_location(inner, path)
-  module = importlib.util.module_from_spec(spec)
-  sys.modules[inner] = module  # dataclasses look their module up there
-  try:
-    spec.loader.exec_module(module)
-  except (Exception, SystemExit) as e:
-    del sys.modules[inner]
-    raise UserError(f"host detector: importing {name} failed: {line(e)}") from None
-  return module
 
 
 def _fresh(factory: Callable[[], Any], host_name: str) -> Any:

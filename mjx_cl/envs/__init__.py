@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import inspect
+import types
 
 from mjx_cl.envs.car import Car
 from mjx_cl.envs.car_real import CarReal
@@ -11,6 +12,12 @@ from mjx_cl.errors import PluginError, UserError, choose
 from mjx_cl.plugins import Registry, line
 
 ENVS = Registry("mjx_cl.envs", "environment", {"walker": Walker, "quadruped": Quadruped, "car": Car, "car_real": CarReal})
+PURE_JAX = types.SimpleNamespace(name="jax", seconds=0.0)  # no time is spent outside the compiled program
+
+
+def physics_of(env):
+  """The physics backend of a robot: its `name`, and the `seconds` spent in it outside the compiled program; of a robot that names none, pure JAX."""
+  return getattr(env, "physics", PURE_JAX)
 
 
 def make(name: str, physics: str = "auto"):

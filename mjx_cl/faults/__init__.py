@@ -26,8 +26,8 @@ FAULTS = Registry("mjx_cl.faults", "fault", {"none": none} | {name: make for fam
 
 
 def family(name: str) -> str:
-  """Name of the family of fault `name`; those of other packages are of family `plugin`."""
-  return next((f for f, members in FAMILIES.items() if name in members), "plugin" if name in FAULTS.plugged() else "none")
+  """Name of the family of fault `name`; those of other packages and files are of family `plugin`."""
+  return next((f for f, members in FAMILIES.items() if name in members), "none" if name == "none" else "plugin")
 
 
 def about(name: str) -> str:

@@ -128,7 +128,7 @@ def plans(faults: dict[str, faults_lib.Fault], chosen: list[Lane], onset: int):
              "period": np.full(shape, 1000), "share": np.full(shape, 0.5)}
   target = np.zeros(shape, np.int32)
   for i, lane in enumerate(chosen):
-    changes = (fault_presets.Change(lane.fault, lane.target, lane.severity),) if "/" not in lane.fault else fault_presets.PRESETS[lane.fault].changes
+    changes = (fault_presets.Change(lane.fault, lane.target, lane.severity),) if not fault_presets.named(lane.fault) else fault_presets.PRESETS[lane.fault].changes
     if len({(c.fault, c.after) for c in changes}) < len(changes):
       raise ValueError(f"preset {lane.fault!r} has a fault twice at once, which one program cannot hold")
     for c in {c.fault: c for c in sorted(changes, key=lambda c: -c.after)}.values():  # the earliest of each comes last, and stays
@@ -206,12 +206,12 @@ def compare(env, faults, chosen, rows, plain, onset) -> list[Certificate]:
   # an outcome of step t is read at t + 1: a sensor that fails at the onset already shows in the outcome of the step before
   out = [Certificate(env.spec.name, "none", "none", "all", 0.0, rounding < ROUNDING, False, None, rounding, None, None, None, "")]
   for i, lane in enumerate(chosen):
-    mine = (lane.fault,) if "/" not in lane.fault else tuple(c.fault for c in fault_presets.PRESETS[lane.fault].changes)
+    mine = (lane.fault,) if not fault_presets.named(lane.fault) else tuple(c.fault for c in fault_presets.PRESETS[lane.fault].changes)
     begin = onset - 1 if any(faults[name].senses for name in mine) else onset
     at = np.flatnonzero(differs[i])
     first = int(at[0]) if at.size else None
     values = [float(size[i, first + k - 1]) if first is not None and first + k - 1 < size.shape[1] else None for k in AFTER]
-    kind, reason = ("preset", "") if "/" in lane.fault else (faults_lib.family(lane.fault), faults[lane.fault].not_monotone)
+    kind, reason = ("preset", "") if fault_presets.named(lane.fault) else (faults_lib.family(lane.fault), faults[lane.fault].not_monotone)
     out.append(Certificate(env.spec.name, lane.fault, kind, lane.target, lane.severity, not at.size, first is not None and first < begin,
                            None if first is None else first - begin, *values, monotone(chosen, differs, size, i), reason, bool(sound[i])))
   return out
