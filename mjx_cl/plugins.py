@@ -56,10 +56,10 @@ class Registry(collections.UserDict):
     self.members |= found
 
   def __contains__(self, name) -> bool:
-    return ":" in name or name in self.data
+    return name in self.data or (isinstance(name, str) and ":" in name)
 
-  def __missing__(self, name: str):
-    if ":" in name:
+  def __missing__(self, name):
+    if name in self:  # though not in `data`
       return find(name, self.kind)
     raise KeyError(name)
 
