@@ -254,7 +254,10 @@ class Trainer:
     streams, rows = self.collect[self.phase].chunk(params, self.state.streams, CHUNK, drive, shake, jitter)
     if self.fault is not None:
       streams = self._redraw(streams, jnp.any(rows.terminated | rows.truncated, 0))
-    replay = self._add(self.state.replay, *kept(rows))
+    if self.config.fall_cost and self.config.updates - self.updates > self.config.pure:
+      replay = self._add(self.state.replay, *kept(rows._replace(reward=rows.reward - self.config.fall_cost * rows.terminated)))
+    else:
+      replay = self._add(self.state.replay, *kept(rows))
     self.state = self.state._replace(streams=streams, replay=replay)
     expert_returns, own, each = [], [], {g: [] for g in range(self.seeds)}
     for at, value in self.returns.add(rows):

@@ -288,6 +288,30 @@ def test_training_episodes_may_be_cut_and_some_robots_jittered(short_walker, tmp
     TrainConfig(jitter=-0.1)
 
 
+def test_an_end_for_good_costs_until_the_last_updates(short_walker, tmp_path):
+  """Every second robot falls where its episodes end: its last records lose the cost, nobody else's do, no return does, and no record of the last updates."""
+  falls = np.arange(ENVS) % 2 == 0
+  replays, returns = [], []
+  for cost, pure in ((0.0, 1), (7.0, 1), (7.0, 10_000)):
+    trainer = make_trainer(short_walker, tmp_path, fall_cost=cost, pure=pure)
+    counted(trainer)
+    chunk = trainer.collect["pure"].chunk
+
+    def fallen(*args, chunk=chunk):
+      streams, rows = chunk(*args)
+      return streams, rows._replace(terminated=rows.truncated & falls, truncated=rows.truncated & ~falls)
+    trainer.collect = {"pure": types.SimpleNamespace(chunk=fallen)}
+    returns.append(trainer.step()["return"])
+    replays.append(jax.tree.map(lambda x: np.asarray(x)[0], trainer.state.replay.data))
+  plain, cost, late = replays
+  assert plain.terminal.any() and (plain.terminal == plain.last & falls[:, None]).all()
+  np.testing.assert_array_equal(cost.reward, plain.reward - np.float32(7) * plain.terminal)
+  np.testing.assert_array_equal(late.reward, plain.reward)
+  assert returns[0] == returns[1] == returns[2]
+  with pytest.raises(UserError, match="fall_cost must be 0 or above"):
+    TrainConfig(fall_cost=-1)
+
+
 def test_the_policy_is_held_at_the_start_of_the_pure_phase(short_walker, tmp_path):
   """Without its own gradient for the first `hold` updates; the anchor takes the robots' own actions for right, so no random ones may be among them."""
   trainer = make_trainer(short_walker, tmp_path, replace(DREAMER, anchor=0.5), hold=20)
