@@ -79,6 +79,8 @@ class Run:
   """Control steps of adaptation between two snapshots of arm oracle-budget, which the stop rule is scored against; 0: none."""
   keep: bool = False
   """Write what each stream has learnt as an agent, OUT/agents/ARM-SEED, for --agent of another run."""
+  parts: bool = False
+  """Also write the residual of each part of the observation into trace.parquet, columns residual_NAME."""
   adapt: AdaptConfig = AdaptConfig()
   json: bool = False
   """One JSON value on standard output, nothing else there."""
@@ -462,7 +464,7 @@ def do_run(args: Run) -> None:
       env=args.env, fault=args.fault, target=None if args.target == "random" else args.target, severity=args.severity, onset=args.onset,
       duration=args.duration, schedule=args.schedule, period=args.period, share=args.share, steps=args.steps, seeds=args.seeds, first_seed=args.first_seed, detector=args.detector, settings=settings(args.set),
       arms=args.arm, agent=args.agent, physics=args.physics, form=args.form, actions=args.actions, deterministic=args.deterministic, adapt=args.adapt,
-      snapshots=args.snapshots, keep=args.keep)
+      snapshots=args.snapshots, keep=args.keep, parts=args.parts)
   from mjx_cl import run
   with RunDisplay() as display:
     summary = run.execute(config, args.out, args.resume, args.overwrite, display, tell=say)

@@ -257,6 +257,7 @@ class RunConfig:
     snapshots: control steps of adaptation between two snapshots of the weights that act, in arms that never stop by themselves; 0: none.
       Each is evaluated on the broken robot once the run is over, see snapshots.py.
     keep: what each stream has learnt is written as an agent, see run.Runner.keep.
+    parts: trace.parquet also holds the residual of each part of the observation (monitor.watched), columns residual_NAME.
   """
   env: str
   fault: str = "gear"
@@ -281,6 +282,7 @@ class RunConfig:
   adapt: AdaptConfig = AdaptConfig()
   snapshots: int = 0
   keep: bool = False
+  parts: bool = False
 
   def __post_init__(self):
     last = self.steps

@@ -33,7 +33,7 @@ from mjx_cl.adapt.loop import Choices, Loop, LoopState, choices
 from mjx_cl.config import AdaptConfig, RunConfig, becomes, changes
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.interrupt import Interruptible
-from mjx_cl.monitor import Monitor
+from mjx_cl.monitor import Monitor, watched
 from mjx_cl.rollout import Rollout, Stream, nest, start
 from mjx_cl.scoring import alarms as alarm_score, bootstrap, recovery, stop
 from mjx_cl.snapshots import Snapshots
@@ -231,6 +231,7 @@ class Runner:
         "score": at_end(digest.score), "alarm": ends(digest.fired),
         "phase": np.broadcast_to(self._phase.astype(np.int8), rewards.shape).copy(),
         "updates": np.broadcast_to(self._updates.astype(np.int32), rewards.shape).copy(),
+        **({"parts": at_end(digest.residual.groups)} if self.config.parts else {}),
         "signals": digest.signals[None], "decision": digest.decision[None], "since": digest.since[None], "settled": digest.settled[None]}
     if self.endless:  # what the stop rule reads besides the signals
       now = (self.done_chunks + 1) * self.chunk_steps
@@ -366,6 +367,8 @@ class Runner:
              "phase": np.asarray(phase_lib.PHASES)[flat(trace["phase"])], "fault_active": flat(trace["severity"] > 0), "severity": flat(trace["severity"]),
              "reward": flat(trace["reward"]), "opr": flat(trace["opr"]), "rpr": flat(trace["rpr"]), "score": flat(trace["score"]),
              "alarm": flat(trace["alarm"]), "terminated": flat(trace["terminated"]), "truncated": flat(trace["truncated"]), "valid": flat(trace["valid"])}
+    if self.config.parts:
+      table |= {f"residual_{name}": flat(trace["parts"][:, :, k]) for k, (name, at) in enumerate(watched(self.env.spec)) if at}
     for column_name, index in (("dyn_loss", 3), ("adv_mag", 4), ("value_loss", 5)):  # once per chunk, in the row at which it is known
       values = np.full((steps, groups), np.nan, np.float32)
       at = np.minimum((np.arange(len(trace["signals"])) + 1) * self.chunk_steps, steps) - 1
