@@ -29,7 +29,7 @@ ENDS = [min(STEPS, (i + 1) * run.CHUNK) - 1 for i in range(-(-STEPS // run.CHUNK
 # nominal levels from step 100, an alarm at any sample beyond three deviations of the last 100, settled four chunks after it
 ARGS = ["run", "walker", "--steps", str(STEPS), "--onset", str(ONSET), "--seeds", "2", "--first-seed", "3", "--detector", "rolling_sigma_plain",
         "--set", "window=100", "warmup=30", "--adapt.warmup", "100", "--adapt.start-windows", "40", "--adapt.patience", "4", "--adapt.least", "64",
-        "--adapt.trend", "1e9", "--adapt.fluctuation", "1e9", "--adapt.refit", "100", "--keep", "--json"]
+        "--adapt.trend", "1e9", "--adapt.fluctuation", "1e9", "--adapt.refit", "100", "--keep", "--parts", "--json"]
 
 
 class Easy(Walker):
@@ -96,10 +96,24 @@ def test_all_files_are_there_with_their_columns(whole):
   assert sorted(os.listdir(out)) == ["agents", "config.json", "events.parquet", "figure.png", "runs.parquet", "summary.json", "trace.parquet"]
   assert list(table(out, "trace")) == [
       "stream", "arm", "seed", "fault", "step", "episode", "phase", "fault_active", "severity", "reward", "opr", "rpr", "score", "alarm",
-      "terminated", "truncated", "valid", "dyn_loss", "adv_mag", "value_loss", "updates"]
+      "terminated", "truncated", "valid", *(f"residual_{name}" for name, _ in envs.make("walker").spec.watched), "dyn_loss", "adv_mag", "value_loss", "updates"]
   assert {"stream", "step", "kind", "reason", "fault"} <= set(table(out, "events"))
   assert {"arm", "onset", "alarm_step", "latency_steps", "latency_s", "false_alarms", "adapt_start", "adapt_stop", "outcome", "recovery_step",
           "reward_pre", "reward_drop", "reward_final", "return_lost", "terminations", "updates", "wall_s"} <= set(table(out, "runs"))
+
+
+def test_residuals_of_the_parts_are_known_where_opr_is(whole):
+  """`--parts`. A part of one variable is that variable's residual over its typical deviation, so that it bounds OPR, the mean over all, from below."""
+  rows, spec = by_stream(whole[0]), envs.make("walker").spec
+  known = rows["valid"]
+  assert 0 < known.mean() < 1
+  for name, at in spec.watched:
+    part = rows[f"residual_{name}"]
+    np.testing.assert_array_equal(np.isfinite(part), known)
+    least = min(spec.obs[i].scale for i in at)
+    assert (part[known] >= 0).all() and (part[known] * least * len(at) / len(spec.obs) <= rows["opr"][known] * (1 + 1e-4)).all()  # float32 sums
+  parts = np.stack([rows[f"residual_{name}"][known] for name, _ in spec.watched])
+  assert len({tuple(p) for p in parts}) == len(parts)
 
 
 def test_config_tells_how_it_was_made(whole, saved):
