@@ -123,6 +123,8 @@ class TrainConfig:
       held by `anchor`, before the policy climbs on them. A critic that saw a demonstrator's data too may tell the two apart by posture.
     fall_cost: taken off the reward that the agent learns from where an episode ends for good, but for the last `pure` updates; returns are reported
       without it. Where a random robot pays for every step (the quadruped's effort), an end that costs nothing is what is learnt. 0: never.
+    penalties: factor on the negative weights of the reward in training, returns included: a first stage, from which `--agent` goes on with the task's
+      own, 1. Where effort costs more than a beginner earns, it learns not to move.
     fault, severity: domain randomisation: each robot draws a target of this fault and a severity, uniform in [0, `severity`], at the start and at the
       end of every chunk of 64 decisions in which one of its episodes ended. None: healthy robots.
   """
@@ -147,13 +149,14 @@ class TrainConfig:
   jitter: float = 0.0
   hold: int = 0
   fall_cost: float = 0.0
+  penalties: float = 1.0
   fault: str | None = None
   severity: float = 1.0
 
   def __post_init__(self):
     positive(self, "envs", "updates", "ratio", "capacity", "repeat", *(("episode",) if self.episode is not None else ()))
     fraction(self, "demo_share", "clone_until", "shake", "shake_share", "severity")
-    for name in ("jitter", "hold", "fall_cost"):
+    for name in ("jitter", "hold", "fall_cost", "penalties"):
       if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
         raise UserError(f"{name} must be 0 or above; got {getattr(self, name)}")
     if self.demonstrator and self.clone + self.fade + self.pure > self.updates:

@@ -102,6 +102,18 @@ def cut(env, steps: int | None):
   return env
 
 
+def eased(env, factor: float):
+  """The environment with its reward's negative weights times `factor`; itself for 1."""
+  if factor == 1.0:
+    return env
+  weights = env.model.task.get("reward_weights")
+  if weights is None or not (np.asarray(weights) < 0).any():
+    raise UserError(f"penalties: the reward of robot {env.spec.name!r} has no negative weights")
+  env = copy.copy(env)
+  env.model = env.model._replace(task=env.model.task | {"reward_weights": jnp.where(weights < 0, weights * factor, weights)})
+  return env
+
+
 class Returns:
   """Returns of finished episodes, per stream, from chunks of rewards."""
 
@@ -130,7 +142,7 @@ class Trainer:
 
   def __init__(self, env, dreamer: DreamerConfig, config: TrainConfig, out, seed: int = 0, seeds: int = 1):
     self.env, self.dreamer, self.config, self.out = env, dreamer, config, pathlib.Path(out)
-    env = cut(env, config.episode)
+    env = eased(cut(env, config.episode), config.penalties)
     self.seeds = seeds
     self.expert = expert(env, config.demonstrator) if config.demonstrator else None
     self.expert_return = 0.0

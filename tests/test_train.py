@@ -1,4 +1,5 @@
 """Pretraining: exact resume, the train ratio, phases with a demonstrator, checkpoints that survive kills and refuse damage."""
+import copy
 import os
 import pathlib
 import shutil
@@ -310,6 +311,23 @@ def test_an_end_for_good_costs_until_the_last_updates(short_walker, tmp_path):
   assert returns[0] == returns[1] == returns[2]
   with pytest.raises(UserError, match="fall_cost must be 0 or above"):
     TrainConfig(fall_cost=-1)
+
+
+def test_penalties_are_eased_and_nothing_else(short_walker, tmp_path):
+  robot = copy.copy(short_walker)
+  before = np.asarray(short_walker.model.task["reward_weights"]).copy()
+  before[0] = -2.0
+  robot.model = robot.model._replace(task=robot.model.task | {"reward_weights": jnp.asarray(before)})
+  trainer = make_trainer(robot, tmp_path, penalties=0.25)
+  at = trainer.collect["pure"].env
+  assert at is not robot and trainer.env is robot  # what is evaluated in the end
+  np.testing.assert_array_equal(at.model.task["reward_weights"], np.where(before < 0, before * np.float32(0.25), before))
+  np.testing.assert_array_equal(robot.model.task["reward_weights"], before)
+  for name, leaf in robot.model.task.items():
+    assert name == "reward_weights" or at.model.task[name] is leaf
+  assert train.eased(robot, 1.0) is robot
+  with pytest.raises(UserError, match="has no negative weights"):
+    make_trainer(short_walker, tmp_path, penalties=0.5)
 
 
 def test_the_policy_is_held_at_the_start_of_the_pure_phase(short_walker, tmp_path):
