@@ -10,6 +10,8 @@ from mjx_cl.adapt.arms import ARMS, never_stops
 from mjx_cl.dreamer.sizes import SIZES
 from mjx_cl.errors import UserError, choose
 
+CHUNK = 64  # decisions of a run between two looks at the stop rule, and between two rounds of updates
+
 
 def positive(config, *names: str) -> None:
   """Raises unless every named field is a finite number above 0."""

@@ -45,7 +45,7 @@ def read(path) -> Log:
   The separator is the comma, or where the header has none the semicolon or the tabulator; then numbers may have a decimal comma, if most that have
   a fraction do: one sign for the whole file, a cell with the other is no number. A second row without a number above columns of numbers is taken for
   units. A column `time` [s] or `step` tells when samples were taken and is not watched; a column of seconds by another name (`time_s`, `seconds`) is
-  taken as `time` if there is none and it rises throughout. A column with a cell that is no number is left out.
+  taken as `time` if there is none and it rises throughout. A first column without a name, among others, is called `index`. A column with a cell that is no number is left out.
   """
   text, notes = _text(path)
   head = _first_line(text)
@@ -123,6 +123,8 @@ def _header(path, head: str, names: list[str]) -> list[str]:
     if all(_number(cell) is not None or sign != "," and _number(cell, True) is not None for cell in numbers):
       example = sign.join(f"x{k + 1}" for k in range(min(3, len(numbers)))) + (f"{sign}..." if len(numbers) > 3 else "")
       raise FileError(f"{path} has no header row with the names of its columns; put a line of names before it, e.g. {example}")
+  if names[0] == "" and len(names) > 1 and "index" not in names:
+    names = ["index", *names[1:]]  # pandas and R write the numbers of the rows there
   if "" in names or len(set(names)) < len(names):
     raise FileError(f"{path}: every column needs a name of its own; got {', '.join(map(repr, names))}")
   return names

@@ -455,7 +455,10 @@ def render(env, out, steps: int = 400, width: int = 480, height: int = 360, fps:
   label = " ".join(["FAULT", fault] + ([target] if target not in (None, "random") else []))
   count = 0
   tmp = out.with_name(f".{out.stem}.tmp{out.suffix.lower()}")
-  tmp.touch()  # an unwritable place is found before anything is computed
+  try:
+    tmp.touch()  # an unwritable place is found before anything is computed
+  except OSError as e:
+    raise FileError(f"cannot write {out}: {e.strerror or e}") from None
   scene = None
   try:
     scene, drawn_by = painter(env, width, height, view, say)

@@ -14,6 +14,7 @@ from collections import Counter
 from typing import NamedTuple
 
 from mjx_cl import fault_presets, paper, store
+from mjx_cl.config import CHUNK
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.paper import number, span
 
@@ -420,7 +421,7 @@ def stop_rule(results: pathlib.Path) -> str:
       without.append((f"`{part}`" if not k else "", names, *stopped(own)))
     for patience, left_out in entry["scores"]["without_floor"].items():
       for k, (names, own) in enumerate(alike(left_out)):
-        floorless.append((f"`{part}`" if not k else "", number(64 * int(patience)) if not k else "", names, *stopped(own)))
+        floorless.append((f"`{part}`" if not k else "", number(CHUNK * int(patience)) if not k else "", names, *stopped(own)))
   text = fill(f"""
       The oracle stop is the earliest snapshot whose frozen episodes on the broken robot reach {percent(first['share'])} % of the best snapshot's. Medians and
       interquartile means with 95 % bootstrap intervals over streams; an adaptation that never ended counts as later than all others. Return lost is the best

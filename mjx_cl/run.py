@@ -30,7 +30,7 @@ from mjx_cl.adapt.arms import ARMS, FOREVER, NEVER, never_stops
 from mjx_cl.adapt.convergence import SIGNALS
 from mjx_cl.adapt.crew import Crew
 from mjx_cl.adapt.loop import Choices, Loop, LoopState, choices
-from mjx_cl.config import AdaptConfig, RunConfig, becomes, changes
+from mjx_cl.config import CHUNK, AdaptConfig, RunConfig, becomes, changes
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.interrupt import Interruptible
 from mjx_cl.monitor import Monitor, watched
@@ -39,7 +39,6 @@ from mjx_cl.scoring import alarms as alarm_score, bootstrap, recovery, stop
 from mjx_cl.snapshots import Snapshots
 from mjx_cl.transfer import Moving, Transfer
 
-CHUNK = 64  # decisions
 # by decision: what a stream has come to
 OUTCOMES = ("nominal", "adapting", "converged", "aborted_by_rule", "aborted_by_rule", "aborted_by_budget", "ended")
 

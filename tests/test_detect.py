@@ -93,6 +93,7 @@ def text_log(tmp_path, text):
     ("a,b\ns,Nm\n1,2\n", {"a": [1], "b": [2]}), ("a,b,c\nA,,[-]\n1,2,x\n", {"a": [1], "b": [2]}),
     ("a;b\nA;V\n0,5;1\n", {"a": [0.5], "b": [1]}),
     ("a,b\r1,2\r3,4\r", {"a": [1, 3], "b": [2, 4]}), ("\u200ba,b\n1,2\n", {"\u200ba": [1], "b": [2]}),
+    (",a\n0,5\n1,6\n", {"index": [0, 1], "a": [5, 6]}), ('"";"a"\n"1";5\n"2";6\n', {"index": [1, 2], "a": [5, 6]}),  # as pandas and R write them
     ("mode,a\nwalk,\nwalk,1\n", {"a": [np.nan, 1]})])
 def test_what_is_read(tmp_path, text, columns):
   log = text_log(tmp_path, text)
@@ -110,7 +111,7 @@ def test_clock_and_words_are_no_columns(tmp_path):
     ("", ["header"]), ("1,2\n3,4\n", ["header", "put a line of names before it, e.g. x1,x2"]),
     ("1.5;2;3;4\n", ["header", "e.g. x1;x2;x3;..."]),
     ("0,5;0,6\n", ["header", "e.g. x1;x2"]), ("a\0,b\n1,2\n", ["no CSV", "UTF-8"]),
-    ("a,a\n1,2\n", ["name of its own"]), ("a,\n1,2\n", ["name of its own"]),
+    ("a,a\n1,2\n", ["name of its own"]), ("a,\n1,2\n", ["name of its own"]), (",index\n1,2\n", ["name of its own"]),
     ("a,b\n1,2\n3\n", ["line 3", "1 cells under 2"]), ("a,time\n1,2\n1,2\n", ["time", "rise"]), ("a,time\nA,s\n1,2\n1,2\n", ["time", "rise"]),
     ("a,step\n1,2\n1,\n", ["step", "gap"])])
 def test_a_broken_file_is_one_line(tmp_path, text, words):
