@@ -116,7 +116,7 @@ def main() -> None:
       data = {k: z[k] for k in z.files}
   else:
     env = envs.make(args.robot)
-    trained = agents.load(args.agent, args.robot, len(env.spec.obs), len(env.spec.act))
+    trained = agents.of(env, args.agent)
     tell = lambda done, steps: print(f"{done}/{steps}", file=sys.stderr) if done % 6400 == 0 else None
     nominal = record.record(env, trained, record.stream_keys(seeds, args.streams), args.steps, progress=tell)
     fault = record.record(env, trained, record.stream_keys(seeds, 4), 7500, *TUNE[args.robot], 5000, progress=tell)

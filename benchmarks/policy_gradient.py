@@ -72,7 +72,7 @@ def ascent(agent: Agent, train, held: replay.Replay, batches: int):
 
 def measure(args) -> dict:
   env = envs.make(args.env)
-  trained = agents.load(args.agent, args.env, len(env.spec.obs), len(env.spec.act))
+  trained = agents.of(env, args.agent)
   agent = Agent(dataclasses.replace(trained.agent.config, last_starts=0, entropy=0.0), len(env.spec.obs), len(env.spec.act))
   train, params = trained.train, trained.train.params
   held = own_data(env, trained, args.robots, args.records, args.jitter)

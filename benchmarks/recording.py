@@ -49,7 +49,7 @@ def main() -> None:
   args = parser.parse_args()
   chunk = 64
   env = envs.make("walker")
-  trained = agents.load(None, "walker", len(env.spec.obs), len(env.spec.act))
+  trained = agents.of(env)
   batch, single = live(env, trained, args.streams, chunk), live(env, trained, 1, chunk)
   times = {"batch": [], "single": []}
   for k in range(1 + args.steps // chunk):  # the first round compiles

@@ -203,8 +203,8 @@ def estimate(part: Part, rate: float) -> Estimate:
   """Expected cost of a part on a machine whose dense float32 products run at `rate` FLOP/s. Physics is taken to scale alike: an estimate, no promise."""
   from mjx_cl import agents, envs, memory, run
   c = part.config
-  spec = envs.make(c.env).spec
-  trained = agents.load(c.agent, spec.name, len(spec.obs), len(spec.act)).agent.config
+  env = envs.make(c.env)
+  spec, trained = env.spec, agents.of(env, c.agent).agent.config
   batch, starts = c.adapt.batch or trained.batch, c.adapt.last_starts
   size = memory.parameters(trained.size, len(spec.obs), len(spec.act), trained.bins)[0] / 640_867  # of size1m on a walker
   streams = len(c.arms) * c.seeds
@@ -231,7 +231,7 @@ def check(part: Part) -> None:
   try:
     detectors.make(c.detector, **c.settings)
     faults.build(changes(c), envs.make(becomes(c) or c.env, c.physics), c.onset)
-    run.arm_agents(c, envs.make(c.env, c.physics).spec)
+    run.arm_agents(c, envs.make(c.env, c.physics))
   except UserError as e:
     raise UserError(f"part {part.name}: {e}") from None
 

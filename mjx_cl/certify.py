@@ -94,9 +94,8 @@ def certify(name: str, physics: str = "auto", episodes: int = 20, agent: str | N
   for fault in only:
     if not faults_lib.make(fault, env).owns:
       raise UserError(f"fault {fault!r} changes nothing by design; choose from: {', '.join(faults)}")
-  faults = {k: f for k, f in faults.items() if k in only} | {k: faults_lib.make(k, env) for k in only if ":" in k} if only else faults
-  have = {name, getattr(env, "agents_of", None)} & set(agents.shipped())
-  trained = agents.load(agent, env.spec.name, len(env.spec.obs), len(env.spec.act)) if episodes and (agent or have) else None
+  faults = {k: faults_lib.make(k, env) for k in only} or faults
+  trained = agents.of(env, agent) if episodes and (agent or agents.is_shipped(env)) else None
   progress(f"{name}: {len(faults)} faults, acting under the same commands")
   rows = [c._asdict() | {"physics": envs.physics_of(env).name, "agent": None, "episodes": 0, "return_nominal": None, "return_mean": None, "return_lost": None,
                          "return_lost_low": None, "return_lost_high": None, "kl_nats": None} for c in certificate.certify(env, faults)]
@@ -147,7 +146,7 @@ def old_rows(folder) -> list[dict]:
 
 def guard(folder, names: tuple[str, ...], episodes: int) -> None:
   """Refuses what would lose measured costs, before anything is measured."""
-  costly = {r["robot"] for r in old_rows(folder) if r["episodes"]} & set(names)
+  costly = {r["robot"] for r in old_rows(folder) if r["episodes"]} & {envs.make(name).spec.name if ":" in name else name for name in names}
   if not episodes and costly:
     raise UserError(f"{folder} holds measured costs of {', '.join(sorted(costly))}; give --episodes above 0, or another --out")
 

@@ -576,7 +576,7 @@ def do_train(args: Train) -> None:
   if args.demonstrator not in (None, "ppo"):  # whatever can be refused is refused before an earlier training is touched
     train.expert(env, args.demonstrator)
   if args.agent:
-    agents.load(args.agent, env.spec.name, len(env.spec.obs), len(env.spec.act))
+    agents.of(env, args.agent)
   state = store.claim_folder(args.out, args.resume, args.overwrite, done_marker="agent/card.json")
   if state == "done":
     say(f"{args.out}: this training is finished")
@@ -637,7 +637,7 @@ def do_eval(args: Eval) -> None:
     raise UserError(f"episodes must be above 0; got {args.episodes}")
   from mjx_cl import agents, envs, evaluate
   env = envs.make(args.env, args.physics)
-  trained = agents.load(args.agent, env.spec.name, len(env.spec.obs), len(env.spec.act))
+  trained = agents.of(env, args.agent)
   result = evaluate.evaluate(env, trained.agent, trained.train.params, args.episodes, args.seed, int(trained.card.get("repeat", 1)), args.deterministic)
   if not math.isfinite(result["return_mean"]):
     raise FileError(f"agent {trained.path}: its return on {args.env} is {result['return_mean']}; its weights or the robot give what is no number")
@@ -778,10 +778,10 @@ def do_render(args: Render) -> None:
   acting = {"seed": args.seed, "deterministic": args.deterministic, "severity": args.severity, "onset": args.onset, "duration": args.duration}
   if args.agent in ("none", "random"):
     acting["agent"] = adapters.Puppet(len(env.spec.act), float(args.agent == "random"))
-  elif args.agent is None and not {args.env, getattr(envs.ENVS.get(args.env), "agents_of", None)} & set(agents.shipped()):
+  elif args.agent is None and not agents.is_shipped(env):
     raise UserError(f"no agent is shipped for {args.env}; give a folder, or --agent none (stands still), --agent random")
   else:
-    trained = agents.load(args.agent, env.spec.name, len(env.spec.obs), len(env.spec.act))
+    trained = agents.of(env, args.agent)
     acting |= {"agent": trained.agent, "params": trained.train.params, "repeat": int(trained.card.get("repeat", 1))}
   result = render.render(env, out, args.steps, args.width, args.height, args.fps, args.fault, args.target, view=args.view,
                          say=lambda text: say(f"mjx-cl: {text}"), **acting)

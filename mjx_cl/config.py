@@ -10,7 +10,7 @@ from mjx_cl.adapt.arms import ARMS, never_stops
 from mjx_cl.dreamer.sizes import SIZES
 from mjx_cl.errors import UserError, choose
 
-CHUNK = 64  # decisions of a run between two looks at the stop rule, and between two rounds of updates
+CHUNK = 64  # decisions between two rounds of updates, of a training as of a run, where the stop rule looks as often
 
 
 def positive(config, *names: str) -> None:
@@ -123,8 +123,8 @@ class TrainConfig:
       less. What an action does shows in the data only as far as actions differ from what the policy would have done there.
     hold: updates of the pure phase, from its start, without the policy's own gradient: critic and model learn what the robots do by themselves,
       held by `anchor`, before the policy climbs on them. A critic that saw a demonstrator's data too may tell the two apart by posture.
-    fall_cost: taken off the reward that the agent learns from where an episode ends for good, but for the last `pure` updates; returns are reported
-      without it. Where a random robot pays for every step (the quadruped's effort), an end that costs nothing is what is learnt. 0: never.
+    fall_cost: taken off the reward of new records where an episode ends for good, but for the last `pure` updates; returns are reported without it.
+      Where a random robot pays for every step (the quadruped's effort), an end that costs nothing is what is learnt. 0: never.
     penalties: factor on the negative weights of the reward in training, returns included: a first stage, from which `--agent` goes on with the task's
       own, 1. Where effort costs more than a beginner earns, it learns not to move.
     fault, severity: domain randomisation: each robot draws a target of this fault and a severity, uniform in [0, `severity`], at the start and at the
@@ -161,6 +161,8 @@ class TrainConfig:
     for name in ("jitter", "hold", "fall_cost", "penalties"):
       if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
         raise UserError(f"{name} must be 0 or above; got {getattr(self, name)}")
+    if self.fall_cost and self.pure >= self.updates:
+      raise UserError(f"fall_cost is not taken in the last pure={self.pure} updates, and there are no more than updates={self.updates}; set pure below that")
     if self.demonstrator and self.clone + self.fade + self.pure > self.updates:
       raise UserError(f"clone + fade + pure = {self.clone + self.fade + self.pure} exceeds updates = {self.updates}")
 
@@ -184,8 +186,8 @@ class AdaptConfig:
     average: rate per chunk with updates of the moving average of the weights that acts while adapting; 1: the newest weights. An earlier
       agent, seeds 100 to 104, reward 5,000 to 10,000 steps after onset: 0.82 with 0.1, 0.78 with 1 (that run ended at 8,000).
     fresh_moments: forget the optimiser's moments at an alarm. Kept ones were gathered on the gradients of a trained agent; those after an event
-      are many times larger, so that each step would be that many times the learning rate until the RMS (memory 1,000 updates) has followed. Walkers and cars on tuning seeds end the same
-      with and without (results/fresh_moments).
+      are many times larger, so that each step would be that many times the learning rate until the RMS (memory 1,000 updates) has followed. On tuning seeds no
+      difference shows, of walkers and cars (results/fresh_moments).
     patience: length over which every signal must be settled [chunks of 64 decisions].
     trend: largest difference of the medians of the first and second half of that length [share of the level].
     fluctuation: largest spread over that length, the interquartile range / 1.349 [share of the level], or

@@ -123,7 +123,7 @@ def _header(path, head: str, names: list[str]) -> list[str]:
     if all(_number(cell) is not None or sign != "," and _number(cell, True) is not None for cell in numbers):
       example = sign.join(f"x{k + 1}" for k in range(min(3, len(numbers)))) + (f"{sign}..." if len(numbers) > 3 else "")
       raise FileError(f"{path} has no header row with the names of its columns; put a line of names before it, e.g. {example}")
-  if names[0] == "" and len(names) > 1 and "index" not in names:
+  if names[0] == "" and len(names) > 1 and "" not in names[1:] and "index" not in names:
     names = ["index", *names[1:]]  # pandas and R write the numbers of the rows there
   if "" in names or len(set(names)) < len(names):
     raise FileError(f"{path}: every column needs a name of its own; got {', '.join(map(repr, names))}")

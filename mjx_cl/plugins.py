@@ -7,6 +7,7 @@ import hashlib
 import importlib
 import importlib.metadata
 import importlib.util
+import os
 import pathlib
 import sys
 from typing import Callable
@@ -59,7 +60,7 @@ class Registry(collections.UserDict):
     return name in self.data or (isinstance(name, str) and ":" in name)
 
   def __missing__(self, name):
-    if name in self:  # though not in `data`
+    if isinstance(name, str) and ":" in name:
       return find(name, self.kind)
     raise KeyError(name)
 
@@ -73,18 +74,26 @@ def line(e: BaseException) -> str:
   return f"{type(e).__name__}: {' '.join(str(e).split()) or 'without a message'}"
 
 
+def file_of(source: str) -> pathlib.Path | None:
+  """The file in "path/to/file.py:Name", absolute; None for any other name."""
+  where, colon, _ = source.rpartition(":")
+  if not colon or not where.endswith(".py"):
+    return None
+  return pathlib.Path(os.path.expanduser(where)).resolve()
+
+
 def find(source: str, kind: str) -> Callable:
   """What "module:Name" or "path/to/file.py:Name" names; UserError, one line that begins with `kind`, where there is nothing that can be called."""
   where, colon, name = source.rpartition(":")
   if not colon or not where or not name:
     raise UserError(f"{kind} {source!r}: give module:Name or path/to/file.py:Name")
-  if where.endswith(".py"):
-    path = pathlib.Path(where).expanduser().resolve()
-    if not path.is_file():
-      raise FileError(f"{kind} {source}: no file {where}")
-    load = lambda: _file(path, path.stat().st_mtime_ns)
-  else:
+  path = file_of(source)
+  if path is None:
     load = lambda: importlib.import_module(where)
+  elif not path.is_file():
+    raise FileError(f"{kind} {source}: no file {where}")
+  else:
+    load = lambda: _file(path, path.stat().st_mtime_ns)
   try:
     module = load()
   except UserError:

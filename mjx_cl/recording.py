@@ -157,11 +157,13 @@ def prepare(suite_: Suite, robots, physics: str, agent: str | None) -> dict[str,
   for robot in robots or suite_.robots:
     if robot not in suite_.robots:
       raise UserError(f"suite {suite_.name!r} has no robot {robot!r}; choose from: {', '.join(suite_.robots)}")
+    if ":" in robot:
+      raise UserError(f"suite {suite_.name!r}: robot {robot!r} gives the recording's files their names; register it, in the entry-point group mjx_cl.envs")
     env = envs.make(robot, physics)
     for key in (k for table in suite_.robots[robot].values() for k in table):
       fault, _, target = key.partition(":")
       faults_lib.target_index(faults_lib.make(fault, env), target or None)
-    out[robot] = env, agents.load(agent, env.spec.name, len(env.spec.obs), len(env.spec.act))
+    out[robot] = env, agents.of(env, agent)
     if int(out[robot][1].card.get("repeat", 1)) != 1:
       raise UserError(f"the agent of {robot!r} holds its actions; streams are recorded with agents that act in every control step")
   return out

@@ -13,6 +13,7 @@ without adaptation shares its past.
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 import os
 import pathlib
@@ -24,7 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_cl import agents, checkpoint, detectors, envs, faults, memory, replay, runtime, store
+from mjx_cl import agents, checkpoint, detectors, envs, faults, memory, plugins, replay, runtime, store
 from mjx_cl.adapt import phase as phase_lib
 from mjx_cl.adapt.arms import ARMS, FOREVER, NEVER, never_stops
 from mjx_cl.adapt.convergence import SIGNALS
@@ -84,13 +85,14 @@ class Runner:
     self.other = envs.make(becomes(config), config.physics) if becomes(config) else None  # what the robot becomes
     self.robots = [self.env] + [self.other] * (self.other is not None)
     spec = self.env.spec
-    self.trained = agents.load(config.agent, spec.name, len(spec.obs), len(spec.act), lr=config.adapt.lr, policy_lr=config.adapt.policy_lr,
-                               anchor=config.adapt.anchor, last_starts=config.adapt.last_starts, batch=config.adapt.batch)
+    adapt = config.adapt
+    self.trained = agents.of(self.env, config.agent, lr=adapt.lr, policy_lr=adapt.policy_lr, anchor=adapt.anchor, last_starts=adapt.last_starts,
+                             batch=adapt.batch)
     agent, self.repeat = self.trained.agent, int(self.trained.card.get("repeat", 1))
-    self.others = arm_agents(config, spec)
+    self.others = arm_agents(config, self.env)
     self.changes = changes(config)
     self.faults, plan, target = faults.build(self.changes, self.robots[-1], config.onset)
-    robot = getattr(type(self.env), "agents_of", None) or config.env
+    robot = getattr(self.env, "agents_of", None) or spec.name
     detector = detectors.make(config.detector, robot=robot, **config.settings)
     monitor = Monitor(agent, n=15, form=config.form, actions=config.actions, spec=spec)
     if self.other is None:
@@ -107,7 +109,7 @@ class Runner:
     self.seeds = [config.first_seed + i for i in range(config.seeds)]
     self.labels = [(arm, seed) for arm in config.arms for seed in self.seeds]
     self.groups = len(self.labels)
-    same = (agent.config, agent.obs_size, agent.act_size, agent.stepwise, config.form, config.actions, spec, detectors.DETECTORS.get(config.detector),
+    same = (agent.config, agent.obs_size, agent.act_size, agent.stepwise, config.form, config.actions, spec, detectors.factory(config.detector),
             config.detector, robot, json.dumps(config.settings, sort_keys=True, default=repr))
     self.crew = Crew(Loop(agent, monitor, detector, spec, config.adapt, self.repeat, capacity=needs(config.steps), same=same), self.groups)
     self.breaks = np.asarray([ARMS[arm].breaks for arm, _ in self.labels])
@@ -495,7 +497,7 @@ class Runner:
     return out
 
 
-def arm_agents(config: RunConfig, spec) -> dict[str, agents.Trained]:
+def arm_agents(config: RunConfig, env) -> dict[str, agents.Trained]:
   """Arm -> its own agent, of the arms that bring one: the run's with the arm's word behind its name, or beside the folder that --agent gives.
 
   Raises:
@@ -503,11 +505,11 @@ def arm_agents(config: RunConfig, spec) -> dict[str, agents.Trained]:
   """
   out = {}
   for arm in (a for a in config.arms if ARMS[a].agent):
-    trained = agents.load(config.agent, spec.name, len(spec.obs), len(spec.act))
+    trained = agents.of(env, config.agent)
     given = config.agent and pathlib.Path(config.agent).exists()
     name = f"{trained.path if given else pathlib.Path(trained.path).name}-{ARMS[arm].agent}"
     try:
-      other = agents.load(name, spec.name, len(spec.obs), len(spec.act))
+      other = agents.of(env, name)
     except UserError as e:
       raise UserError(f"arm {arm!r}: {e}") from None
     same = lambda t: (t.agent.config.size, t.agent.config.obs_scale, int(t.card.get("repeat", 1)))
@@ -647,8 +649,12 @@ def clear(out: pathlib.Path) -> None:
 
 
 def identity(config: RunConfig) -> dict:
-  """What makes a run what it is, as config.json holds it: its settings, and `changes`, what a preset's name stood for when it began."""
-  return json.loads(json.dumps({**dataclasses.asdict(config), "changes": [dataclasses.asdict(change) for change in changes(config)]}))
+  """What makes a run what it is, as config.json holds it: its settings, `changes`, what a preset's name stood for when it began, and the SHA-256 of
+  the `files` that robot, fault or detector stand in."""
+  sources = {name: plugins.file_of(name) for name in (config.env, config.detector, *(change.fault for change in changes(config)))}
+  files = {name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in sources.items() if path is not None and path.is_file()}
+  return json.loads(json.dumps({**dataclasses.asdict(config), "changes": [dataclasses.asdict(change) for change in changes(config)],
+                                **({"files": files} if files else {})}))
 
 
 def check_same(out: pathlib.Path, values: dict) -> None:

@@ -16,13 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_cl import checkpoint, demonstrator, faults, memory, replay as replay_lib
-from mjx_cl.config import DreamerConfig, TrainConfig
+from mjx_cl.config import CHUNK, DreamerConfig, TrainConfig
 from mjx_cl.dreamer.agent import Agent, TrainState, Weights
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.interrupt import Interruptible
 from mjx_cl.rollout import Rollout, Stream, nest, records, start
 
-CHUNK = 64  # decisions between two rounds of updates
 DEMONSTRATOR_STEPS = 8_000_000
 FAULT = 11  # folded into a stream's key for the draw of its faults
 
@@ -383,7 +382,7 @@ def build(env, dreamer: DreamerConfig, config: TrainConfig, out, seed: int, seed
     trainer.resume()
   else:
     if agent_name:
-      trained = agents.load(agent_name, env.spec.name, len(env.spec.obs), len(env.spec.act))
+      trained = agents.of(env, agent_name)
       if trained.agent.config.size != dreamer.size:
         raise UserError(f"agent {agent_name!r} has size {trained.agent.config.size}, this training {dreamer.size}")
       spread = jax.tree.map(lambda x: jnp.broadcast_to(x, (seeds,) + x.shape).copy(), trained.train)

@@ -50,7 +50,7 @@ class Spec(NamedTuple):
   """What a task is, in numbers a reader can check.
 
   Attributes:
-    name: registry name.
+    name: what tables and agents' cards call it; of a registered robot the name that it is registered by.
     obs, act: one Var per scalar, in the order of the arrays.
     control_s: control period [s].
     episode_steps: control steps until truncation.

@@ -201,9 +201,9 @@ def test_robot_and_fault_of_a_file(tmp_path, capsys, tiny):
   """As of a package: built, proven to act, trained agents fit by the robot's own name; the robot names no physics."""
   import dataclasses
 
-  from mjx_cl import agents, certify, run
+  from mjx_cl import agents, certify, run, store
   from mjx_cl.config import RunConfig, changes
-  (tmp_path / "mine.py").write_text(PLUG)
+  (tmp_path / "mine.py").write_text(PLUG + "repr, dict = repr, dict\n")
   robot, broken = (f"{tmp_path}/mine.py:{name}" for name in ("Reach", "sticky"))
   env = envs.make(robot)
   assert type(env) is type(envs.make(robot)) and type(env).__name__ == "Reach" and robot in envs.ENVS and robot not in [*envs.ENVS]
@@ -214,15 +214,52 @@ def test_robot_and_fault_of_a_file(tmp_path, capsys, tiny):
   assert acts and all(not r["identical"] and r["first_step"] == 0 and r["physics"] == "jax" for r in acts) and not certify.certificate.faulty(
     [certify.certificate.Certificate(*(r[k] for k in certify.certificate.Certificate._fields)) for r in rows])
 
-  config = RunConfig(robot, fault=broken, steps=256, onset=128, seeds=1, agent=str(tmp_path / "agent"))
+  config = RunConfig(robot, fault=broken, steps=256, onset=128, seeds=1, agent=str(tmp_path / "agent"), detector=f"{tmp_path}/mine.py:level@rpr")
   assert config.severity == 0.5 and changes(config)[0].fault == broken  # no preset, for all its slashes
   agents.save(tmp_path / "agent", jax.jit(type(tiny)(tiny.config, 2, 1).init)(jax.random.key(0)),
               {"env": "reach", "preset": "tiny", "repeat": 1, "dreamer": dataclasses.asdict(tiny.config)})
-  assert run.Runner(config, tmp_path / "run").config_dict()["physics"] == "jax"
+  held = run.Runner(config, tmp_path / "run").config_dict()
+  assert held["physics"] == "jax" and len(set(held["files"].values())) == 1 and set(held["files"]) == {robot, broken, config.detector}
+  (tmp_path / "run").mkdir(exist_ok=True)
+  store.write_json(tmp_path / "run" / "config.json", held)
+  unresolved = lambda: {k: v for k, v in run.identity(config).items() if k != "physics"}
+  run.check_same(tmp_path / "run", unresolved())
+  (tmp_path / "mine.py").write_text(PLUG + "repr, dict = repr, dict  # another one\n")
+  with pytest.raises(UserError, match="another files"):  # what the path holds now is not what the run began with
+    run.check_same(tmp_path / "run", unresolved())
+  assert "files" not in run.identity(RunConfig("walker"))
 
   for argv, words in ((("eval", f"{tmp_path}/mine.py:Nobody"), "nothing of the name 'Nobody'"), (("eval", "nowhere.py:Robot"), "no file nowhere.py"),
                       (("eval", "no_such_module:Robot"), "no module 'no_such_module' is installed"), (("eval", ":x"), "give module:Name or"),
-                      (("run", "walker", "--fault", f"{tmp_path}/mine.py:broken", "--out", str(tmp_path / "r")), "cannot be built for robot 'walker': ZeroDivisionError")):
+                      (("run", "walker", "--fault", f"{tmp_path}/mine.py:broken", "--out", str(tmp_path / "r")), "cannot be built for robot 'walker': ZeroDivisionError"),
+                      (("run", "walker", "--fault", f"{tmp_path}/mine.py:repr", "--out", str(tmp_path / "r")), "gives str in place of a Fault"),
+                      (("run", "walker", "--fault", "~nobodyhere/mine.py:x", "--out", str(tmp_path / "r")), "no file ~nobodyhere/mine.py"),
+                      (("eval", f"{tmp_path}/mine.py:dict"), "gives dict, which has no spec and no model and no init and no step")):
     code = cli.main([*argv])
     err = capsys.readouterr().err
     assert code in (1, 2) and words in err and err.strip().count("\n") == 0 and not (tmp_path / "r").exists(), err
+
+
+def test_a_file_robot_that_is_a_shipped_one_by_another_path(tmp_path, capsys):
+  """A subclass goes by the name in its spec: it takes that robot's agent, or that of `agents_of`, and cannot overwrite its costs unasked."""
+  import types
+
+  from mjx_cl import agents, certify, recording, store
+  (tmp_path / "mine.py").write_text("from mjx_cl.envs.walker import Walker\n\nclass Mine(Walker):\n  pass\n")
+  mine = envs.make(f"{tmp_path}/mine.py:Mine")
+  assert agents.is_shipped(mine) and agents.of(mine).card["env"] == "walker"
+  car = envs.make("car").spec
+  heir = types.SimpleNamespace(spec=car._replace(name="fast:car"), agents_of="car")
+  assert agents.is_shipped(heir) and agents.of(heir).card["env"] == "car"
+  heir.agents_of = None
+  assert not agents.is_shipped(heir)
+  with pytest.raises(UserError, match="no agent 'fast:car'"):
+    agents.of(heir)
+  store.write_table(tmp_path / "certificates.parquet", {k: ["walker" if k == "robot" else 20 if k == "episodes" else None] for k in certify.COLUMNS})
+  for name in ("walker", f"{tmp_path}/mine.py:Mine"):
+    with pytest.raises(UserError, match="holds measured costs of walker"):
+      certify.guard(tmp_path, (name,), 0)
+    certify.guard(tmp_path, (name,), 20)
+  name = f"{tmp_path}/mine.py:Mine"
+  with pytest.raises(UserError, match="register it"):
+    recording.prepare(types.SimpleNamespace(name="s", robots={name: {}}), (), "auto", None)

@@ -293,8 +293,9 @@ def test_an_end_for_good_costs_until_the_last_updates(short_walker, tmp_path):
   """Every second robot falls where its episodes end: its last records lose the cost, nobody else's do, no return does, and no record of the last updates."""
   falls = np.arange(ENVS) % 2 == 0
   replays, returns = [], []
-  for cost, pure in ((0.0, 1), (7.0, 1), (7.0, 10_000)):
-    trainer = make_trainer(short_walker, tmp_path, fall_cost=cost, pure=pure)
+  for cost, pure in ((0.0, 1), (7.0, 1), (7.0, 10_000)):  # of 10,001 updates; the last trainer has one behind it
+    trainer = make_trainer(short_walker, tmp_path, fall_cost=cost, pure=pure, updates=10_001)
+    trainer.state = trainer.state._replace(train=trainer.state.train._replace(updates=trainer.state.train.updates + 1))
     counted(trainer)
     chunk = trainer.collect["pure"].chunk
 
@@ -311,6 +312,8 @@ def test_an_end_for_good_costs_until_the_last_updates(short_walker, tmp_path):
   assert returns[0] == returns[1] == returns[2]
   with pytest.raises(UserError, match="fall_cost must be 0 or above"):
     TrainConfig(fall_cost=-1)
+  with pytest.raises(UserError, match="set pure below that"):
+    TrainConfig(fall_cost=1, updates=100, pure=100)
 
 
 def test_penalties_are_eased_and_nothing_else(short_walker, tmp_path):

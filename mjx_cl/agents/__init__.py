@@ -60,17 +60,28 @@ def save(folder, train: TrainState, card: dict) -> None:
   os.replace(tmp, folder / "card.json")
 
 
-def load(path: str | None, env_name: str, obs_size: int, act_size: int, **departures) -> Trained:
+def of(env, path: str | None = None, **departures) -> Trained:
+  """`load` for the robot `env`, which is known by the name in its spec; its `agents_of` names another whose agents it takes."""
+  return load(path, env.spec.name, len(env.spec.obs), len(env.spec.act), getattr(env, "agents_of", None), **departures)
+
+
+def is_shipped(env) -> bool:
+  """Whether there is an agent for this robot without a path."""
+  return not {env.spec.name, getattr(env, "agents_of", None)}.isdisjoint(shipped())
+
+
+def load(path: str | None, env_name: str, obs_size: int, act_size: int, agents_of: str | None = None, **departures) -> Trained:
   """Loads an agent by shipped name or folder.
 
   Args:
-    path: folder or shipped name; None: the shipped agent named as the environment, or as the one whose agents it takes (`agents_of`).
-    env_name: robot that it must fit.
+    path: folder or shipped name; None: the shipped agent named as the environment, or as the one whose agents it takes.
+    env_name: robot that it must fit. agents_of: robot with the same observation, action and reward, whose agents fit too; None: that of the class
+      registered under this name.
     departures: fields of its DreamerConfig to go on with otherwise, e.g. lr; None: its own.
   Raises:
     UserError for an agent of another robot or an unknown name; FileError for a broken or foreign file.
   """
-  related = getattr(envs.ENVS.get(env_name), "agents_of", None)  # a robot with the same observation, action and reward
+  related = agents_of or getattr(envs.ENVS.data.get(env_name), "agents_of", None)
   name = path or (related if related and env_name not in shipped() else env_name)
   folder = pathlib.Path(name)
   if not (folder / "card.json").exists():

@@ -99,6 +99,17 @@ def _pure(name: str, factory):
   return build
 
 
+def split(name: str) -> tuple[str, str | None]:
+  """Name and channel of `name@channel`; a file's path may hold an @ too."""
+  found, at, channel = name.rpartition("@") if "@" in name.rpartition(":")[2] else (name, "", None)
+  return found, channel
+
+
+def factory(name: str):
+  """What builds detector `name`, its channel left aside."""
+  return choose("detector", split(name)[0], DETECTORS)
+
+
 def make(name: str, channel: str | None = None, log: bool | None = None, whiten: int = 0, patience: int = 1, cool_down: int = 0,
          robot: str | None = None, shared: bool = False, **settings) -> Detector:
   """Builds detector `name`, a map over monitor.Residual. Unknown settings are refused.
@@ -116,9 +127,8 @@ def make(name: str, channel: str | None = None, log: bool | None = None, whiten:
     robot: whose figures `rolling_sigma` starts from, where CALIBRATED has them; default: the walker's.
     shared: `rolling_sigma` has one threshold for both residuals, see `one_threshold`.
   """
-  if "@" in name.rpartition(":")[2]:  # a file's path may hold one too
-    name, _, channel = name.rpartition("@")
-  build = choose("detector", name, DETECTORS)
+  name, own = split(name)
+  build, channel = factory(name), own or channel
   if ":" in name:
     build = _pure(name, build)
   if name == "rolling_sigma":

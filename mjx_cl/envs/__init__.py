@@ -10,6 +10,7 @@ from mjx_cl.envs.quadruped import Quadruped
 from mjx_cl.envs.walker import Walker
 from mjx_cl.errors import PluginError, UserError, choose
 from mjx_cl.plugins import Registry, line
+from mjx_cl.types import Spec
 
 ENVS = Registry("mjx_cl.envs", "environment", {"walker": Walker, "quadruped": Quadruped, "car": Car, "car_real": CarReal})
 PURE_JAX = types.SimpleNamespace(name="jax", seconds=0.0)  # no time is spent outside the compiled program
@@ -34,7 +35,11 @@ def make(name: str, physics: str = "auto"):
     takes = any(p.name == "physics" or p.kind is p.VAR_KEYWORD for p in parameters)
     if not takes and physics != "auto":
       raise UserError(f"environment {name!r} has no physics backend to choose; leave out --physics {physics}")
-    return build(physics=physics) if takes else build()
+    robot = build(physics=physics) if takes else build()
+    lacking = [part for part in ("spec", "model", "init", "step") if not hasattr(robot, part)]
+    if lacking or not isinstance(robot.spec, Spec):
+      raise PluginError(f"environment {name!r} gives {type(robot).__name__}, which has no {' and no '.join(lacking or ['mjx_cl.types.Spec'])}")
+    return robot
   except UserError:
     raise
   except Exception as e:  # whatever a foreign class raises

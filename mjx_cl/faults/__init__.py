@@ -47,7 +47,10 @@ def make(name: str, env) -> Fault:
   """
   build = choose("fault", name, FAULTS)
   try:
-    return build(env)
+    made = build(env)
+    if not isinstance(made, Fault):
+      raise PluginError(f"fault {name!r} gives {type(made).__name__} in place of a Fault, see mjx_cl.faults.base.fault")
+    return made
   except UserError:
     raise
   except Exception as e:  # whatever a foreign function raises
