@@ -203,7 +203,7 @@ def test_robot_and_fault_of_a_file(tmp_path, capsys, tiny):
 
   from mjx_cl import agents, certify, run, store
   from mjx_cl.config import RunConfig, changes
-  (tmp_path / "mine.py").write_text(PLUG + "repr, dict = repr, dict\n")
+  (tmp_path / "mine.py").write_text(PLUG + "class Bare: pass\nrepr = repr\n")
   robot, broken = (f"{tmp_path}/mine.py:{name}" for name in ("Reach", "sticky"))
   env = envs.make(robot)
   assert type(env) is type(envs.make(robot)) and type(env).__name__ == "Reach" and robot in envs.ENVS and robot not in [*envs.ENVS]
@@ -224,7 +224,7 @@ def test_robot_and_fault_of_a_file(tmp_path, capsys, tiny):
   store.write_json(tmp_path / "run" / "config.json", held)
   unresolved = lambda: {k: v for k, v in run.identity(config).items() if k != "physics"}
   run.check_same(tmp_path / "run", unresolved())
-  (tmp_path / "mine.py").write_text(PLUG + "repr, dict = repr, dict  # another one\n")
+  (tmp_path / "mine.py").write_text(PLUG + "class Bare: pass\nrepr = repr  # another one\n")
   with pytest.raises(UserError, match="another files"):  # what the path holds now is not what the run began with
     run.check_same(tmp_path / "run", unresolved())
   assert "files" not in run.identity(RunConfig("walker"))
@@ -234,7 +234,7 @@ def test_robot_and_fault_of_a_file(tmp_path, capsys, tiny):
                       (("run", "walker", "--fault", f"{tmp_path}/mine.py:broken", "--out", str(tmp_path / "r")), "cannot be built for robot 'walker': ZeroDivisionError"),
                       (("run", "walker", "--fault", f"{tmp_path}/mine.py:repr", "--out", str(tmp_path / "r")), "gives str in place of a Fault"),
                       (("run", "walker", "--fault", "~nobodyhere/mine.py:x", "--out", str(tmp_path / "r")), "no file ~nobodyhere/mine.py"),
-                      (("eval", f"{tmp_path}/mine.py:dict"), "gives dict, which has no spec and no model and no init and no step")):
+                      (("eval", f"{tmp_path}/mine.py:Bare"), "gives Bare, which has no spec and no model and no init and no step")):
     code = cli.main([*argv])
     err = capsys.readouterr().err
     assert code in (1, 2) and words in err and err.strip().count("\n") == 0 and not (tmp_path / "r").exists(), err
