@@ -623,7 +623,8 @@ class TrainDisplay:
     self.marks = (self.marks + [(now, row["updates"])])[-200:]
     rate = (self.marks[-1][1] - self.marks[0][1]) / max(1e-9, self.marks[-1][0] - self.marks[0][0])
     mean = f"{sum(self.recent) / len(self.recent):.0f}" if self.recent else "-"
-    text = f"{row['phase']}: return {mean}, {rate:.1f} updates/s"
+    step = "" if row["reward"] is None else f" ({row['reward']:.2f} a step)"
+    text = f"{row['phase']}: return {mean}{step}, {rate:.1f} updates/s"
     if self.bar:
       self.bar.update(self.task, completed=row["updates"], description=text)
     elif now - self.told > 30 or row["updates"] >= self.total:

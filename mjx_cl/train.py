@@ -271,10 +271,13 @@ class Trainer:
       replay = self._add(self.state.replay, *kept(rows))
     self.state = self.state._replace(streams=streams, replay=replay)
     expert_returns, own, each = [], [], {g: [] for g in range(self.seeds)}
+    counts = ~drive  # robots that act as the agent would
+    for noise in (shake, jitter):
+      counts &= noise is None or noise == 0
     for at, value in self.returns.add(rows):
       if drive[at]:
         expert_returns.append(value)
-      elif (shake is None or not shake[at]) and (jitter is None or not jitter[at]):
+      elif counts[at]:
         own.append(value)
         each[at[0]].append(value)
     self.own = (self.own + own)[-200:]
@@ -282,7 +285,8 @@ class Trainer:
       self.expert_return = float(np.mean(expert_returns)) if not self.expert_return else 0.8 * self.expert_return + 0.2 * float(np.mean(expert_returns))
     collected = time.monotonic()
     row = {"updates": self.updates, "records": int(np.sum(np.asarray(self.state.streams.t))) // self.config.repeat // self.seeds, "phase": self.phase,
-           "return": float(np.mean(own)) if own else None, "episodes": len(own), "expert_return": self.expert_return or None}
+           "return": float(np.mean(own)) if own else None, "episodes": len(own), "expert_return": self.expert_return or None,
+           "reward": float(np.asarray(rows.reward)[:, counts].mean()) if counts.any() else None}  # `return` is of episodes that end, short ones first
     if self.seeds > 1:
       row |= {f"return/{g}": float(np.mean(values)) if values else None for g, values in each.items()}
     size = self.dreamer.batch * self.dreamer.length

@@ -267,6 +267,7 @@ def test_returns_are_sums_over_episodes(short_walker, tmp_path):
   data = jax.tree.map(lambda x: np.asarray(x)[0], trainer.state.replay.data)
   episodes = [np.split(data.reward[e], np.flatnonzero(data.last[e]) + 1)[:-1] for e in range(ENVS)]
   assert row["episodes"] == sum(map(len, episodes)) == ENVS * (train.CHUNK // 12)
+  np.testing.assert_allclose(row["reward"], data.reward.sum() / (ENVS * train.CHUNK), rtol=0.05)  # the last step's reward arrives with the next chunk
   np.testing.assert_allclose(row["return"], np.mean([np.sum(r) for e in episodes for r in e]), rtol=1e-5)  # float32 rewards
 
 
@@ -282,6 +283,7 @@ def test_training_episodes_may_be_cut_and_some_robots_jittered(short_walker, tmp
   assert row["episodes"] == ENVS // 2 * (train.CHUNK // 8)
   quiet = np.concatenate([r[:9] for e in range(ENVS // 2) for r in np.split(data.reward[e], np.flatnonzero(data.last[e]) + 1)[:-1]]).sum()
   np.testing.assert_allclose(row["return"], quiet / row["episodes"], rtol=1e-5)  # float32 rewards
+  np.testing.assert_allclose(row["reward"], quiet / (ENVS // 2 * train.CHUNK), rtol=1e-5)  # 64 steps are eight whole episodes
   assert trainer.env.spec.episode_steps == short_walker.spec.episode_steps == 12
   with pytest.raises(UserError, match="episode must be above 0"):
     TrainConfig(episode=0)
