@@ -46,7 +46,7 @@ def main() -> None:
   out.mkdir(parents=True, exist_ok=True)
   seeds = curves(table)
   ended = np.unique(np.concatenate([rows for rows, _ in seeds.values()]))
-  columns = ("updates", "records", "seconds", "phase", "return", *(f"return/{s}" for s in seeds), "episodes", "expert_return", "loss/dyn", "loss/value",
+  columns = ("updates", "records", "seconds", "phase", "return", *(f"return/{s}" for s in seeds), "episodes", "reward", "rew", "expert_return", "loss/dyn", "loss/value",
              "adv_mag", "ent/action")
   store.write_table(out / "curve.parquet", {c: table[c][ended] for c in columns if c in table})
   then = None
