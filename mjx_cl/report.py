@@ -326,7 +326,8 @@ def agents(results: pathlib.Path) -> str:
            ("`walker-plain`, without a demonstrator", "walker_learning/eval.json", trained("walker_learning", "then"), falls),
            ("`car`", "car_agent/eval.json", trained("car_agent"), driving),
            ("the same in `car_real`, unchanged", "car_agent/eval_car_real.json", "", driving),
-           ("`quadruped`", "quadruped_agent/eval.json", trained("quadruped_agent"), walking))
+           ("`quadruped`", "quadruped_agent/eval.json", trained("quadruped_agent"), walking),
+           ("`quadruped-plain`, without a demonstrator", "quadruped_plain/eval.json", trained("quadruped_plain"), walking))
   rows = []
   for name, file, training, own in tasks:
     e = load(results / file)
