@@ -465,12 +465,16 @@ def test_load_overrides_how_it_goes_on(saved):
   assert (config.lr, config.last_starts, config.warmup) == (1e-5, 4, 0)
 
 
-@pytest.mark.parametrize("name, obs, act", [("walker", 24, 6), ("car", 67, 2), ("quadruped", 48, 12)])
-def test_the_shipped_agents_load(name, obs, act):
-  assert name in agents.shipped()
-  trained = agents.load(None, name, obs, act)
-  assert trained.card["env"] == name and {"command", "dreamer", "repeat"} <= set(trained.card) and int(trained.train.updates) > 0
+@pytest.mark.parametrize("name", agents.shipped())
+def test_every_shipped_agent_loads(name):
+  robot = json.loads((agents.HERE / name / "card.json").read_text())["env"]
+  trained = agents.of(envs.make(robot), name)
+  assert trained.card["env"] == robot == name.partition("-")[0] and {"command", "dreamer", "repeat", "eval"} <= set(trained.card) and int(trained.train.updates) > 0
   assert all(np.isfinite(x).all() for x in jax.tree.leaves(trained.train))
+
+
+def test_every_robot_has_an_agent():
+  assert {"walker", "car", "quadruped"} <= set(agents.shipped()) and all(agents.is_shipped(envs.make(name)) for name in envs.ENVS.own)
 
 
 def test_a_related_robot_takes_the_agent():
