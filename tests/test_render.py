@@ -1,4 +1,5 @@
 """Moving pictures: what is drawn where, the mark of a fault, frames and pace of the file, and one line for whatever is wrong."""
+import copy
 import io
 import os
 import subprocess
@@ -342,7 +343,9 @@ def test_bad_argument_is_one_line(refused, tmp_path, monkeypatch, case):  # noqa
 
 
 def test_a_robot_without_a_shipped_agent(refused, short_walker, monkeypatch):  # noqa: F811
-  monkeypatch.setattr(envs, "make", lambda *_: short_walker)
+  newcomer = copy.copy(short_walker)
+  newcomer.spec = newcomer.spec._replace(name="newcomer")
+  monkeypatch.setattr(envs, "make", lambda *_: newcomer)
   text = refused(2, "render", "newcomer")
   assert "newcomer" in text and "--agent none" in text
 
