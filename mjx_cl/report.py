@@ -327,7 +327,7 @@ def agents(results: pathlib.Path) -> str:
            ("`car`", "car_agent/eval.json", trained("car_agent"), driving),
            ("the same in `car_real`, unchanged", "car_agent/eval_car_real.json", "", driving),
            ("`quadruped`", "quadruped_agent/eval.json", trained("quadruped_agent"), walking),
-           ("`quadruped-plain`, without a demonstrator", "quadruped_plain/eval.json", trained("quadruped_plain"), walking))
+           ("`quadruped-plain`, without a demonstrator", "quadruped_plain/eval.json", trained("quadruped_plain", "then"), walking))
   rows = []
   for name, file, training, own in tasks:
     e = load(results / file)

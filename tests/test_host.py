@@ -257,14 +257,14 @@ FILES = {"syntax.py": "class D(:\n", "raises.py": "raise RuntimeError('first\\ns
 
 
 @pytest.mark.parametrize("source, settings, code, words", [
-    ("PageHinkley", {}, 2, ["module:Class"]), (":X", {}, 2, ["module:Class"]), ("river.drift:", {}, 2, ["module:Class"]),
+    ("PageHinkley", {}, 2, ["module:Name"]), (":X", {}, 2, ["module:Name"]), ("river.drift:", {}, 2, ["module:Name"]),
     ("no_such_module_here:X", {}, 2, ["no_such_module_here", "path/to/file.py"]), ("river.no_part:X", {}, 2, ["river.no_part"]),
     ("river.drift:Nothing", {}, 2, ["Nothing", "river.drift"]), ("river.drift:PageHinkley", {"thresh": 1}, 2, ["thresh", "cannot be built"]),
     ("{}/none.py:D", {}, 1, ["none.py"]), ("{}/syntax.py:D", {}, 2, ["SyntaxError"]), ("{}/raises.py:D", {}, 2, ["RuntimeError: first second"]),
     ("{}/leaves.py:D", {}, 2, ["importing", "SystemExit"]), ("leaves_mjx:D", {}, 2, ["importing leaves_mjx failed", "SystemExit"]),
     ("{}/unbuilt.py:D", {}, 2, ["D cannot be built", "SystemExit: 3"]),
     ("{}/imports.py:D", {}, 2, ["no_such_module_here"]), ("{}/plain.py:D", {}, 2, ["D has no method update"]),
-    ("{}/plain.py:x", {}, 2, ["no class 'x'"]), ("{}/plain.py:Needs", {}, 2, ["Needs cannot be built", "'k'"])])
+    ("{}/plain.py:x", {}, 2, ["nothing of the name 'x'"]), ("{}/plain.py:Needs", {}, 2, ["Needs cannot be built", "'k'"])])
 def test_what_cannot_be_loaded_is_one_line(tmp_path, monkeypatch, source, settings, code, words):
   for name, text in FILES.items():
     (tmp_path / name).write_text(text)
