@@ -265,10 +265,9 @@ class Trainer:
     streams, rows = self.collect[self.phase].chunk(params, self.state.streams, CHUNK, drive, shake, jitter)
     if self.fault is not None:
       streams = self._redraw(streams, jnp.any(rows.terminated | rows.truncated, 0))
-    if self.config.fall_cost and self.config.updates - self.updates > self.config.pure:
-      replay = self._add(self.state.replay, *kept(rows._replace(reward=rows.reward - self.config.fall_cost * rows.terminated)))
-    else:
-      replay = self._add(self.state.replay, *kept(rows))
+    cost = self.config.fall_cost if self.config.updates - self.updates > self.config.pure else 0.0
+    learnt = rows._replace(reward=rows.reward - cost * rows.terminated) if cost else rows
+    replay = self._add(self.state.replay, *kept(learnt))
     self.state = self.state._replace(streams=streams, replay=replay)
     expert_returns, own, each = [], [], {g: [] for g in range(self.seeds)}
     counts = ~drive  # robots that act as the agent would
