@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_cl import envs, faults
+from mjx_cl import envs, fault_presets, faults
 from mjx_cl.dreamer.agent import Carry
 from mjx_cl.errors import UserError
 from mjx_cl.rollout import Rollout, Stream, expand, nest, start
@@ -44,33 +44,32 @@ class Puppet:
     return carry._replace(action=action), action
 
 
-def join(env, agent=None, fault: str = "none", target: str | None = None, severity: float = 0.5, onset: int = 0, duration: int | None = None,
-         repeat: int = 1, deterministic: bool = False):
+def join(env, agent=None, fault: str = "none", target: str | None = None, severity: float | None = None, onset: int = 0, duration: int | None = None,
+         schedule: str = "abrupt", period: int = 1000, share: float = 0.5, repeat: int = 1, deterministic: bool = False):
   """Environment, fault and agent as `run` joins them.
 
   Args:
     agent: what acts; None: a Puppet.
-    fault, target: names; target None or `random`: drawn from the stream's key.
-    severity: in [0, 1], while active.
+    fault: name of a fault, or of a preset, which brings its targets, severities and schedules. target: None or `random`: drawn from the stream's key.
+    severity: in [0, 1], while active; None: 0.5, or the preset's.
     onset: first control step that the fault acts in. duration: control steps until it is repaired; None: never.
+    schedule, period, share: how the severity moves from the onset on, see fault_presets.SCHEDULES.
     repeat, deterministic: as in Rollout.
   Returns:
     (rollout, begin): Rollout, and begin(key) -> Stream of one robot.
+  Raises:
+    UserError for what `fault_presets.resolve` refuses, and for a preset that turns the robot into another one.
   """
-  if not 0.0 <= severity <= 1.0:
-    raise UserError(f"severity must lie in [0, 1]; got {severity}")
+  changes = fault_presets.resolve(env.spec.name, fault, None if target == "random" else target, severity, duration, schedule, period, share)
+  if fault_presets.named(fault) and (other := fault_presets.find(fault, env.spec.name).becomes):
+    raise UserError(f"preset {fault!r} turns the robot into {other!r}, which only `mjx-cl run` does; take {other!r} itself")
   if onset < 0:
     raise UserError(f"onset must be at least 0; got {onset}")
-  if duration is not None and not 1 <= duration < faults.FOREVER:
-    raise UserError(f"duration must lie in 1..{faults.FOREVER - 1:,}; got {duration}")
-  if onset >= faults.FOREVER:
-    raise UserError(f"onset must be below {faults.FOREVER:,}; got {onset}")
-  the_fault = faults.make(fault, env)
+  if onset >= (last := faults.FOREVER - max(c.after for c in changes)):
+    raise UserError(f"onset must be below {last:,}; got {onset}")
+  made, plan, index = faults.build(changes, env, onset)
   agent = agent or Puppet(len(env.spec.act))
-  index = faults.target_index(the_fault, target)
-  duration = faults.FOREVER if duration is None else duration
-  begin = lambda key: start(env, agent, the_fault, key, severity, onset, duration, index)
-  return Rollout(env, agent, the_fault, repeat, deterministic), begin
+  return Rollout(env, agent, made, repeat, deterministic), lambda key: start(env, agent, made, key, plan=plan, target=index)
 
 
 # ---- brax ----------------------------------------------------------------------------------------------------------------------------
@@ -88,14 +87,15 @@ def brax(module: str):
     raise UserError(f"this needs brax ({e}): pip install 'mjx-cl[brax]'") from None
 
 
-def brax_env(env, fault: str | None = None, target: str | None = None, severity: float = 0.5, onset: int = 0, duration: int | None = None):
-  """Our environment as a `brax.envs.Env`, nominal unless a fault is named.
+def brax_env(env, fault: str | None = None, target: str | None = None, severity: float | None = None, onset: int = 0, duration: int | None = None,
+             schedule: str = "abrupt", period: int = 1000, share: float = 0.5):
+  """Our environment as a `brax.envs.Env`, nominal unless a fault or a preset is named, with settings as in `join`.
 
   brax's own wrappers do the vmap, the time limit and the autoreset; its autoreset restarts every robot from its own first state. They
   leave `info` alone, which is where the fault and its clock live: a reset touches neither.
   """
   base = brax("envs.base")
-  rollout, begin = join(env, None, fault or "none", target, severity, onset, duration)
+  rollout, begin = join(env, None, fault or "none", target, severity, onset, duration, schedule, period, share)
 
   class BraxEnv(base.Env):
     def reset(self, rng):
@@ -210,11 +210,12 @@ def _prepare(env, physics: str, num: int, fault: dict):
   return env, Robots(env, num, **fault), box(env.spec.obs), box(env.spec.act)
 
 
-def gymnasium_env(env, seed: int = 0, physics: str = "auto", fault: str = "none", target: str | None = None, severity: float = 0.5,
-                  onset: int = 0, duration: int | None = None):
+def gymnasium_env(env, seed: int = 0, physics: str = "auto", fault: str = "none", target: str | None = None,
+                  severity: float | None = None, onset: int = 0, duration: int | None = None, schedule: str = "abrupt", period: int = 1000,
+                  share: float = 0.5):
   """One robot as a `gymnasium.Env`; arguments and the meaning of a reset as in `gymnasium_vector`."""
   gymnasium = _gymnasium()
-  options = dict(fault=fault, target=target, severity=severity, onset=onset, duration=duration)
+  options = dict(fault=fault, target=target, severity=severity, onset=onset, duration=duration, schedule=schedule, period=period, share=share)
   env, robots, obs_space, act_space = _prepare(env, physics, 1, options)
 
   class GymnasiumEnv(gymnasium.Env):
@@ -240,7 +241,8 @@ def gymnasium_env(env, seed: int = 0, physics: str = "auto", fault: str = "none"
 
 
 def gymnasium_vector(env, num_envs: int = 1, seed: int = 0, physics: str = "auto", fault: str = "none", target: str | None = None,
-                     severity: float = 0.5, onset: int = 0, duration: int | None = None):
+                     severity: float | None = None, onset: int = 0, duration: int | None = None, schedule: str = "abrupt", period: int = 1000,
+                     share: float = 0.5):
   """Robots side by side as a `gymnasium.vector.VectorEnv` with autoreset in the next step.
 
   After a step with `terminations` or `truncations`, `obs` is the last observation of that episode; the next call ignores the robot's action,
@@ -252,7 +254,7 @@ def gymnasium_vector(env, num_envs: int = 1, seed: int = 0, physics: str = "auto
 
   Args:
     env: name or environment. num_envs: robots. seed: of the first reset where that names none.
-    physics: backend, where `env` is a name. fault ... duration: as in `join`.
+    physics: backend, where `env` is a name. fault ... share: as in `join`.
   Example:
     robots = gymnasium_vector("walker", 8, fault="gear", severity=0.5, onset=5000)
     obs, infos = robots.reset(seed=0)
@@ -260,7 +262,7 @@ def gymnasium_vector(env, num_envs: int = 1, seed: int = 0, physics: str = "auto
   gymnasium = _gymnasium()
   if num_envs < 1:
     raise UserError(f"num_envs must be above 0; got {num_envs}")
-  options = dict(fault=fault, target=target, severity=severity, onset=onset, duration=duration)
+  options = dict(fault=fault, target=target, severity=severity, onset=onset, duration=duration, schedule=schedule, period=period, share=share)
   env, robots, obs_space, act_space = _prepare(env, physics, num_envs, options)
   batch = functools.partial(gymnasium.vector.utils.batch_space, n=num_envs)
 

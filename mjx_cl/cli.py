@@ -251,15 +251,21 @@ class Render:
   agent: str | None = None
   """Trained agent: shipped name or folder; `none` stands still, `random` moves at random."""
   fault: str = "none"
-  """Fault, see `mjx-cl list faults`."""
+  """Fault, see `mjx-cl list faults`, or preset, see `mjx-cl list fault-presets`."""
   target: str = "random"
-  """Joint or part that the fault hits."""
-  severity: float = 0.5
-  """In [0, 1]."""
+  """Joint or part that the fault hits, `random`: drawn from the seed."""
+  severity: float | None = None
+  """In [0, 1], default 0.5; a preset brings its own."""
   onset: int = 200
   """First control step that the fault acts in."""
   duration: int | None = None
   """Control steps until the fault is repaired; default: never."""
+  schedule: str = "abrupt"
+  """How the severity moves from the onset on: abrupt, ramp, intermittent, cyclic or random_walk."""
+  period: int = 1000
+  """Control steps of the ramp, of one cycle, or between two steps of the random walk."""
+  share: float = 0.5
+  """On-share of an intermittent fault, deviation of a random walk's steps."""
   steps: int = 400
   """Control steps in all."""
   seed: int = 0
@@ -776,7 +782,8 @@ def do_render(args: Render) -> None:
   out = args.out or f"{args.env.rpartition(':')[2]}.gif"
   render.check(out, args.steps, args.width, args.height, args.fps, args.seed)
   env = envs.make(args.env, args.physics)
-  acting = {"seed": args.seed, "deterministic": args.deterministic, "severity": args.severity, "onset": args.onset, "duration": args.duration}
+  acting = {"seed": args.seed, "deterministic": args.deterministic, "severity": args.severity, "onset": args.onset, "duration": args.duration,
+            "schedule": args.schedule, "period": args.period, "share": args.share}
   if args.agent in ("none", "random"):
     acting["agent"] = adapters.Puppet(len(env.spec.act), float(args.agent == "random"))
   elif args.agent is None and not agents.is_shipped(env):

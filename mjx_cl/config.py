@@ -294,33 +294,18 @@ class RunConfig:
 
   def __post_init__(self):
     last = self.steps
-    if fault_presets.named(self.fault):
-      preset = fault_presets.find(self.fault, self.env)
-      if self.severity is not None or self.target is not None:
-        raise UserError(f"preset {self.fault!r} brings its own severity and target; leave --severity and --target out")
-      if (self.schedule, self.period, self.share) != ("abrupt", 1000, 0.5):
-        raise UserError(f"preset {self.fault!r} brings its own schedule; leave --schedule, --period and --share out")
-      if preset.becomes:
-        if self.duration is not None:
-          raise UserError(f"preset {self.fault!r} turns the robot into {preset.becomes!r} for good; leave --duration out")
-        last = 2**31 - 2 - max((c.after for c in preset.then), default=0)  # later than the last step: it never happens
-    elif self.severity is None:
+    changes(self)  # refuses what does not fit together
+    if becomes(self):
+      last = fault_presets.FOREVER - 1 - max(c.after for c in changes(self))  # later than the last step: it never happens
+    elif self.severity is None and not fault_presets.named(self.fault):
       object.__setattr__(self, "severity", 0.5)
-    if self.severity is not None:
-      fraction(self, "severity")
-    fraction(self, "share")
-    if self.schedule not in fault_presets.SCHEDULES:
-      raise UserError(f"unknown schedule {self.schedule!r}; choose from: {', '.join(fault_presets.SCHEDULES)}")
-    positive(self, "steps", "seeds", "period")
-    for name in ("steps", "period", "duration"):
-      if (getattr(self, name) or 0) >= 2**31 - 1:
-        raise UserError(f"{name} must be below 2,147,483,647 control steps; got {getattr(self, name)}")
+    positive(self, "steps", "seeds")
+    if self.steps >= fault_presets.FOREVER:
+      raise UserError(f"steps must be below {fault_presets.FOREVER:,} control steps; got {self.steps}")
     if self.first_seed < 0:
       raise UserError(f"first_seed must be at least 0; got {self.first_seed}")
     if not 0 <= self.onset <= last:
       raise UserError(f"onset must lie in 0..{'steps=' if last == self.steps else ''}{last}; got {self.onset}")
-    if self.duration is not None:
-      positive(self, "duration")
     for arm in self.arms:
       choose("arm", arm, ARMS)
     if not self.arms or len(set(self.arms)) != len(self.arms):
@@ -341,12 +326,7 @@ def becomes(config: RunConfig) -> str | None:
 
 def changes(config: RunConfig) -> tuple[fault_presets.Change, ...]:
   """The faults of a run, with its duration where the preset leaves it open; of a robot that becomes another one, those of that other one."""
-  if fault_presets.named(config.fault):
-    preset = fault_presets.find(config.fault, config.env)
-    if preset.becomes:
-      return preset.then or (fault_presets.Change("none"),)
-    return tuple(dataclasses.replace(c, duration=config.duration if c.duration is None else c.duration) for c in preset.changes)
-  return (fault_presets.Change(config.fault, config.target, config.severity, 0, config.duration, config.schedule, config.period, config.share),)
+  return fault_presets.resolve(config.env, config.fault, config.target, config.severity, config.duration, config.schedule, config.period, config.share)
 
 
 @dataclass(frozen=True)

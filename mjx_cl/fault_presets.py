@@ -4,10 +4,11 @@ A preset is a tuple of changes to one robot. Onsets are counted from the run's o
 """
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from mjx_cl.errors import UserError
 
+FOREVER = 2**31 - 1  # control steps that no run outlasts
 
 SCHEDULES = {
     "abrupt": "from the onset on in full",
@@ -115,3 +116,39 @@ def find(name: str, env_name: str) -> Preset:
   if preset.robot not in (env_name, "*"):
     raise UserError(f"preset {name!r} is of robot {preset.robot!r}, not of {env_name!r}")
   return preset
+
+
+def resolve(env_name: str, fault: str, target: str | None = None, severity: float | None = None, duration: int | None = None, schedule: str = "abrupt",
+            period: int = 1000, share: float = 0.5) -> tuple[Change, ...]:
+  """The changes that a fault or a preset stands for on a robot, its settings checked.
+
+  Args:
+    fault: name of a fault, or of a preset, which brings its own targets, severities and schedules.
+    severity: in [0, 1]; None: 0.5, or the preset's. duration: control steps, where the preset leaves it open; None: never repaired.
+    schedule, period, share: see SCHEDULES and `Change`.
+  Returns:
+    Changes; of a robot that becomes another one, those of that other one.
+  Raises:
+    UserError for an unknown preset or schedule, one of another robot, a number out of range, or settings that the preset brings itself.
+  """
+  if severity is not None and not 0.0 <= severity <= 1.0:  # also true for nan
+    raise UserError(f"severity must lie in [0, 1]; got {severity}")
+  if not 0.0 <= share <= 1.0:
+    raise UserError(f"share must lie in [0, 1]; got {share}")
+  if schedule not in SCHEDULES:
+    raise UserError(f"unknown schedule {schedule!r}; choose from: {', '.join(SCHEDULES)}")
+  for name, value in (("duration", duration), ("period", period)):
+    if value is not None and not 1 <= value < FOREVER:
+      raise UserError(f"{name} must lie in 1..{FOREVER - 1:,} control steps; got {value}")
+  if not named(fault):
+    return (Change(fault, target, 0.5 if severity is None else severity, 0, duration, schedule, period, share),)
+  preset = find(fault, env_name)
+  if severity is not None or target is not None:
+    raise UserError(f"preset {fault!r} brings its own severity and target; leave --severity and --target out")
+  if (schedule, period, share) != ("abrupt", 1000, 0.5):
+    raise UserError(f"preset {fault!r} brings its own schedule; leave --schedule, --period and --share out")
+  if preset.becomes:
+    if duration is not None:
+      raise UserError(f"preset {fault!r} turns the robot into {preset.becomes!r} for good; leave --duration out")
+    return preset.then or (Change("none"),)
+  return tuple(replace(c, duration=duration if c.duration is None else c.duration) for c in preset.changes)

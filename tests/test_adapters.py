@@ -202,11 +202,26 @@ def test_brax_environment_keeps_its_fault_over_an_autoreset(short_walker):
   np.testing.assert_array_equal(obs[4], first)
 
 
+def test_schedules_and_presets_act(short_walker):
+  """A repaired preset, then a cycle by hand: severity (1 - cos(2 pi (t - onset + 1) / period)) / 2 of 0.8."""
+  def severities(**fault):
+    robots = adapters.gymnasium_env(short_walker, **fault)
+    robots.reset(seed=SEED)
+    return [robots.step(np.zeros(6, np.float32))[4]["severity"] for _ in range(10)]
+  t = np.arange(10)
+  assert severities(fault="walker/gear-half", onset=3, duration=4) == [0.5 * (3 <= k < 7) for k in t]
+  cycle = severities(fault="gear", target="left_hip", severity=0.8, onset=2, schedule="cyclic", period=4)
+  np.testing.assert_allclose(cycle, np.where(t < 2, 0, 0.4 * (1 - np.cos(np.pi / 2 * (t - 1)))), atol=1e-6)  # float32 cosine
+
+
 # ---- refusals ------------------------------------------------------------------------------------------------------------------------
 
 @pytest.mark.parametrize("bad, word", [
     (dict(num_envs=0), "num_envs"), (dict(severity=1.5), "severity"), (dict(onset=-1), "onset"), (dict(duration=0), "duration"),
-    (dict(fault="geer"), "geer"), (dict(fault="gear", target="elbow"), "elbow"), (dict(env="wlker"), "wlker")])
+    (dict(fault="geer"), "geer"), (dict(fault="gear", target="elbow"), "elbow"), (dict(env="wlker"), "wlker"),
+    (dict(fault="walker/gear-half", severity=0.5), "brings its own severity"), (dict(fault="gear", schedule="sine"), "sine"),
+    (dict(fault="gear", period=0), "period"), (dict(fault="walker/gear-haf"), "gear-half"), (dict(fault="quadruped/rh-velocity-third"), "quadruped"),
+    (dict(fault="walker/gear-half-twice", onset=2**31 - 2), "onset"), (dict(env="car", fault="car/sim-to-real"), "car_real")])
 def test_bad_arguments_are_named(short_walker, bad, word):
   with pytest.raises(UserError, match=word):
     adapters.gymnasium_vector(**{"env": short_walker, "num_envs": 2} | bad)

@@ -142,7 +142,7 @@ RUN = {
     "zero steps": (["run", "walker", "--steps", "0"], ["steps"]),
     "zero duration": (["run", "walker", "--duration", "0"], ["duration"]),
     "adaptation out of range": (["run", "walker", "--adapt.patience", "0"], ["patience"]),
-    "agent that is not there": (["run", "walker", "--agent", "wlaker"], ["wlaker", "shipped: car, quadruped, quadruped-plain, walker"]),
+    "agent that is not there": (["run", "walker", "--agent", "wlaker"], ["wlaker", "shipped: car, quadruped, quadruped-cloned, walker"]),
 }
 OTHER = {
     "command": (["rnu"], ["rnu"]),

@@ -52,7 +52,7 @@ def calibrated_rule(**settings) -> Detector:
 # by robot, chosen by benchmarks/calibrate.py on tuning seeds, see results/arl0.json, arl0_quadruped.json, arl0_car.json
 CALIBRATED = {
     "walker": {"window": 4000, "smooth": 400, "lag": 500, "threshold": 6.5, "patience": 1, "two_sided": False, "log": True},
-    "quadruped": {"window": 4000, "smooth": 300, "lag": 500, "threshold": 4.5, "threshold_rpr": 8.5, "patience": 1, "two_sided": False, "log": False},
+    "quadruped": {"window": 4000, "smooth": 200, "lag": 500, "threshold": 4.5, "threshold_rpr": 12.0, "patience": 1, "two_sided": False, "log": True},
     # also where a car that has adapted must not take its own crashes for an event
     "car": {"window": 4000, "smooth": 1, "lag": 0, "threshold": 4.0, "threshold_rpr": 4.0, "patience": 20, "two_sided": False, "log": False},
 }

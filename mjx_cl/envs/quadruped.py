@@ -261,9 +261,9 @@ def make_spec(mj_model: mujoco.MjModel) -> Spec:
   legs = tuple((leg, tuple(range(3 * k, 3 * k + 3))) for k, leg in enumerate(LEGS))
   return Spec(
       name="quadruped", obs=tuple(obs), act=tuple(Var(j, "1", -1, 1) for j in JOINTS), control_s=CONTROL_S, episode_steps=EPISODE_STEPS,
-      # mean reward per step: twice what one that stands still earns; the shipped agent earns 0.53, and above 0.44 in 99 % of all stretches of 3,072 steps
+      # mean reward per step: one that stands still earns 0.21; the shipped agent earns 0.63, and above 0.50 in 99 % of all stretches of 3,072 steps
       # (healthy, seeds 100 to 109, 0.95 M control steps); perfect tracking without effort would be 1
-      acceptance=0.42,
+      acceptance=0.48,
       posture=None,    # upright is a least value of no channel (gravity's z is then -1); a fall ends the episode, standing still earns too little
       targets=JOINTS, act_groups=legs + (("all", tuple(range(12))),), obs_groups=tuple(groups),
       feet=tuple((leg, (mj_model.geom(f"{leg}_foot").id,)) for leg in LEGS),

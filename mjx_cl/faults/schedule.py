@@ -7,9 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from mjx_cl.errors import UserError
-from mjx_cl.fault_presets import SCHEDULES
-
-FOREVER = 2**31 - 1  # a duration that no run outlasts
+from mjx_cl.fault_presets import FOREVER, SCHEDULES
 
 
 class Plan(NamedTuple):
