@@ -163,7 +163,7 @@ class Record:
   physics: str = "auto"
   json: bool = False
   overwrite: bool = False
-  """Replace a set that is in --out."""
+  """Replace a set that is in --out; with --robot, in a set of the same suite, those robots' streams alone."""
 
 
 @dataclass(frozen=True)
@@ -689,7 +689,7 @@ def do_record(args: Record) -> None:
   suite, out = streams.suite(args.suite), args.out
   if args.overwrite:
     recording.prepare(suite, args.robot, args.physics, args.agent)  # what is refused must not cost the set that is there
-  recording.claim(suite, out, args.overwrite)
+  recording.claim(suite, out, args.overwrite, args.robot)
   told = [0.0]
 
   def progress(part, done, steps, lanes):

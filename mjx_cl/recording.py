@@ -98,8 +98,9 @@ def _record(env, trained, lanes_: list[Lane], keys, onsets, steps: int, watch_fr
   return {k: np.concatenate(v)[:steps] for k, v in out.items()} | {"target": np.asarray([t or "" for t in drawn])}
 
 
-def claim(suite_: Suite, out, overwrite: bool) -> None:
-  """Makes sure that `out` may take a recording of the suite; with `overwrite` the set that it holds is removed, and no other file.
+def claim(suite_: Suite, out, overwrite: bool, robots=()) -> None:
+  """Makes sure that `out` may take a recording of the suite; with `overwrite` the set that it holds is removed, and no other file; where it has more
+  than the `robots` named, and is of this very suite, it stays until theirs are recorded, see `record`.
 
   Raises:
     UserError for a folder that holds a set, or anything else than parts of one.
@@ -110,11 +111,11 @@ def claim(suite_: Suite, out, overwrite: bool) -> None:
     return
   if not out.is_dir():
     raise foreign
-  robots, held = set(suite_.robots), (out / "config.json").exists()
+  known, held = set(suite_.robots), (out / "config.json").exists()
   if held:
     try:
       config = json.loads((out / "config.json").read_text())
-      robots |= set(config["suite"]["robots"])
+      known |= set(config["suite"]["robots"])
       is_set = {"meta", "schema", "stream_steps"} <= set(config)
     except (OSError, ValueError, KeyError, TypeError):
       is_set = False
@@ -122,13 +123,32 @@ def claim(suite_: Suite, out, overwrite: bool) -> None:
       raise foreign
     if not overwrite:
       raise UserError(f"{out} holds a recorded set; give --overwrite to replace it, or another --out")
-  ours = {"config.json", "streams.parquet", *(f"{r}{end}.parquet" for r in robots for end in ("", "_latents"))}
+    if robots and beside(suite_, out, robots):
+      return
+  ours = {"config.json", "streams.parquet", *(f"{r}{end}.parquet" for r in known for end in ("", "_latents"))}
   if held:
     for name in sorted(ours):
       (out / name).unlink(missing_ok=True)
     clear(out)
   elif {p.name.removesuffix(".tmp") for p in out.iterdir()} - ours - {"work"} or _others(out / "work"):
     raise foreign
+
+
+def beside(suite_: Suite, out, robots) -> dict | None:
+  """config.json of the set in `out` if streams of other robots than `robots` can stay there, since it is a set of this very suite; else None."""
+  try:
+    config = json.loads((pathlib.Path(out) / "config.json").read_text())
+    held = config["suite"]["robots"]
+    whole = json.loads(json.dumps(_plain(suite_, suite_.robots)))
+    same = config["version"] == VERSION and config["suite"] == whole | {"robots": {r: whole["robots"].get(r) for r in held}}
+  except (OSError, ValueError, KeyError, TypeError, AttributeError):
+    return None
+  return config if same and set(held) - set(robots) else None
+
+
+def _plain(suite_: Suite, robots) -> dict:
+  """The suite as config.json has it, with these robots alone."""
+  return {f.name: getattr(suite_, f.name) for f in dataclasses.fields(Suite)} | {"robots": {r: suite_.robots[r] for r in robots}}
 
 
 def _others(work: pathlib.Path) -> list[pathlib.Path]:
@@ -173,6 +193,9 @@ def record(suite_: Suite, out, robots=(), physics: str = "auto", agent: str | No
            progress=lambda part, done, steps, lanes: None) -> dict:
   """Records a suite into the folder `out`; parts that are finished already are kept, so a recording that was cut off goes on.
 
+  Where `robots` are named and `out` holds a set of this very suite, the streams of its other robots stay in it, with the numbers that they have; how
+  they were recorded stands under `kept` of config.json then.
+
   Returns:
     {robot: stream-steps per second of its parts}, plus the size of the files.
   """
@@ -185,7 +208,10 @@ def record(suite_: Suite, out, robots=(), physics: str = "auto", agent: str | No
   work = out / "work"
   work.mkdir(parents=True, exist_ok=True)
   ready = prepare(suite_, robots, physics, agent)
-  meta: dict[str, list] = {k: [] for k in META}
+  old = beside(suite_, out, robots) if robots else None
+  table = store.read_rows(out / "streams.parquet") if old else []
+  kept = {r: None for r in old["suite"]["robots"] if r not in robots} if old else {}
+  rows, free = [row for row in table if row["robot"] in kept], 1 + max((row["stream"] for row in table), default=-1)
   steps_of, speed, details = {}, {}, {}
   for robot, (env, trained) in ready.items():
     weights = _digest(trained.train.params)
@@ -213,16 +239,29 @@ def record(suite_: Suite, out, robots=(), physics: str = "auto", agent: str | No
           store.atomic(path, lambda f, data=data, tag=tag, of=of: np.savez(f, tag=np.asarray(tag), of=np.asarray(of), **data))
         parts[split, kind] = (who, onsets, data)
     groups = ",".join(name for name, _ in watched(env.spec))
-    details[robot] = _write(suite_, out, robot, parts, meta, env.spec.control_s, groups)
+    number = min((row["stream"] for row in table if row["robot"] == robot), default=free)
+    details[robot], fresh = _write(suite_, out, robot, parts, number, env.spec.control_s, groups)
+    rows, free = rows + fresh, max(free, number + len(fresh))
     steps_of[robot] = int(sum(x[2]["opr"].size for x in parts.values()))
     speed[robot] = lived / seconds if seconds else None
-  types = {"stream": np.int32, "seed": np.int32, "severity": float, "steps": np.int32, "full": bool, "control_s": float}
-  store.write_table(out / "streams.parquet", {k: np.asarray(v, types[k]) if k in types else v for k, v in meta.items()})
-  plain = {f.name: getattr(suite_, f.name) for f in dataclasses.fields(Suite)} | {"robots": {r: suite_.robots[r] for r in ready}}
-  store.write_json(out / "config.json", {"version": VERSION, "suite": plain, "command": command, "schema": SCHEMA, "meta": META, "details": details,
-                                        "stream_steps": steps_of, **store.provenance()})
+  write_meta(out, rows)
+  if old:
+    made = {k: old[k] for k in ("command", "versions", "python", "git_commit", "machine")}
+    kept = {r: old.get("kept", {}).get(r, made) for r in kept}
+    details, steps_of = ({r: old[name][r] for r in kept} | new for name, new in (("details", details), ("stream_steps", steps_of)))
+  config = {"version": VERSION, "suite": _plain(suite_, [r for r in suite_.robots if r in {*ready, *kept}]), "command": command, "schema": SCHEMA, "meta": META,
+            "details": details, "stream_steps": steps_of, **store.provenance()}
+  store.write_json(out / "config.json", config | ({"kept": kept} if kept else {}))
   size = sum(p.stat().st_size for p in out.glob("*.parquet"))
   return {"stream_steps_per_s": speed, "stream_steps": steps_of, "bytes": size}
+
+
+def write_meta(out, rows: list[dict]) -> None:
+  """Writes streams.parquet, a row of META a stream, in the order of their numbers."""
+  types = {"stream": np.int32, "seed": np.int32, "severity": float, "steps": np.int32, "full": bool, "control_s": float}
+  rows = sorted(rows, key=lambda row: row["stream"])
+  columns = {k: [row[k] for row in rows] for k in META}
+  store.write_table(pathlib.Path(out) / "streams.parquet", {k: np.asarray(v, types[k]) if k in types else v for k, v in columns.items()})
 
 
 def _digest(params) -> int:
@@ -246,16 +285,15 @@ def _part(path: pathlib.Path, tag: str, of: str) -> dict | None:
     raise
 
 
-def _write(suite_, out, robot, parts, meta, control_s, groups) -> dict:
-  """Writes ROBOT.parquet and ROBOT_latents.parquet and adds to `meta`. Returns the rounding steps."""
+def _write(suite_, out, robot, parts, number, control_s, groups) -> tuple[dict, list[dict]]:
+  """Writes ROBOT.parquet and ROBOT_latents.parquet, streams numbered from `number` on. Returns the rounding steps, and the streams' rows of META."""
   grain, differ = _grain(parts["tune", "nominal"][2]), 0
   rows: dict[str, list] = {k: [] for k in SCHEMA}
   latents: dict[str, list] = {k: [] for k in ("stream", "step") + tuple(f"z{k}" for k in range(LATENT))}
-  number = int(meta["stream"][-1]) + 1 if meta["stream"] else 0
+  meta, begin = [], number
 
   def add_meta(**values):
-    for k in META:
-      meta[k].append(values.get(k))
+    meta.append({k: values.get(k) for k in META})
 
   def add_rows(stream, data, lane, first, last, columns):
     at = slice(first, last)
@@ -305,18 +343,18 @@ def _write(suite_, out, robot, parts, meta, control_s, groups) -> dict:
       number += 1
     if split == "score":  # some streams again, cut off somewhere: a score that looks ahead betrays itself there
       rng = np.random.default_rng(zlib.crc32(robot.encode()))
-      whole = [i for i in range(first, number) if meta["kind"][i] == "fault"]  # streams are numbered in the order of `meta`
-      for source in rng.choice(whole, min(5, len(whole)), replace=False):
-        at = int(source)
-        cut = int(rng.integers(meta["onset"][at], meta["steps"][at]))
-        add_meta(stream=number, kind="probe", seed=meta["seed"][at], severity=0.0, steps=cut, prefix=int(source), full=True, **common)
+      whole = [i for i in range(first - begin, number - begin) if meta[i]["kind"] == "fault"]  # streams are numbered in the order of `meta`
+      for at in rng.choice(whole, min(5, len(whole)), replace=False):
+        source = meta[int(at)]
+        cut = int(rng.integers(source["onset"], source["steps"]))
+        add_meta(stream=number, kind="probe", seed=source["seed"], severity=0.0, steps=cut, prefix=source["stream"], full=True, **common)
         number += 1
   table = {k: np.concatenate(v) for k, v in rows.items()}
   how = {"codec": "brotli", "level": 11 if len(table["step"]) < 2_000_000 else 5}  # 11: 9 % smaller than zstd at its best; but half a MB a second
   store.write_table(out / f"{robot}.parquet", table, split=COLUMNS, **how)
   store.write_table(out / f"{robot}_latents.parquet", {k: np.concatenate(v) for k, v in latents.items()}, **how,
                     split=tuple(f"z{k}" for k in range(LATENT)))
-  return {"rounding": {k: float(v) for k, v in grain.items()}, "pasts_that_differ": int(differ)}  # in the last digits, hence later in all: should be 0
+  return {"rounding": {k: float(v) for k, v in grain.items()}, "pasts_that_differ": int(differ)}, meta  # in the last digits, hence later in all: should be 0
 
 
 def _grain(healthy: dict) -> dict[str, float]:

@@ -44,7 +44,7 @@ def part(lanes, onsets, steps, seed):
 def make_set(folder, suite=SUITE, robots=("walker",)):
   """A set as `record` writes it, from synthetic recordings."""
   folder.mkdir(parents=True, exist_ok=True)
-  meta, details = {k: [] for k in streams.META}, {}
+  rows, details = [], {}
   for robot in robots:
     parts = {}
     for split in ("score", "tune"):
@@ -54,9 +54,9 @@ def make_set(folder, suite=SUITE, robots=("walker",)):
       who = recording.lanes(suite, robot, split)
       onsets = np.asarray([suite.onset_of(lane.seed) for lane in who])
       parts[split, "fault"] = (who, onsets, part(who, onsets, int(onsets.max()) + suite.after(CONTROL_S), 2))
-    details[robot] = recording._write(suite, folder, robot, parts, meta, CONTROL_S, ",".join(f"g{k}" for k in range(8)))
-  types = {"stream": np.int32, "seed": np.int32, "severity": float, "steps": np.int32, "full": bool, "control_s": float}
-  store.write_table(folder / "streams.parquet", {k: np.asarray(v, types[k]) if k in types else v for k, v in meta.items()})
+    details[robot], fresh = recording._write(suite, folder, robot, parts, len(rows), CONTROL_S, ",".join(f"g{k}" for k in range(8)))
+    rows += fresh
+  recording.write_meta(folder, rows)
   store.write_json(folder / "config.json", {"version": streams.VERSION, "suite": dataclasses.asdict(suite), "details": details})
   return parts
 

@@ -1,4 +1,5 @@
 """Recording a suite with real robots and a tiny agent, and the commands on what it writes: record, leaderboard."""
+import dataclasses
 import json
 
 import numpy as np
@@ -71,6 +72,53 @@ def test_a_recording_goes_on_where_it_was_cut_off(recorded, saved, tmp_path):
   assert list(dict.fromkeys(lived)) == ["walker score nominal", "walker tune nominal", "walker tune fault"]
   for name in ("walker.parquet", "walker_latents.parquet", "streams.parquet"):
     assert (tmp_path / name).read_bytes() == (recorded[0] / name).read_bytes()
+
+
+TWO = """name = "two"
+arl0 = 100
+count_from = 50
+onset = [100, 120]
+horizon_s = 2.0
+seeds = {score = [0, 1], tune = [100, 101]}
+nominal = {steps = 128, score = 1, tune = 1}
+latents = {nominal = 1, after_s = 1.0}
+robots.walker = {score = {gear = [0.5]}, tune = {push = [1.0]}}
+robots.car = {score = {friction = [0.5]}, tune = {wind = [1.0]}}
+"""
+
+
+def test_one_robot_of_a_set_is_recorded_anew(tmp_path, monkeypatch):
+  """The others' streams keep bytes, numbers and provenance; recorded one by one, a set has the bytes of one recorded at once. The lives are made up."""
+  (tmp_path / "two.toml").write_text(TWO)
+  suite, draw = streams.suite(str(tmp_path / "two.toml")), [0]
+
+  def live(env, trained, who, keys, onsets, steps, watch, progress):
+    rng = np.random.default_rng([draw[0], len(env.spec.obs), steps])
+    life = {c: np.repeat(rng.gamma(4.0, size=(steps, 1)).astype(np.float32), len(who), 1) for c in streams.COLUMNS}
+    return life | {"latent": np.zeros((steps, len(who), streams.LATENT), np.float16), "episode": np.zeros((steps, len(who)), np.int16),
+                   "terminated": np.zeros((steps, len(who)), bool), "target": np.array([lane.target or "all" for lane in who])}
+  monkeypatch.setattr(recording, "_record", live)
+
+  def record(name, robots=(), seed=0, **edit):
+    draw[0], out, own = seed, tmp_path / name, dataclasses.replace(suite, **edit)
+    recording.claim(own, out, True, robots)
+    recording.record(own, out, robots, physics="native", command=f"record {seed}")
+    recording.clear(out)
+    config = json.loads((out / "config.json").read_text())
+    return {p.name: p.read_bytes() for p in out.glob("*.parquet")}, config
+  whole, config = record("set")
+  assert set(whole) == {f"{r}{end}.parquet" for r in ("walker", "car") for end in ("", "_latents")} | {"streams.parquet"} and "kept" not in config
+  again, config = record("set", ("walker",), 1)
+  assert {name for name in whole if whole[name] != again[name]} == {"walker.parquet"}  # its latents are 0 in both
+  assert config["command"] == "record 1" and config["kept"]["car"]["command"] == "record 0" and set(config["kept"]) == {"car"}
+  assert set(config["details"]) == set(config["stream_steps"]) == set(config["suite"]["robots"]) == {"walker", "car"}
+  assert record("set", ("walker",), 0)[0] == whole and record("set", ("car",), 2)[1]["kept"]["walker"]["command"] == "record 0"
+  one, _ = record("by one", ("walker",))
+  assert set(one) == {"walker.parquet", "walker_latents.parquet", "streams.parquet"}
+  grown, config = record("by one", ("car",))
+  assert grown == whole and len(streams.StreamSet(tmp_path / "by one").robots) == 2
+  other, config = record("set", ("walker",), 0, arl0=200)  # another suite: nothing stays
+  assert "car.parquet" not in other and "kept" not in config
 
 
 def test_record_refuses(refused, recorded, tmp_path):
