@@ -301,7 +301,7 @@ def dreamer(results: pathlib.Path) -> str:
   return text + "\n\n" + grid(("", "measured", "goal"), rows)
 
 
-GOALS = {"velocity_error_m_s": 0.25, "fall_rate": 0.05}  # of the shipped quadruped
+GOALS = {"velocity_error_m_s": 0.25, "fall_rate": 0.05}  # of the quadruped's agents
 
 
 def agents(results: pathlib.Path) -> str:
@@ -326,8 +326,8 @@ def agents(results: pathlib.Path) -> str:
            ("`walker-plain`, without a demonstrator", "walker_learning/eval.json", trained("walker_learning", "then"), falls),
            ("`car`", "car_agent/eval.json", trained("car_agent"), driving),
            ("the same in `car_real`, unchanged", "car_agent/eval_car_real.json", "", driving),
-           ("`quadruped`", "quadruped_agent/eval.json", trained("quadruped_agent"), walking),
-           ("`quadruped-plain`, without a demonstrator", "quadruped_plain/eval.json", trained("quadruped_plain", "then"), walking))
+           ("`quadruped`, without a demonstrator", "quadruped_agent/eval.json", trained("quadruped_agent", "then"), walking),
+           ("`quadruped-cloned`", "quadruped_cloned/eval.json", trained("quadruped_cloned"), walking))
   rows = []
   for name, file, training, own in tasks:
     e = load(results / file)

@@ -27,7 +27,7 @@ SOURCES = {
     "physics": ("physics.json",),
     "dreamer": ("dreamer_update.json",),
     "agents": ("walker_agent/eval.json", "walker_agent/curve.parquet", "walker_learning/eval.json", "walker_learning/then.parquet", "car_agent/eval.json", "car_agent/eval_car_real.json",
-               "car_agent/curve.parquet", "quadruped_agent/eval.json", "quadruped_plain/eval.json", "quadruped_plain/then.parquet", "quadruped_agent/curve.parquet"),
+               "car_agent/curve.parquet", "quadruped_agent/eval.json", "quadruped_cloned/eval.json", "quadruped_agent/then.parquet", "quadruped_cloned/curve.parquet"),
     "detectors": ("detectors.json",),
     "paper": tuple(f"paper/{robot}/{file}" for robot in ("walker", "quadruped", "car") for file in ("config.json", "summary.json", "runs.parquet"))
              + ("paper/car/events.parquet",),
