@@ -703,7 +703,7 @@ def do_record(args: Record) -> None:
     emit(result)
   else:
     for robot, steps in result["stream_steps"].items():
-      speed = result["stream_steps_per_s"][robot]
+      speed = result["stream_steps_per_s"].get(robot)
       print(f"{robot}: {steps:,} stream-steps" + (f", {speed:,.0f} a second" if speed else ", recorded before"))
     print(f"{result['bytes'] / 1e6:.1f} MB in {out}")
 

@@ -128,7 +128,8 @@ class TrainConfig:
     penalties: factor on the negative weights of the reward in training, returns included: a first stage, from which `--agent` goes on with the task's
       own, 1. Where effort costs more than a beginner earns, it learns not to move.
     fault, severity: domain randomisation: each robot draws a target of this fault and a severity, uniform in [0, `severity`], at the start and at the
-      end of every chunk of 64 decisions in which one of its episodes ended. None: healthy robots.
+      end of every chunk of 64 decisions in which one of its episodes ended. A preset (robot/name) brings its own severities, whole from the first step
+      on, and the targets that it names: what an agent comes to that has the faulty robot to itself. None: healthy robots.
   """
   envs: int = 16
   updates: int = 500_000
@@ -157,6 +158,8 @@ class TrainConfig:
 
   def __post_init__(self):
     positive(self, "envs", "updates", "ratio", "capacity", "repeat", *(("episode",) if self.episode is not None else ()))
+    if self.fault is not None and fault_presets.named(self.fault) and self.severity != 1.0:
+      raise UserError(f"preset {self.fault!r} brings its own severity; leave severity out")
     fraction(self, "demo_share", "clone_until", "shake", "shake_share", "severity")
     for name in ("jitter", "hold", "fall_cost", "penalties"):
       if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= 0):

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_cl import checkpoint, demonstrator, faults, memory, replay as replay_lib
+from mjx_cl import checkpoint, demonstrator, fault_presets, faults, memory, replay as replay_lib
 from mjx_cl.config import CHUNK, DreamerConfig, TrainConfig
 from mjx_cl.dreamer.agent import Agent, TrainState, Weights
 from mjx_cl.errors import FileError, UserError
@@ -157,7 +157,14 @@ class Trainer:
     memory.check(dreamer.size, len(spec.obs), len(spec.act), config.envs * config.capacity, seeds, ("capacity", lambda n: n * config.envs), dreamer.bins,
                  1 if self.mesh is None else self.mesh.size)
     self.failed: dict[int, str] = {}  # seed -> the term that was not finite, and when
-    fault = faults.make(config.fault or "none", env)
+    self.preset = config.fault is not None and fault_presets.named(config.fault)
+    if self.preset:
+      changes = fault_presets.resolve(spec.name, config.fault)
+      if fault_presets.find(config.fault, spec.name).becomes:
+        raise UserError(f"preset {config.fault!r} turns the robot into another one, which only `mjx-cl run` does; train that one itself")
+      fault, self.plan, self.target = faults.build(changes, env)
+    else:
+      fault, self.target = faults.make(config.fault or "none", env), -1
     self.collect = {"pure": Rollout(env, self.plain, fault, config.repeat)}
     if dreamer.anchor and (config.shake or config.jitter):
       raise UserError("anchor holds the policy to the actions taken; shake and jitter put random ones among them: set both to 0")
@@ -173,7 +180,7 @@ class Trainer:
     train = jax.vmap(agent.init)(jax.random.split(key_init, seeds))
     keys = jax.random.split(key_stream, (seeds, config.envs))
     self.fault = fault if config.fault else None
-    streams = nest(lambda k: start(env, agent, fault, k, plan=self._drawn(k)), 0, 0)(keys)
+    streams = nest(lambda k: start(env, agent, fault, k, plan=self._drawn(k), target=self.target), 0, 0)(keys)
     empty = replay_lib.init(config.envs, config.capacity, len(spec.obs), len(spec.act), size.deter, size.stoch)
     replay = jax.tree.map(lambda x: jnp.broadcast_to(x, (seeds,) + x.shape).copy(), empty)
     self.state = self._place(Learner(train, streams, replay, key))
@@ -243,13 +250,15 @@ class Trainer:
     self.phase, self.phase_start = phase, self.updates
 
   def _drawn(self, key) -> faults.Plan:
-    """A severity from the stream's key, from the first step on; none without `config.fault`."""
+    """A severity from the stream's key, from the first step on; a preset's own, and none without `config.fault`."""
+    if self.preset:
+      return self.plan
     return faults.plan(self.config.severity * jax.random.uniform(jax.random.fold_in(key, FAULT)) if self.config.fault else 0.0)
 
   def _new_fault(self, stream: Stream, ended) -> Stream:
-    """`stream` with another target and severity where its episode `ended`: what it draws follows from its key and its clock."""
+    """`stream` with another target and severity where its episode `ended`, so far as these are drawn: that follows from its key and its clock."""
     key = jax.random.fold_in(jax.random.fold_in(stream.key, FAULT), stream.t)
-    fresh = faults.begin(self.fault, key, self._drawn(key))
+    fresh = faults.begin(self.fault, key, self._drawn(key), self.target)
     return stream._replace(injection=jax.tree.map(lambda a, b: jnp.where(ended, jnp.asarray(a, b.dtype), b), fresh, stream.injection))
 
   # ---- one chunk -----------------------------------------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ from test_cli import mjx, refused  # noqa: F401  fixtures
 from test_leaderboard import submission, trailing
 from test_run import saved  # noqa: F401  a fixture
 
-from mjx_cl import leaderboard, passes, recording, store, streams
+from mjx_cl import cli, leaderboard, passes, recording, store, streams
 
 SUITE = """
 name = "mini"
@@ -87,7 +87,7 @@ robots.car = {score = {friction = [0.5]}, tune = {wind = [1.0]}}
 """
 
 
-def test_one_robot_of_a_set_is_recorded_anew(tmp_path, monkeypatch):
+def test_one_robot_of_a_set_is_recorded_anew(tmp_path, monkeypatch, capsys):
   """The others' streams keep bytes, numbers and provenance; recorded one by one, a set has the bytes of one recorded at once. The lives are made up."""
   (tmp_path / "two.toml").write_text(TWO)
   suite, draw = streams.suite(str(tmp_path / "two.toml")), [0]
@@ -113,6 +113,8 @@ def test_one_robot_of_a_set_is_recorded_anew(tmp_path, monkeypatch):
   assert config["command"] == "record 1" and config["kept"]["car"]["command"] == "record 0" and set(config["kept"]) == {"car"}
   assert set(config["details"]) == set(config["stream_steps"]) == set(config["suite"]["robots"]) == {"walker", "car"}
   assert record("set", ("walker",), 0)[0] == whole and record("set", ("car",), 2)[1]["kept"]["walker"]["command"] == "record 0"
+  assert cli.main(["record", str(tmp_path / "two.toml"), "--out", str(tmp_path / "set"), "--robot", "car", "--overwrite", "--physics", "native"]) == 0
+  assert "walker: 2,448 stream-steps, recorded before" in capsys.readouterr().out
   one, _ = record("by one", ("walker",))
   assert set(one) == {"walker.parquet", "walker_latents.parquet", "streams.parquet"}
   grown, config = record("by one", ("car",))

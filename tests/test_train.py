@@ -114,6 +114,20 @@ def test_randomised_faults_are_drawn_anew_with_each_episode(short_walker, tmp_pa
     train.Trainer(short_walker, DREAMER, TrainConfig(fault="geer"), tmp_path)
 
 
+def test_a_preset_is_trained_under_as_it_is(short_walker, tmp_path):
+  """Severities, clocks and the targets that it names, for every robot, and still after a new draw; a target that it leaves open is drawn."""
+  trainer = train.Trainer(short_walker, DREAMER, TrainConfig(envs=3, fault="walker/gear-half-twice"), tmp_path)
+  knee = trainer.fault[0].targets.index("right_knee")
+  for streams in (trainer.state.streams, trainer._redraw(trainer.state.streams, np.ones((1, 3), bool))):
+    injection = streams.injection
+    assert (np.asarray(injection.target) == knee).all() and (np.asarray(injection.plan.severity) == 0.5).all()
+    assert (np.asarray(injection.plan.onset) == [0, 20_000]).all() and (np.asarray(injection.plan.duration)[..., 0] == 10_000).all()
+  for bad, text in ((dict(fault="walker/gear-half", severity=0.3), "brings its own severity"), (dict(fault="walker/gear-haf"), "walker/gear-half"),
+                    (dict(fault="quadruped/rh-velocity-third"), "of robot 'quadruped'")):
+    with pytest.raises(UserError, match=text):
+      train.Trainer(short_walker, DREAMER, TrainConfig(**bad), tmp_path)
+
+
 def test_resume_without_a_checkpoint(short_walker, tmp_path):
   with pytest.raises(FileError, match="no checkpoint"):
     make_trainer(short_walker, tmp_path).resume()
