@@ -581,6 +581,7 @@ def do_train(args: Train) -> None:
   env = envs.make(args.env, args.physics)
   if args.demonstrator not in (None, "ppo"):  # whatever can be refused is refused before an earlier training is touched
     train.expert(env, args.demonstrator)
+  train.faults_of(env, train_config)
   if args.agent:
     agents.of(env, args.agent)
   state = store.claim_folder(args.out, args.resume, args.overwrite, done_marker="agent/card.json")
@@ -751,7 +752,8 @@ def do_leaderboard(args: Leaderboard) -> None:
       say(f"{done}/{total}  {robot}: {name}, {clock(seconds)} gone, {clock(seconds / done * (total - done))} left")
   board = leaderboard.score(held, entries, robots, extra, progress)
   meta = {"command": "mjx-cl " + " ".join(sys.argv[1:]), "seeds": {k: list(v) for k, v in held.suite.seeds.items()}, "arl0_target": held.suite.arl0,
-          "streams": held.config.get("command"), "wall_s": round(board.seconds, 1), "stream_steps": board.stream_steps, **store.provenance()}
+          "streams": held.config.get("command"), **({"kept": {r: v.get("command") for r, v in held.config["kept"].items()}} if "kept" in held.config else {}),
+          "wall_s": round(board.seconds, 1), "stream_steps": board.stream_steps, **store.provenance()}
   files = leaderboard.write(board, args.out, meta)
   if args.json:
     emit([{k: v for k, v in r.items() if not k.startswith("stream_")} for r in board.rows])

@@ -41,8 +41,8 @@ class DreamerConfig:
     last_starts: imagination starts are the last k states of each sequence; 0 means all.
     horizon: the discount is 1 - 1 / horizon.
     lr, warmup: learning rate and updates of its linear warm-up.
-    policy_lr: factor on the policy's steps; 1, as the authors'. Below 1 the world model keeps ahead of the policy (the quadruped's at 1 runs to
-      where the model promises too much, and its return falls).
+    policy_lr: factor on the policy's steps; 1, as the authors'. Below 1 the world model keeps ahead of the policy (the cloned quadruped's at 1
+      runs to where the model promises too much, and its return falls).
     anchor: weight of -log policy(a | s) for the mean of the policy, over the actions that the robot itself took, in replayed states; 0: off, as the
       authors. The policy reads the latents of the world model; where learning moves those under it, this makes it follow.
     min_std, max_std: least and greatest deviation of the policy's actions; 0.1 and 1, as the authors'. What the robot does is drawn with it, in tests too.
@@ -128,8 +128,8 @@ class TrainConfig:
     penalties: factor on the negative weights of the reward in training, returns included: a first stage, from which `--agent` goes on with the task's
       own, 1. Where effort costs more than a beginner earns, it learns not to move.
     fault, severity: domain randomisation: each robot draws a target of this fault and a severity, uniform in [0, `severity`], at the start and at the
-      end of every chunk of 64 decisions in which one of its episodes ended. A preset (robot/name) brings its own severities, whole from the first step
-      on, and the targets that it names: what an agent comes to that has the faulty robot to itself. None: healthy robots.
+      end of every chunk of 64 decisions in which one of its episodes ended. A preset (robot/name) brings its own severities, schedules, whose clock
+      begins with the first step of a robot, and the targets that it names: what an agent comes to that has the faulty robot to itself. None: healthy ones.
   """
   envs: int = 16
   updates: int = 500_000

@@ -138,17 +138,17 @@ def resolve(env_name: str, fault: str, target: str | None = None, severity: floa
   if schedule not in SCHEDULES:
     raise UserError(f"unknown schedule {schedule!r}; choose from: {', '.join(SCHEDULES)}")
   for name, value in (("duration", duration), ("period", period)):
-    if value is not None and not 1 <= value < FOREVER:
-      raise UserError(f"{name} must lie in 1..{FOREVER - 1:,} control steps; got {value}")
+    if value is not None and not (1 <= value < FOREVER and value == int(value)):
+      raise UserError(f"{name} must be a whole number in 1..{FOREVER - 1:,} control steps; got {value}")
   if not named(fault):
     return (Change(fault, target, 0.5 if severity is None else severity, 0, duration, schedule, period, share),)
   preset = find(fault, env_name)
   if severity is not None or target is not None:
-    raise UserError(f"preset {fault!r} brings its own severity and target; leave --severity and --target out")
+    raise UserError(f"preset {fault!r} brings its own severity and target; leave severity and target out")
   if (schedule, period, share) != ("abrupt", 1000, 0.5):
-    raise UserError(f"preset {fault!r} brings its own schedule; leave --schedule, --period and --share out")
+    raise UserError(f"preset {fault!r} brings its own schedule; leave schedule, period and share out")
   if preset.becomes:
     if duration is not None:
-      raise UserError(f"preset {fault!r} turns the robot into {preset.becomes!r} for good; leave --duration out")
+      raise UserError(f"preset {fault!r} turns the robot into {preset.becomes!r} for good; leave duration out")
     return preset.then or (Change("none"),)
   return tuple(replace(c, duration=duration if c.duration is None else c.duration) for c in preset.changes)

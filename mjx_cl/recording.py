@@ -3,7 +3,9 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 import pathlib
+import shutil
 import zlib
 from typing import NamedTuple
 
@@ -15,6 +17,8 @@ from mjx_cl.streams import COLUMNS, LATENT, META, SCHEMA, VERSION, Suite
 
 CHUNK = 64
 TILE = 16      # lanes are filled up to a multiple of it
+MADE = ("command", "versions", "python", "git_commit", "machine")  # of config.json: how a set was made
+HELD = "held.json"  # config.json of the set whose files are being replaced
 WATCH = 2_000  # what is folded into a lane's key for the monitor's draws
 
 
@@ -123,7 +127,8 @@ def claim(suite_: Suite, out, overwrite: bool, robots=()) -> None:
       raise foreign
     if not overwrite:
       raise UserError(f"{out} holds a recorded set; give --overwrite to replace it, or another --out")
-    if robots and beside(suite_, out, robots):
+    if robots and set(config["suite"]["robots"]) - set(robots):
+      beside(suite_, out, robots)
       return
   ours = {"config.json", "streams.parquet", *(f"{r}{end}.parquet" for r in known for end in ("", "_latents"))}
   if held:
@@ -135,15 +140,30 @@ def claim(suite_: Suite, out, overwrite: bool, robots=()) -> None:
 
 
 def beside(suite_: Suite, out, robots) -> dict | None:
-  """config.json of the set in `out` if streams of other robots than `robots` can stay there, since it is a set of this very suite; else None."""
-  try:
-    config = json.loads((pathlib.Path(out) / "config.json").read_text())
-    held = config["suite"]["robots"]
-    whole = json.loads(json.dumps(_plain(suite_, suite_.robots)))
-    same = config["version"] == VERSION and config["suite"] == whole | {"robots": {r: whole["robots"].get(r) for r in held}}
-  except (OSError, ValueError, KeyError, TypeError, AttributeError):
+  """config.json of the set in `out` that holds more than `robots`, whose other streams stay there; None where it holds no more, or is none.
+
+  Raises:
+    UserError where streams of `suite_` have no place in it.
+  """
+  out = pathlib.Path(out)
+  for path in (out / "config.json", out / "work" / "set" / HELD):  # the latter: files were being moved into place when it was cut off
+    try:
+      config = json.loads(path.read_text())
+      break
+    except (OSError, ValueError):
+      continue
+  else:
     return None
-  return config if same and set(held) - set(robots) else None
+  held = config["suite"]["robots"]
+  if not set(held) - set(robots):
+    return None
+  whole = json.loads(json.dumps(_plain(suite_, suite_.robots)))
+  same = whole | {"robots": {r: whole["robots"].get(r) for r in held}}
+  differ = [k for k, v in config["suite"].items() if same.get(k) != v] + [k for k in MADE if k not in config] + ["version"] * (config["version"] != VERSION) + [k for k in ("details", "stream_steps") if set(config.get(k, ())) != set(held)]
+  if differ:
+    raise UserError(f"{out} holds a set of another suite (its {', '.join(differ)}), whose other robots' streams would be lost; give another --out, or "
+                    "record all robots")
+  return config
 
 
 def _plain(suite_: Suite, robots) -> dict:
@@ -153,16 +173,24 @@ def _plain(suite_: Suite, robots) -> dict:
 
 def _others(work: pathlib.Path) -> list[pathlib.Path]:
   """What is no part of a recording."""
-  return [p for p in work.iterdir() if not p.name.removesuffix(".tmp").endswith(".npz")] if work.is_dir() else []
+  staged = lambda p: p.name == "set" and p.is_dir() and all(f.suffix in (".parquet", ".json", ".tmp") for f in p.iterdir())
+  return [p for p in work.iterdir() if not p.name.removesuffix(".tmp").endswith(".npz") and not staged(p)] if work.is_dir() else []
 
 
 def clear(out) -> None:
   """Removes the parts of a recording."""
   work = pathlib.Path(out) / "work"
   if work.is_dir() and not _others(work):
-    for p in work.iterdir():
-      p.unlink()
-    work.rmdir()
+    shutil.rmtree(work)
+
+
+def _publish(staged: pathlib.Path, out: pathlib.Path) -> None:
+  """Moves a set's files into place. config.json, without which a folder holds no set, leaves first and comes last: no one reads old beside new."""
+  if (out / "config.json").exists():
+    os.replace(out / "config.json", staged / HELD)
+  for p in sorted(staged.glob("*.parquet")):
+    os.replace(p, out / p.name)
+  os.replace(staged / "config.json", out / "config.json")
 
 
 def prepare(suite_: Suite, robots, physics: str, agent: str | None) -> dict[str, tuple]:
@@ -205,8 +233,11 @@ def record(suite_: Suite, out, robots=(), physics: str = "auto", agent: str | No
   from mjx_cl.record import stream_keys
   import jax
   out = pathlib.Path(out)
-  work = out / "work"
-  work.mkdir(parents=True, exist_ok=True)
+  work, staged = out / "work", out / "work" / "set"
+  staged.mkdir(parents=True, exist_ok=True)
+  for p in staged.iterdir():
+    if p.name != HELD:
+      p.unlink()
   ready = prepare(suite_, robots, physics, agent)
   old = beside(suite_, out, robots) if robots else None
   table = store.read_rows(out / "streams.parquet") if old else []
@@ -240,18 +271,19 @@ def record(suite_: Suite, out, robots=(), physics: str = "auto", agent: str | No
         parts[split, kind] = (who, onsets, data)
     groups = ",".join(name for name, _ in watched(env.spec))
     number = min((row["stream"] for row in table if row["robot"] == robot), default=free)
-    details[robot], fresh = _write(suite_, out, robot, parts, number, env.spec.control_s, groups)
+    details[robot], fresh = _write(suite_, staged, robot, parts, number, env.spec.control_s, groups)
     rows, free = rows + fresh, max(free, number + len(fresh))
     steps_of[robot] = int(sum(x[2]["opr"].size for x in parts.values()))
     speed[robot] = lived / seconds if seconds else None
-  write_meta(out, rows)
+  write_meta(staged, rows)
   if old:
-    made = {k: old[k] for k in ("command", "versions", "python", "git_commit", "machine")}
+    made = {k: old[k] for k in MADE}
     kept = {r: old.get("kept", {}).get(r, made) for r in kept}
     details, steps_of = ({r: old[name][r] for r in kept} | new for name, new in (("details", details), ("stream_steps", steps_of)))
   config = {"version": VERSION, "suite": _plain(suite_, [r for r in suite_.robots if r in {*ready, *kept}]), "command": command, "schema": SCHEMA, "meta": META,
             "details": details, "stream_steps": steps_of, **store.provenance()}
-  store.write_json(out / "config.json", config | ({"kept": kept} if kept else {}))
+  store.write_json(staged / "config.json", config | ({"kept": kept} if kept else {}))
+  _publish(staged, out)
   size = sum(p.stat().st_size for p in out.glob("*.parquet"))
   return {"stream_steps_per_s": speed, "stream_steps": steps_of, "bytes": size}
 

@@ -113,6 +113,20 @@ def eased(env, factor: float):
   return env
 
 
+def faults_of(env, config: TrainConfig):
+  """(Fault or tuple of them, their Plan, targets) of a training: of a preset its own; of a fault no Plan and -1, since both are drawn.
+
+  Raises:
+    UserError for what is unknown, belongs to another robot, or turns the robot into another one.
+  """
+  if config.fault is None or not fault_presets.named(config.fault):
+    return faults.make(config.fault or "none", env), None, -1
+  changes = fault_presets.resolve(env.spec.name, config.fault)
+  if fault_presets.find(config.fault, env.spec.name).becomes:
+    raise UserError(f"preset {config.fault!r} turns the robot into another one, which only `mjx-cl run` does; train that one itself")
+  return faults.build(changes, env)
+
+
 class Returns:
   """Returns of finished episodes, per stream, from chunks of rewards."""
 
@@ -157,14 +171,7 @@ class Trainer:
     memory.check(dreamer.size, len(spec.obs), len(spec.act), config.envs * config.capacity, seeds, ("capacity", lambda n: n * config.envs), dreamer.bins,
                  1 if self.mesh is None else self.mesh.size)
     self.failed: dict[int, str] = {}  # seed -> the term that was not finite, and when
-    self.preset = config.fault is not None and fault_presets.named(config.fault)
-    if self.preset:
-      changes = fault_presets.resolve(spec.name, config.fault)
-      if fault_presets.find(config.fault, spec.name).becomes:
-        raise UserError(f"preset {config.fault!r} turns the robot into another one, which only `mjx-cl run` does; train that one itself")
-      fault, self.plan, self.target = faults.build(changes, env)
-    else:
-      fault, self.target = faults.make(config.fault or "none", env), -1
+    fault, self.plan, self.target = faults_of(env, config)
     self.collect = {"pure": Rollout(env, self.plain, fault, config.repeat)}
     if dreamer.anchor and (config.shake or config.jitter):
       raise UserError("anchor holds the policy to the actions taken; shake and jitter put random ones among them: set both to 0")
@@ -251,7 +258,7 @@ class Trainer:
 
   def _drawn(self, key) -> faults.Plan:
     """A severity from the stream's key, from the first step on; a preset's own, and none without `config.fault`."""
-    if self.preset:
+    if self.plan is not None:
       return self.plan
     return faults.plan(self.config.severity * jax.random.uniform(jax.random.fold_in(key, FAULT)) if self.config.fault else 0.0)
 

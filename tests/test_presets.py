@@ -87,7 +87,7 @@ def test_run_takes_a_preset_and_refuses_what_contradicts_it():
   assert config.changes(RunConfig("walker", severity=0.25, schedule="ramp", period=9))[0] == Change("gear", None, 0.25, schedule="ramp", period=9)
   for kw, words in (({"fault": "any/all-easy", "severity": 0.3}, "brings its own severity"), ({"fault": "walker/nothing"}, "walker/gear-half"),
                     ({"fault": "car/socks"}, "of robot 'car_real'"), ({"schedule": "now"}, "abrupt, ramp"), ({"fault": "any/all-easy", "schedule": "ramp"}, "brings its own schedule"),
-                    ({"duration": 3_000_000_000}, "duration must lie in"), ({"period": 2**31}, "period must lie in"), ({"period": 0}, "period"), ({"share": 1.5}, "share")):
+                    ({"duration": 3_000_000_000}, "duration must be a whole"), ({"period": 2**31}, "period must be a whole"), ({"period": 0}, "period"), ({"share": 1.5}, "share")):
     with pytest.raises(UserError, match=words):
       RunConfig("walker", **kw)
 

@@ -1,6 +1,8 @@
 """Recording a suite with real robots and a tiny agent, and the commands on what it writes: record, leaderboard."""
 import dataclasses
 import json
+import os
+import pathlib
 
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ from test_leaderboard import submission, trailing
 from test_run import saved  # noqa: F401  a fixture
 
 from mjx_cl import cli, leaderboard, passes, recording, store, streams
+from mjx_cl.errors import FileError, UserError
 
 SUITE = """
 name = "mini"
@@ -87,8 +90,9 @@ robots.car = {score = {friction = [0.5]}, tune = {wind = [1.0]}}
 """
 
 
-def test_one_robot_of_a_set_is_recorded_anew(tmp_path, monkeypatch, capsys):
-  """The others' streams keep bytes, numbers and provenance; recorded one by one, a set has the bytes of one recorded at once. The lives are made up."""
+@pytest.fixture
+def two(tmp_path, monkeypatch):
+  """record(name, robots, seed): bytes of the tables and config.json of the set in tmp_path / name, of a suite of two robots, lives made up from the seed."""
   (tmp_path / "two.toml").write_text(TWO)
   suite, draw = streams.suite(str(tmp_path / "two.toml")), [0]
 
@@ -106,6 +110,12 @@ def test_one_robot_of_a_set_is_recorded_anew(tmp_path, monkeypatch, capsys):
     recording.clear(out)
     config = json.loads((out / "config.json").read_text())
     return {p.name: p.read_bytes() for p in out.glob("*.parquet")}, config
+  return record
+
+
+def test_one_robot_of_a_set_is_recorded_anew(two, tmp_path, capsys):
+  """The others' streams keep bytes, numbers and provenance; recorded one by one, a set has the bytes of one recorded at once."""
+  record = two
   whole, config = record("set")
   assert set(whole) == {f"{r}{end}.parquet" for r in ("walker", "car") for end in ("", "_latents")} | {"streams.parquet"} and "kept" not in config
   again, config = record("set", ("walker",), 1)
@@ -119,8 +129,36 @@ def test_one_robot_of_a_set_is_recorded_anew(tmp_path, monkeypatch, capsys):
   assert set(one) == {"walker.parquet", "walker_latents.parquet", "streams.parquet"}
   grown, config = record("by one", ("car",))
   assert grown == whole and len(streams.StreamSet(tmp_path / "by one").robots) == 2
-  other, config = record("set", ("walker",), 0, arl0=200)  # another suite: nothing stays
-  assert "car.parquet" not in other and "kept" not in config
+  with pytest.raises(UserError, match="another suite .its arl0., whose other robots"):
+    record("set", ("walker",), 0, arl0=200)
+  assert {p.name: p.read_bytes() for p in (tmp_path / "by one").glob("*.parquet")} == whole and streams.StreamSet(tmp_path / "set").robots
+
+
+@pytest.mark.parametrize("cut", range(1, 6))
+def test_a_set_that_was_cut_off_between_its_files_is_none(two, tmp_path, monkeypatch, cut):
+  """Killed while a robot's new files move into place: nobody reads old beside new, the others' streams are there, and the same command ends it."""
+  record, moved, replace = two, [], os.replace
+  whole, _ = record("set")
+  wanted, _ = record("wanted", seed=1)
+
+  def kill(source, target):
+    if pathlib.Path(target).parent == tmp_path / "set" or pathlib.Path(target).name == recording.HELD:
+      moved.append(target)
+      if len(moved) == cut:
+        raise KeyboardInterrupt
+    replace(source, target)
+  monkeypatch.setattr(os, "replace", kill)
+  with pytest.raises(KeyboardInterrupt):
+    record("set", ("walker",), 1)
+  monkeypatch.setattr(os, "replace", replace)
+  if cut > 1:
+    with pytest.raises(FileError, match="holds no recorded streams"):
+      streams.StreamSet(tmp_path / "set")
+  else:
+    assert streams.StreamSet(tmp_path / "set").robots == ["walker", "car"]
+  again, config = record("set", ("walker",), 1)
+  assert config["kept"]["car"]["command"] == "record 0" and not (tmp_path / "set" / "work").exists()
+  assert again == {name: (wanted if "walker" in name else whole)[name] for name in whole}
 
 
 def test_record_refuses(refused, recorded, tmp_path):

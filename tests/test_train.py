@@ -122,6 +122,8 @@ def test_a_preset_is_trained_under_as_it_is(short_walker, tmp_path):
     injection = streams.injection
     assert (np.asarray(injection.target) == knee).all() and (np.asarray(injection.plan.severity) == 0.5).all()
     assert (np.asarray(injection.plan.onset) == [0, 20_000]).all() and (np.asarray(injection.plan.duration)[..., 0] == 10_000).all()
+  drawn = train.Trainer(short_walker, DREAMER, TrainConfig(envs=24, fault="walker/gear-half"), tmp_path)
+  assert set(np.asarray(drawn.state.streams.injection.target)[0, :, 0]) == set(range(6))  # 6 (5 / 6)^24 = 0.08 to miss one; the seed is fixed
   for bad, text in ((dict(fault="walker/gear-half", severity=0.3), "brings its own severity"), (dict(fault="walker/gear-haf"), "walker/gear-half"),
                     (dict(fault="quadruped/rh-velocity-third"), "of robot 'quadruped'")):
     with pytest.raises(UserError, match=text):

@@ -249,7 +249,7 @@ def test_config():
   assert [c.fault for c in config.changes(late)] == ["none"]
   assert config.changes(RunConfig("car", fault="car/transfer-then-socks")) == (Change("friction", "rear", SOCKS, 42_000),)
   for kw, words in (({"severity": 0.3}, "its own severity and target"), ({"target": "rear"}, "its own severity and target"),
-                    ({"schedule": "ramp"}, "its own schedule"), ({"duration": 50}, "'car_real' for good; leave --duration out"),
+                    ({"schedule": "ramp"}, "its own schedule"), ({"duration": 50}, "'car_real' for good; leave duration out"),
                     ({"onset": -1}, "onset must lie in 0..2147483646"), ({"onset": 2**31}, "onset must lie in"), ({"env": "walker"}, "of robot 'car'")):
     with pytest.raises(UserError, match=words) as e:
       RunConfig(**{"env": "car", "fault": "car/sim-to-real"} | kw)
