@@ -562,6 +562,30 @@ def gradient(results: pathlib.Path) -> str:
   return text + "\n\n" + grid(("agent", "step along the gradient", "the dream promises", "the robot gains", "terminations"), rows)
 
 
+def quadruped(results: pathlib.Path) -> str:
+  """What finetuning gives the quadruped, beside an agent that had the faulty robot to itself."""
+  from mjx_cl.scoring import bootstrap
+  folder, rows = results / "quadruped_agent" / "finetuning", []
+  config = load(folder / "none" / "config.json")
+  seeds, span_ = range(config["first_seed"], config["first_seed"] + config["seeds"]), config["steps"] - config["onset"]
+
+  def read(name):
+    lines = load(folder / name / "curve.json")
+    return [statistics.mean(r["reward"] for r in lines if r["seed"] == s) for s in seeds], sum(r["falls"] for r in lines)
+  still, _ = read("none")
+  for name, what in (("none", "no adaptation"), ("told", "finetuning from the onset on"), ("ratio64", "train ratio 64 in place of 16"),
+                     ("ratio64_lr3e-5", "the same at a learning rate of 3e-5"), ("expert", "no adaptation, agent trained on the faulty robot")):
+    reward, falls = read(name)
+    more = [x - y for x, y in zip(reward, still)]
+    gain = "" if name == "none" else f"{number(statistics.mean(more), 3)} {span(bootstrap.interval(more, lambda x, axis: x.mean(axis)), 3)}"
+    (arm,) = load(folder / name / "summary.json")["arms"].values()
+    rows.append((what, number(statistics.mean(reward), 3), gain, str(falls), number(arm["updates_mean"])))
+  text = fill(f"""
+      Reward per control step over the {number(span_)} steps from the onset on, gain over no adaptation paired by seed with its 95 % bootstrap interval over {config['seeds']} streams (seeds {seeds[0]} to {seeds[-1]}, one run each),
+      falls of all of them, updates a stream.""")
+  return text + "\n\n" + grid(("", "reward", "gain", "falls", "updates"), rows)
+
+
 def ppo(results: pathlib.Path) -> str:
   """Model-free finetuning on the paper's walker, beside the method's arms."""
   own = load(results / "ppo_finetune.json")
@@ -588,7 +612,7 @@ def ppo(results: pathlib.Path) -> str:
 
 BLOCKS = {"run-walker": run_walker, "arl0": arl0, "leaderboard": leaderboard, "leaderboard-100k": leaderboard_100k, "physics": physics, "dreamer": dreamer, "agents": agents,
           "detectors": detectors, "paper": experiments, "arms": arms,
-          "other-arms": other_arms, "stop-rule": stop_rule, "again": again, "study": study, "full": full, "two-agents": two_agents, "gradient": gradient, "ppo": ppo}
+          "other-arms": other_arms, "stop-rule": stop_rule, "again": again, "study": study, "full": full, "two-agents": two_agents, "gradient": gradient, "quadruped": quadruped, "ppo": ppo}
 
 
 # ---- pages -----------------------------------------------------------------------------------------------------------------------
