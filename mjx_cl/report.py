@@ -574,7 +574,8 @@ def quadruped(results: pathlib.Path) -> str:
     return [statistics.mean(r["reward"] for r in lines if r["seed"] == s) for s in seeds], sum(r["falls"] for r in lines)
   still, _ = read("none")
   for name, what in (("none", "no adaptation"), ("told", "finetuning from the onset on"), ("ratio64", "train ratio 64 in place of 16"),
-                     ("ratio64_lr3e-5", "the same at a learning rate of 3e-5"), ("expert", "no adaptation, agent trained on the faulty robot")):
+                     ("ratio64_lr3e-5", "the same at a learning rate of 3e-5"), ("average0.02", "weights averaged over 50 chunks in place of 10"),
+                     ("average0.01_lr2e-4", "over 100, at 2e-4"), ("expert", "no adaptation, agent trained on the faulty robot")):
     reward, falls = read(name)
     more = [x - y for x, y in zip(reward, still)]
     gain = "" if name == "none" else f"{number(statistics.mean(more), 3)} {span(bootstrap.interval(more, lambda x, axis: x.mean(axis)), 3)}"

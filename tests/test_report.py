@@ -40,7 +40,7 @@ SOURCES = {
     "two-agents": ("walker_gear/summary.json", "walker_plain/summary.json"),
     "gradient": ("policy_gradient.json",),
     "quadruped": ("quadruped_agent/finetuning/none/config.json", *(f"quadruped_agent/finetuning/{run}/{file}.json" for run in (
-        "none", "told", "ratio64", "ratio64_lr3e-5", "expert") for file in ("curve", "summary"))),
+        "none", "told", "ratio64", "ratio64_lr3e-5", "average0.02", "average0.01_lr2e-4", "expert") for file in ("curve", "summary"))),
     "ppo": ("ppo_finetune.json", "paper/bench.json"),
 }
 ALL = [(name, file) for name, files in SOURCES.items() for file in files]
