@@ -566,25 +566,27 @@ def quadruped(results: pathlib.Path) -> str:
   """What finetuning gives the quadruped, beside an agent that had the faulty robot to itself."""
   from mjx_cl.scoring import bootstrap
   folder, rows = results / "quadruped_agent" / "finetuning", []
-  config = load(folder / "none" / "config.json")
-  seeds, span_ = range(config["first_seed"], config["first_seed"] + config["seeds"]), config["steps"] - config["onset"]
 
   def read(name):
     lines = load(folder / name / "curve.json")
-    return [statistics.mean(r["reward"] for r in lines if r["seed"] == s) for s in seeds], sum(r["falls"] for r in lines)
-  still, _ = read("none")
-  for name, what in (("none", "no adaptation"), ("told", "finetuning from the onset on"), ("ratio64", "train ratio 64 in place of 16"),
-                     ("ratio64_lr3e-5", "the same at a learning rate of 3e-5"), ("average0.02", "weights averaged over 50 chunks in place of 10"),
-                     ("average0.01_lr2e-4", "over 100, at 2e-4"), ("expert", "no adaptation, agent trained on the faulty robot")):
+    return [statistics.mean(r["reward"] for r in lines if r["seed"] == s) for s in sorted({r["seed"] for r in lines})], sum(r["falls"] for r in lines)
+  still, falls = read("none")
+  rows.append(("none", "", "", "", number(statistics.mean(still), 3), "", number(falls), ""))
+  for name, what in (("told", "from the onset on"), ("ratio64", ""), ("ratio64_lr3e-5", ""), ("average0.02", ""), ("average0.01_lr2e-4", ""),
+                     ("expert", "none; agent trained on the faulty robot")):
     reward, falls = read(name)
     more = [x - y for x, y in zip(reward, still)]
-    gain = "" if name == "none" else f"{number(statistics.mean(more), 3)} {span(bootstrap.interval(more, lambda x, axis: x.mean(axis)), 3)}"
-    (arm,) = load(folder / name / "summary.json")["arms"].values()
-    rows.append((what, number(statistics.mean(reward), 3), gain, str(falls), number(arm["updates_mean"])))
+    how = ("", "", "", "")
+    if name != "expert":
+      adapt, (arm,) = load(folder / name / "config.json")["adapt"], load(folder / name / "summary.json")["arms"].values()
+      how = number(adapt["ratio"]), f"{adapt['lr']:g}", f"{adapt['average']:g}", number(arm["updates_mean"])
+    rows.append((what, *how[:3], number(statistics.mean(reward), 3), f"{number(statistics.mean(more), 3)} {span(bootstrap.interval(more, lambda x, axis: x.mean(axis)), 3)}",
+                 number(falls), how[3]))
+  config = load(folder / "none" / "config.json")
   text = fill(f"""
-      Reward per control step over the {number(span_)} steps from the onset on, gain over no adaptation paired by seed with its 95 % bootstrap interval over {config['seeds']} streams (seeds {seeds[0]} to {seeds[-1]}, one run each),
-      falls of all of them, updates a stream.""")
-  return text + "\n\n" + grid(("", "reward", "gain", "falls", "updates"), rows)
+      Reward per control step over the {number(config['steps'] - config['onset'])} steps from the onset on; gain over no adaptation, paired by seed, with its 95 % bootstrap interval over {len(still)} streams
+      (seeds from {config['first_seed']} on, one run each); falls of all of them; updates a stream. Average: rate per chunk of the moving average of the weights that acts.""")
+  return text + "\n\n" + grid(("adaptation", "train ratio", "learning rate", "average", "reward", "gain", "falls", "updates"), rows)
 
 
 def ppo(results: pathlib.Path) -> str:

@@ -39,8 +39,9 @@ SOURCES = {
     "full": ("full/bench.json", "full/suite.json", "full/bench.parquet"),
     "two-agents": ("walker_gear/summary.json", "walker_plain/summary.json"),
     "gradient": ("policy_gradient.json",),
-    "quadruped": ("quadruped_agent/finetuning/none/config.json", *(f"quadruped_agent/finetuning/{run}/{file}.json" for run in (
-        "none", "told", "ratio64", "ratio64_lr3e-5", "average0.02", "average0.01_lr2e-4", "expert") for file in ("curve", "summary"))),
+    "quadruped": ("quadruped_agent/finetuning/none/config.json", *(f"quadruped_agent/finetuning/{run}/curve.json" for run in ("none", "expert")),
+                  *(f"quadruped_agent/finetuning/{run}/{file}.json" for run in ("told", "ratio64", "ratio64_lr3e-5", "average0.02", "average0.01_lr2e-4")
+                    for file in ("config", "summary", "curve"))),
     "ppo": ("ppo_finetune.json", "paper/bench.json"),
 }
 ALL = [(name, file) for name, files in SOURCES.items() for file in files]
@@ -270,7 +271,7 @@ def changed(value, key="", place=0):
     return value
   if isinstance(value, int):
     return value + value // 3 + len(key) + place
-  return value * (2.1 + 0.1 * (len(key) % 7)) + (0.173 if value > 0 else 0.0)
+  return value * (3.1 + 0.1 * (len(key) % 7)) + (0.173 if value > 0 else 0.0)
 
 
 def change(path):
@@ -310,6 +311,7 @@ CONSTANTS = {  # what a block says of itself: windows of the definitions, sizes 
     "full": {"95", "500", "2,000", "1", "2", "3"},
     "two-agents": {"95", "500", "10,000", "2,000"},
     "gradient": {"95"},
+    "quadruped": {"95", "8"},
     "ppo": {"95", "3"},
 }
 
