@@ -3,7 +3,8 @@
   [XLA_FLAGS=...] python benchmarks/compile_time.py update|digest
 
 `update`: a learner's update (size1m, 16 x 64, preset `cpu`); `digest`: what a run does with a chunk of the walker (monitor, detector, rule, updates).
-Processor time, since it changes less than wall time beside other work; two runs with the same hash computed the same bits.
+Processor time, since it changes less than wall time beside other work. The hash is of one call: one update from new weights; a first chunk, in which no
+stream updates yet. Where it differs between two settings, so do the bits; where it does not, that much is shown.
 """
 from __future__ import annotations
 
