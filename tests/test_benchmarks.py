@@ -3,6 +3,8 @@ import dataclasses
 import importlib.util
 import json
 import pathlib
+import subprocess
+import sys
 import types
 
 import jax
@@ -216,3 +218,9 @@ def test_socks_at_the_healthy_grip_are_none_and_less_grip_costs(monkeypatch):
     own.append(np.asarray(rows.reward).mean((0, 2)))
   np.testing.assert_allclose(reward[:, 0], np.mean(own, 0), rtol=1e-6)
   assert (reward[:, 1:] != reward[:, :1]).all()
+
+
+@pytest.mark.parametrize("given", [[], ["nosuch"], ["update", "digest"]])
+def test_compile_time_names_its_programs(given):
+  done = subprocess.run([sys.executable, FOLDER / "compile_time.py", *given], capture_output=True, text=True)
+  assert done.returncode == 1 and done.stderr == "usage: python benchmarks/compile_time.py update|digest\n"
