@@ -105,15 +105,18 @@ def named(fault: str) -> bool:
 
 
 def find(name: str, env_name: str) -> Preset:
-  """The preset `name` for a robot; `any/...` fits every robot.
+  """The preset `name` for a robot; `any/...` fits every robot. A robot of one's own may take that of a shipped one, from which it may be derived:
+  whether it has what the faults act on, and the targets, is for them to say. What turns a robot into another one it may not.
 
   Raises:
     UserError for an unknown name, or one of another robot.
   """
+  shipped = env_name in {preset.robot for preset in PRESETS.values()}
+  fits = lambda preset: preset.robot in (env_name, "*") or not (shipped or preset.becomes)
   if name not in PRESETS:
-    raise UserError(f"unknown preset {name!r}; choose from: {', '.join(n for n, p in PRESETS.items() if p.robot in (env_name, '*'))}")
+    raise UserError(f"unknown preset {name!r}; choose from: {', '.join(n for n, p in PRESETS.items() if fits(p))}")
   preset = PRESETS[name]
-  if preset.robot not in (env_name, "*"):
+  if not fits(preset):
     raise UserError(f"preset {name!r} is of robot {preset.robot!r}, not of {env_name!r}")
   return preset
 

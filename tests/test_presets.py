@@ -96,3 +96,18 @@ def test_names_are_found_for_the_robot_that_asks():
   with pytest.raises(UserError, match="choose from: .*car/sim-to-real") as e:
     fault_presets.find("car/fly", "car")
   assert "walker/" not in str(e.value)
+
+
+def test_a_robot_of_ones_own_takes_presets_of_shipped_ones():
+  for name, preset in PRESETS.items():
+    if preset.becomes:
+      with pytest.raises(UserError, match=f"is of robot '{preset.robot}', not of 'mine.py:Mine'"):
+        fault_presets.find(name, "mine.py:Mine")
+    else:
+      assert fault_presets.find(name, "mine.py:Mine") is preset
+  assert fault_presets.resolve("mine.py:Mine", "walker/gear-half") == fault_presets.resolve("walker", "walker/gear-half")
+  with pytest.raises(UserError, match="unknown preset 'walker/fly'; choose from: (?!.*car/sim-to-real).*walker/gear-half"):
+    fault_presets.find("walker/fly", "mine.py:Mine")
+  for robot in {p.robot for p in PRESETS.values()} - {"*", "walker"}:  # among shipped robots each has its own
+    with pytest.raises(UserError, match=f"is of robot 'walker', not of '{robot}'"):
+      fault_presets.find("walker/gear-half", robot)
