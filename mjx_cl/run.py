@@ -94,6 +94,7 @@ class Runner:
     self.faults, plan, target = faults.build(self.changes, self.robots[-1], config.onset)
     robot = getattr(self.env, "agents_of", None) or spec.name
     detector = detectors.make(config.detector, robot=robot, **config.settings)
+    self.robot, self.threshold = robot, detectors.calibrated(config.detector, robot, **config.settings)
     monitor = Monitor(agent, n=15, form=config.form, actions=config.actions, spec=spec)
     if self.other is None:
       self.rollout = Rollout(self.env, agent, self.faults, self.repeat, config.deterministic)
@@ -296,7 +297,7 @@ class Runner:
     return {"command": "run", **identity(self.config),
             "physics": "+".join(dict.fromkeys(envs.physics_of(robot).name for robot in self.robots)),
             "agent_card": self.trained.card, **({"arm_cards": {arm: other.card for arm, other in self.others.items()}} if self.others else {}), "agent_path": pathlib.Path(self.trained.path).name, "repeat": self.repeat,
-            "control_s": self.env.spec.control_s, **store.provenance()}
+            "control_s": self.env.spec.control_s, **({"threshold": self.threshold._asdict()} if self.threshold else {}), **store.provenance()}
 
   def finish(self, tell=lambda text: None) -> dict:
     """Writes trace, events, runs, summary and figure, of an arm that never stops also signals, snapshots and stop; removes the working files.
@@ -572,6 +573,18 @@ def summarise(rows: list[dict], config: RunConfig, control_s: float) -> dict:
   return out
 
 
+def watching(config: RunConfig, robot: str, threshold: detectors.Threshold | None) -> str | None:
+  """The threshold that a detector has without having been given one, in a line; None where it was, or is one of the paper's rules or a reference, which looks at nothing."""
+  own = config.detector.startswith("rolling_sigma") or getattr(detectors.factory(config.detector), "reference", False)
+  if own or "threshold" in config.settings or not any(ARMS[arm].trigger.listens for arm in config.arms):
+    return None
+  if threshold is None:
+    return (f"detector {config.detector} has its own default threshold, if any; none is known for {robot} and these settings, and false alarms may be many: "
+            "--set threshold=... (`mjx-cl leaderboard` finds one)")
+  often = f"{threshold.alarms} false alarms, one in {threshold.arl0:,.0f} healthy control steps" if threshold.arl0 else "no false alarm at all"
+  return f"detector {config.detector} at threshold {threshold.value:.6g}, which gave the shipped {robot} {often}"
+
+
 def doubts(config: RunConfig) -> list[str]:
   """What a user may not have meant, one line each."""
   warmup = config.adapt.warmup
@@ -608,7 +621,7 @@ def execute(config: RunConfig, out, resume: bool = False, overwrite: bool = Fals
       clear(out)
     runner.open()
     store.write_json(out / "config.json", values)
-  for text in doubts(config):
+  for text in [*filter(None, [watching(config, runner.robot, runner.threshold)]), *doubts(config)]:
     tell(f"note: {text}")
   tell(f"{len(config.arms) * config.seeds} streams of {config.steps:,} control steps; what is not compiled yet is compiled first, a minute or two")
   saved = time.monotonic()
