@@ -17,7 +17,7 @@ from flax import serialization
 from test_agent import shake
 
 from mjx_cl import agents, demonstrator, detectors, envs, faults, store
-from mjx_cl.errors import UserError
+from mjx_cl.errors import FileError, UserError
 
 FOLDER = pathlib.Path(__file__).parent.parent / "benchmarks"
 
@@ -224,3 +224,20 @@ def test_socks_at_the_healthy_grip_are_none_and_less_grip_costs(monkeypatch):
 def test_compile_time_names_its_programs(given):
   done = subprocess.run([sys.executable, FOLDER / "compile_time.py", *given], capture_output=True, text=True)
   assert done.returncode == 1 and done.stderr == "usage: python benchmarks/compile_time.py update|digest\n"
+
+
+def test_the_thresholds_that_ship_are_those_of_the_board(tmp_path):
+  thresholds, root = load("thresholds"), FOLDER.parent
+  assert thresholds.collect(root / "results/leaderboard_100k") == json.loads(thresholds.FILE.read_text())
+  for name, text, words in ((None, "", "is missing"), ("leaderboard.json", "{}", "not a leaderboard's"), ("leaderboard.json", "[", "cannot read")):
+    folder = tmp_path / f"{name}{len(text)}"
+    folder.mkdir()
+    if name:
+      (folder / name).write_text(text)
+      pq.write_table(pq.read_table(root / "results/leaderboard_100k/leaderboard.parquet"), folder / "leaderboard.parquet")
+    with pytest.raises(FileError, match=words):
+      thresholds.collect(folder)
+  (folder / "leaderboard.json").write_text((root / "results/leaderboard_100k/leaderboard.json").read_text())
+  (folder / "leaderboard.parquet").write_text("no table")
+  with pytest.raises(FileError, match="not a leaderboard's table"):
+    thresholds.collect(folder)

@@ -79,7 +79,7 @@ def test_list(mjx):
   tables = json.loads(out)
   assert {k: set(v) for k, v in tables.items()} == {
       "envs": set(envs.ENVS), "faults": set(faults.FAULTS), "detectors": set(detectors.DETECTORS), "presets": set(PRESETS),
-      "agents": set(agents.shipped()), "arms": set(ARMS), "sizes": set(SIZES), "suites": {"leaderboard", "leaderboard-100k"}, "benches": {"again", "arms", "full", "paper", "quick", "stop", "study"},
+      "agents": set(agents.shipped()), "arms": set(ARMS), "sizes": set(SIZES), "suites": {"leaderboard", "leaderboard-100k"}, "benches": {"again", "arms", "full", "loop", "paper", "quick", "stop", "study"},
       "fault-presets": set(fault_presets.PRESETS), "schedules": set(fault_presets.SCHEDULES)}
   assert all(text for table in tables.values() for text in table.values())  # each with a word about it
   assert json.loads(mjx("list", "faults", "--json")[1]) == {"faults": tables["faults"]}

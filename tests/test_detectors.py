@@ -295,6 +295,30 @@ def test_one_threshold_for_both_residuals_is_both_thresholds_in_proportion(robot
   assert one.fired.any() and (np.asarray(one.score)[one.fired] > 0.8).all() and detectors.one_threshold("a robot of mine") == detectors.one_threshold("walker")
 
 
+@pytest.mark.parametrize("robot", detectors.board())
+def test_what_stands_on_the_board_takes_its_threshold_from_there(robot):
+  """Whoever names a robot and no threshold gets the board's, for just these settings; whoever names one keeps it."""
+  for row in detectors.board()[robot].values():
+    own = dict(row["settings"])
+    assert detectors.calibrated(own.pop("use"), robot, **own).value == row["threshold"] > 0
+    assert detectors.calibrated(row["settings"]["use"], robot, **own, threshold=2.0) is None
+  xs = residuals(jax.random.key(8), 1300, invalid=0.0)
+  xs = xs._replace(opr=jnp.where(jnp.arange(1300) < 1100, 1.0, 1.2) * xs.opr)  # some two deviations
+  run = lambda **settings: jax.lax.scan((det := detectors.make("cusum@opr", **settings)).update, det.init(), xs)[1]
+  found, given, plain = run(robot=robot), run(robot=robot, threshold=0.1), run()
+  same, other = run(threshold=detectors.board()[robot]["cusum@opr"]["threshold"]), run(robot=robot, slack=0.25)
+  np.testing.assert_array_equal(found.fired, same.fired)
+  np.testing.assert_array_equal(found.score, same.score)
+  assert given.fired.sum() > plain.fired.sum() > found.fired.sum() and (other.fired == run(slack=0.25).fired).all()
+
+
+def test_the_boards_thresholds_are_for_what_the_board_ran():
+  assert detectors.calibrated("rolling_sigma", "walker") is detectors.calibrated("rolling_sigma_plain", "walker") is detectors.calibrated("random", "walker") is None
+  assert detectors.calibrated("ewma", "a robot of mine") is detectors.calibrated("ewma", None) is detectors.calibrated("ewma", "walker", whiten=3) is None
+  assert detectors.calibrated("cusum@surprise", "car") == detectors.calibrated("cusum", "car", channel="surprise") != detectors.calibrated("cusum@opr", "car")
+  assert {"walker", "quadruped", "car"} == set(detectors.board()) and all(len(rows) > 20 for rows in detectors.board().values())
+
+
 def echo(threshold):
   """Fires above `threshold`; score is the sample; nan stays unknown."""
   return Detector(lambda: jnp.int32(0), lambda state, x: (state + 1, Alarm(x > threshold, jnp.float32(x))))

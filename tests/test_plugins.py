@@ -153,6 +153,25 @@ def test_what_a_run_takes_with_a_doubt_and_what_it_refuses(capsys, tmp_path):
     assert words in capsys.readouterr().err and not (tmp_path / "r").exists()  # an empty folder is no run either
 
 
+def test_a_detector_in_the_loop_has_the_boards_threshold_and_says_so(capsys, tmp_path):
+  """What a run watches with, whether it was given or not, is told before it starts; what it took from the board stands in config.json."""
+  from mjx_cl import run
+  from mjx_cl.config import RunConfig
+  runner = run.Runner(RunConfig("car", fault="noise", detector="cusum", settings={"whiten": 8}, seeds=1, steps=64, onset=10), tmp_path / "r")
+  row = detectors.board()["car"]["cusum white"]
+  assert runner.robot == "car" and runner.config_dict()["threshold"] == {"value": row["threshold"], "arl0": row["arl0"], "alarms": row["alarms"]}
+  tell = lambda detector, robot="car", arms=("detector", "none"), **settings: run.watching(
+      RunConfig("car", fault="noise", detector=detector, settings=settings, arms=arms), robot, detectors.calibrated(detector, robot, **settings))
+  assert tell("cusum", whiten=8) == f"detector cusum at threshold {row['threshold']:.6g}, which gave the shipped car 33 false alarms, one in 102,560 healthy control steps"
+  assert tell("kswin", "walker").endswith("no false alarm at all")
+  for other in (tell("cusum", whiten=4), tell("ewma", "mine"), tell("bfar", rate=0.5)):
+    assert "no" in other and "--set threshold=" in other
+  silent = tell("ewma", threshold=3.0), tell("rolling_sigma"), tell("rolling_sigma_plain"), tell("never"), tell("random"), tell("ewma", arms=("none", "oracle"))
+  assert silent == (None,) * 6
+  assert cli.main(["run", "car", "--detector", "ewma", "--set", "rate=0.3", "--agent", str(tmp_path / "none"), "--out", str(tmp_path / "o")]) != 0
+  assert "note" not in capsys.readouterr().err  # nothing runs, nothing is said
+
+
 def test_a_board_is_not_replaced_unasked(capsys, tmp_path):
   (tmp_path / "board").mkdir()
   (tmp_path / "board" / "leaderboard.json").write_text("{}")
