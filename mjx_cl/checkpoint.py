@@ -5,6 +5,7 @@ import logging
 import pathlib
 
 import jax
+import numpy as np
 import orbax.checkpoint as ocp
 
 from mjx_cl.errors import FileError
@@ -16,14 +17,18 @@ def _is_key(x) -> bool:
   return isinstance(x, jax.Array) and jax.numpy.issubdtype(x.dtype, jax.dtypes.prng_key)
 
 
+def _is_empty(x) -> bool:
+  return 0 in getattr(x, "shape", ())
+
+
 def pack(tree):
-  """Typed random keys -> their uint32 data, everything else unchanged."""
-  return jax.tree.map(lambda x: jax.random.key_data(x) if _is_key(x) else x, tree)
+  """What orbax can write: typed random keys -> their uint32 data; arrays without an element (MJX has some) -> one zero; everything else unchanged."""
+  return jax.tree.map(lambda x: jax.random.key_data(x) if _is_key(x) else np.zeros(1, x.dtype) if _is_empty(x) else x, tree)
 
 
 def unpack(tree, like):
   """Inverse of `pack`, for a tree of the same structure as `like`."""
-  return jax.tree.map(lambda x, l: jax.random.wrap_key_data(x) if _is_key(l) else x, tree, like)
+  return jax.tree.map(lambda x, l: jax.random.wrap_key_data(x) if _is_key(l) else l if _is_empty(l) else x, tree, like)
 
 
 class Checkpoints:
