@@ -46,7 +46,7 @@ class Row(NamedTuple):
     obs (O,), first (), reward_in (), action (A,), deter (D,), stoch (stoch,) int: at the decision.
     reward (): sum over the control steps of the decision; rewards (repeat,): one by one.
     final_obs (O,), terminated (), truncated (): of arriving.
-    severity (): true severity in force, the greatest where there are several faults. episode int32 (). demo (A,), has_demo ().
+    severity (): true severity in force in the last control step, the greatest where there are several faults. episode int32 (). demo (A,), has_demo ().
   """
   obs: jax.Array
   first: jax.Array
