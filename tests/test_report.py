@@ -37,6 +37,7 @@ SOURCES = {
     "again": ("again/bench.json",),
     "study": ("study/bench.json", "study/suite.json", "study/bench.parquet"),
     "full": ("full/bench.json", "full/suite.json", "full/bench.parquet"),
+    "in-loop": ("loop/bench.json", "loop/suite.json", *(f"loop/{part}/{file}.parquet" for part in ("walker/detector=ewma", "walker/detector=cusum@surprise") for file in ("runs", "events"))),
     "two-agents": ("walker_gear/summary.json", "walker_plain/summary.json"),
     "gradient": ("policy_gradient.json",),
     "quadruped": ("quadruped_agent/finetuning/none/config.json", *(f"quadruped_agent/finetuning/{run}/curve.json" for run in ("none", "expert")),
@@ -68,7 +69,7 @@ def write(path, rows):
 def results(tmp_path):
   """A copy of results/ in which no file of any block is missing: the experiments of the paper are the walker's run, the car's with two changes."""
   out = tmp_path / "results"
-  shutil.copytree(RESULTS, out, ignore=shutil.ignore_patterns("*.png", "*.html", "paper", "arms", "stop", "again", "study", "full", "detectors.json", "policy_gradient.json"))
+  shutil.copytree(RESULTS, out, ignore=shutil.ignore_patterns("*.png", "*.html", "paper", "arms", "stop", "again", "study", "full", "loop", "detectors.json", "policy_gradient.json"))
   rows = [{"name": "cusum: 1000 streams", "value": 0.4567, "unit": "s", "goal": "<= 1", "holds": True},
           {"name": "adwin: 1000 streams", "value": 23.4, "unit": "s", "goal": "<= 20", "holds": False},
           {"name": "ewma: a sample", "value": 1234.5, "unit": "ns", "goal": None, "holds": None}]
@@ -111,6 +112,12 @@ def results(tmp_path):
   (out / "full/suite.json").write_text(json.dumps({"suite": "full", "parts": {k: v | {"first_seed": 31, "seeds": 10} for k, v in plan.items()}}))
   write(out / "full/bench.parquet", [r for r in lived if r["part"] == "walker"])
   (out / "full/bench.json").write_text(json.dumps({"suite": "full", "parts": 3, "finished": 1, "entries": {"walker": entry}}))
+  plan = {f"walker/detector={d}": part | {"detector": d, "onset": 5000, "steps": 25_000, "first_seed": 31, "seeds": 10} for d in ("ewma", "cusum@surprise", "never")}
+  for name, factor in zip(list(plan)[:2], (1.0, 0.7)):
+    write(out / "loop" / name / "runs.parquet", [r | {"change": 0, "return_lost": r["return_lost"] and factor * r["return_lost"] + 17.0 * r["seed"] * factor} for r in runs])
+    write(out / "loop" / name / "events.parquet", parquet.read_table(out / "walker_gear/events.parquet").to_pylist()[:round(40 * factor)])
+  (out / "loop/suite.json").write_text(json.dumps({"suite": "loop", "parts": plan}))
+  (out / "loop/bench.json").write_text(json.dumps({"suite": "loop", "parts": 3, "finished": 2, "entries": {name: entry for name in list(plan)[:2]}}))
   for suite, value in entries.items():
     (out / suite).mkdir(exist_ok=True)
     (out / suite / "bench.json").write_text(json.dumps({"suite": suite, "parts": 1, "finished": 1, "entries": {"walker": value}}))
@@ -279,7 +286,7 @@ def change(path):
     path.write_text(json.dumps(changed(json.loads(path.read_text()))))
     return
   rows = [changed(r) for r in parquet.read_table(path).to_pylist()]
-  if path.name == "runs.parquet":  # counts of rows are numbers too
+  if path.name == "runs.parquet" or "loop" in path.parts:  # counts of rows are numbers too
     rows += rows
   elif path == path.parent.parent / "full" / "bench.parquet":
     rows += [r | {"seed": r["seed"] + 1000} for r in rows]
@@ -309,6 +316,7 @@ CONSTANTS = {  # what a block says of itself: windows of the definitions, sizes 
     "again": {"95", "2,000"},
     "study": {"1", "2,000"},
     "full": {"95", "500", "2,000", "1", "2", "3"},
+    "in-loop": {"95", "500", "2,000", "1", "2", "3"},
     "two-agents": {"95", "500", "10,000", "2,000"},
     "gradient": {"95"},
     "quadruped": {"95", "8"},
