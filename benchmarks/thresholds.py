@@ -1,8 +1,8 @@
 """Thresholds that `mjx-cl run --detector NAME` takes where none is given: python benchmarks/thresholds.py [--board results/leaderboard_100k] [--out FILE]
 
 Writes mjx_cl/detectors/thresholds.json from a leaderboard's own files: robot -> name on the board -> settings, threshold, ARL0 and the alarms that it was
-counted from. References, which look at nothing, the paper's rule as written, which is at three deviations, and `rolling_sigma`, which has figures of each
-robot (`CALIBRATED`), are left out.
+counted from. Left out are references, which look at nothing, the paper's rule, which has figures of its own (`detectors.PAPER`), and what the board counted fewer
+than ten alarms of: a detector that no threshold brings to that rate stays silent, and one with too few rows has not been measured.
 """
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from mjx_cl.errors import FileError
 from mjx_cl.report import load
 
 FILE = pathlib.Path(detectors.__file__).parent / "thresholds.json"
-OWN = ("rolling_sigma", "rolling_sigma_plain")
+LEAST = 10  # alarms
 
 
 def collect(folder: pathlib.Path) -> dict:
@@ -32,7 +32,7 @@ def collect(folder: pathlib.Path) -> dict:
   robots: dict[str, dict] = {}
   for row in rows:
     name = row["detector"]
-    if name not in known or name in OWN or name in references.REFERENCES or row["threshold"] is None:
+    if name not in known or name in detectors.PAPER or name in references.REFERENCES or row["threshold"] is None or row["arl0_alarms"] < LEAST:
       continue
     settings = dict(known[name])
     use, channel = detectors.split(settings.pop("use"))

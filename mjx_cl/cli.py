@@ -60,7 +60,7 @@ class Run:
   first_seed: int = 0
   """Seeds are first_seed, first_seed + 1, ..."""
   detector: str = "rolling_sigma"
-  """Change detector, see `mjx-cl list detectors`; NAME@CHANNEL watches one channel. Without a threshold: the leaderboard's, at one false alarm in 100,000 steps."""
+  """Change detector, see `mjx-cl list detectors`; NAME@CHANNEL watches one channel. One that stands on the leaderboard has, unless given, its threshold of one false alarm in 100,000 steps."""
   set: tuple[str, ...] = ()
   """Detector settings, name=value ..."""
   arm: tuple[str, ...] = ("detector", "none")

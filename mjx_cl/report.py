@@ -533,30 +533,31 @@ def in_loop(results: pathlib.Path) -> str:
   from mjx_cl.scoring import bootstrap
   folder = results / "loop"
   plan, entries = load(folder / "suite.json")["parts"], load(folder / "bench.json")["entries"]
-  runs, begun = {}, {}
-  for part in entries:
-    own = [r for r in table(folder / part / "runs.parquet") if r["arm"] == "detector" and not r["change"]]
-    runs[part] = {r["seed"]: r["return_lost"] for r in own if r["return_lost"] is not None}
+  parts = [p for p in plan if p in entries]  # in the order of the suite; the first of a robot is what its others are set against
+  lost, begun, base, rows = {}, {}, {}, []
+  for part in parts:
+    lost[part] = {r["seed"]: r["return_lost"] for r in table(folder / part / "runs.parquet") if r["arm"] == "detector" and not r["change"] and r["return_lost"] is not None}
     begun[part] = sum(e["kind"] == "start" for e in table(folder / part / "events.parquet") if e["arm"] == "detector")
-  rows, last, first = [], None, {}
-  for part in (p for p in plan if p in entries):  # in the order of the suite; the first of a robot is what the others are set against
+  mean = lambda values: f"{number(statistics.mean(values))} {span(bootstrap.interval(values, lambda x, axis: x.mean(axis)))}, {len(values)} seeds" if len(values) > 1 else "-"
+  for part in parts:
     one, own, worth = plan[part], entries[part]["arms"]["detector"], (entries[part]["scores"]["normalised"] or {}).get("detector")
-    base = runs[first.setdefault(one["env"], part)]
-    less = [lost - runs[part][seed] for seed, lost in base.items() if seed in runs[part]]
-    gain = "" if first[one["env"]] == part else f"{number(statistics.mean(less))} {span(bootstrap.interval(less, lambda x, axis: x.mean(axis)))}"
-    rows.append((f"`{one['env']}`" if one["env"] != last else "", f"`{one['detector']}`", str(own["false_alarm_streams"]), f"{own['alarms']} of {own['seeds']}",
+    new, first = one["env"] not in base, lost[base.setdefault(one["env"], part)]
+    rows.append((f"`{one['env']}`" if new else "", f"`{one['detector']}`", str(own["false_alarm_streams"]), f"{own['alarms']} of {own['seeds']}",
                  f"{own['affected_alarmed_within_500']} of {own['affected']}" if own["affected"] else "-", both(own, "latency_median_steps"),
                  f"{own['recovered']} of {own['affected']}" if own["affected"] else "-",
-                 few(worth, "normalised", worth["seeds"], 2) if worth and worth["seeds"] else "-", number(statistics.mean(runs[part].values())) if runs[part] else "-", gain,
-                 f"{begun[part]}", f"{own['converged']} / {own['aborted_by_rule'] + own['aborted_by_budget']} / {own['adapting']}", number(own["updates_mean"])))
-    last = one["env"]
+                 few(worth, "normalised", worth["seeds"], 2) if worth and worth["seeds"] else "-", both(own, "return_lost"),
+                 "" if new else mean([first[seed] - lost[part][seed] for seed in first if seed in lost[part]]), number(own["return_lost_healthy_mean"]),
+                 str(begun[part]), f"{own['converged']} / {own['aborted_by_rule'] + own['aborted_by_budget']} / {own['adapting']}", number(own["updates_mean"])))
+  robots = {one["env"]: one for one in plan.values()}.values()
+  seeds = sorted({(one["first_seed"], one["first_seed"] + one["seeds"] - 1) for one in plan.values()})
   done = f"{len(entries)} of {len(plan)} parts are finished. " if len(entries) < len(plan) else ""
   text = fill(f"""
-      {done}{'; '.join(f"`{one['env']}`, `{one['fault']}` at step {number(one['onset'])} of {number(one['steps'])}" for one in {p['env']: p for p in plan.values()}.values())}; seeds {one['first_seed']} to
-      {one['first_seed'] + one['seeds'] - 1}. Streams with a false alarm before the onset; streams that alarm after it; affected ones that do within 500 steps; median latency of all streams, misses counted as infinite;
-      affected streams recovered before the run ends; normalised recovery over the last 2,000 steps (0: arm `none`, 1: the reward before onset, interquartile mean with its bootstrap interval); return lost from the onset to
-      the run's end, a stream's mean, and how much less of it than with the first detector, paired over seeds, with its 95 % interval; finetunings begun, of all streams together; streams whose last one converged / was given up / still went on; updates a stream. {FEW if any(" to " in row[7] for row in rows) else ""}""")
-  return text + "\n\n" + grid(("robot", "detector", "false alarms", "alarm", "within 500", "latency [steps]", "recovered", "normalised recovery", "return lost", "less", "begun",
+      {done}{'; '.join(f"`{one['env']}`: `{one['fault']}` at step {number(one['onset'])} of {number(one['steps'])}" for one in robots)}; seeds {joined([f"{a} to {b}" for a, b in seeds])}. Streams with
+      a false alarm before the onset; streams that alarm after it; affected ones that do within 500 steps; median latency of all streams, misses counted as infinite; affected streams recovered before the run ends;
+      normalised recovery over the last 2,000 steps (0: arm `none`, 1: the reward before onset); return lost from the onset to the run's end (interquartile means, 95 % bootstrap intervals over streams); how much less of it a
+      stream loses than with its robot's first detector, a mean paired over seeds; return lost before the onset by finetuning on a false alarm, a stream's mean; finetunings begun, of all streams together; streams whose last one converged / was given up / still
+      went on; updates a stream. {FEW if any(" to " in row[7] for row in rows) else ""}""")
+  return text + "\n\n" + grid(("robot", "detector", "false alarms", "alarm", "within 500", "latency [steps]", "recovered", "normalised recovery", "return lost", "less", "before onset", "begun",
                                 "converged / given up / going on", "updates"), rows)
 
 

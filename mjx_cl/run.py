@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import inspect
 import json
 import os
 import pathlib
@@ -36,7 +37,7 @@ from mjx_cl.errors import FileError, UserError
 from mjx_cl.interrupt import Interruptible
 from mjx_cl.monitor import Monitor, watched
 from mjx_cl.rollout import Rollout, Stream, nest, start
-from mjx_cl.scoring import alarms as alarm_score, bootstrap, recovery, stop
+from mjx_cl.scoring import alarms as alarm_score, bootstrap, recovery, special, stop
 from mjx_cl.snapshots import Snapshots
 from mjx_cl.transfer import Moving, Transfer
 
@@ -92,9 +93,10 @@ class Runner:
     self.others = arm_agents(config, self.env)
     self.changes = changes(config)
     self.faults, plan, target = faults.build(self.changes, self.robots[-1], config.onset)
-    robot = getattr(self.env, "agents_of", None) or spec.name
-    detector = detectors.make(config.detector, robot=robot, **config.settings)
-    self.robot, self.threshold = robot, detectors.calibrated(config.detector, robot, **config.settings)
+    robot = known_as(self.env)
+    found = threshold_of(config)
+    settings = config.settings | ({"threshold": found.value} if found else {})
+    detector = detectors.make(config.detector, robot=robot, **settings)
     monitor = Monitor(agent, n=15, form=config.form, actions=config.actions, spec=spec)
     if self.other is None:
       self.rollout = Rollout(self.env, agent, self.faults, self.repeat, config.deterministic)
@@ -111,7 +113,7 @@ class Runner:
     self.labels = [(arm, seed) for arm in config.arms for seed in self.seeds]
     self.groups = len(self.labels)
     same = (agent.config, agent.obs_size, agent.act_size, agent.stepwise, config.form, config.actions, spec, detectors.factory(config.detector),
-            config.detector, robot, json.dumps(config.settings, sort_keys=True, default=repr))
+            config.detector, robot, json.dumps(settings, sort_keys=True, default=repr))
     self.crew = Crew(Loop(agent, monitor, detector, spec, config.adapt, self.repeat, capacity=needs(config.steps), same=same), self.groups)
     self.breaks = np.asarray([ARMS[arm].breaks for arm, _ in self.labels])
     keys = jnp.stack([jax.random.key(seed) for _, seed in self.labels])[:, None]
@@ -297,7 +299,7 @@ class Runner:
     return {"command": "run", **identity(self.config),
             "physics": "+".join(dict.fromkeys(envs.physics_of(robot).name for robot in self.robots)),
             "agent_card": self.trained.card, **({"arm_cards": {arm: other.card for arm, other in self.others.items()}} if self.others else {}), "agent_path": pathlib.Path(self.trained.path).name, "repeat": self.repeat,
-            "control_s": self.env.spec.control_s, **({"threshold": self.threshold._asdict()} if self.threshold else {}), **store.provenance()}
+            "control_s": self.env.spec.control_s, **store.provenance()}
 
   def finish(self, tell=lambda text: None) -> dict:
     """Writes trace, events, runs, summary and figure, of an arm that never stops also signals, snapshots and stop; removes the working files.
@@ -573,16 +575,38 @@ def summarise(rows: list[dict], config: RunConfig, control_s: float) -> dict:
   return out
 
 
-def watching(config: RunConfig, robot: str, threshold: detectors.Threshold | None) -> str | None:
-  """The threshold that a detector has without having been given one, in a line; None where it was, or is one of the paper's rules or a reference, which looks at nothing."""
-  own = config.detector.startswith("rolling_sigma") or getattr(detectors.factory(config.detector), "reference", False)
-  if own or "threshold" in config.settings or not any(ARMS[arm].trigger.listens for arm in config.arms):
+def known_as(env) -> str:
+  """The robot whose agents and figures `env` takes: its own name, or that of the one that it is another fidelity of."""
+  return getattr(env, "agents_of", None) or env.spec.name
+
+
+def threshold_of(config: RunConfig) -> detectors.Threshold | None:
+  """The board's threshold that this run's detector has without having been given one; None where it has another."""
+  if "threshold" in config.settings or detectors.split(config.detector)[0] in detectors.PAPER:
     return None
-  if threshold is None:
-    return (f"detector {config.detector} has its own default threshold, if any; none is known for {robot} and these settings, and false alarms may be many: "
-            "--set threshold=... (`mjx-cl leaderboard` finds one)")
-  often = f"{threshold.alarms} false alarms, one in {threshold.arl0:,.0f} healthy control steps" if threshold.arl0 else "no false alarm at all"
-  return f"detector {config.detector} at threshold {threshold.value:.6g}, which gave the shipped {robot} {often}"
+  return detectors.calibrated(config.detector, known_as(envs.make(config.env, config.physics)), config.settings)
+
+
+def watching(config: RunConfig) -> str | None:
+  """The threshold that a detector has without having been given one, in a line; None where it was, takes none, is one of the paper's rules or looks at
+  nothing."""
+  name = detectors.split(config.detector)[0]
+  build = detectors.factory(config.detector)
+  if (name in detectors.PAPER or getattr(build, "reference", False) or "threshold" in config.settings or "threshold" not in detectors.known_settings(build)
+      or not any(ARMS[arm].trigger.listens for arm in config.arms)):
+    return None
+  found, robot = threshold_of(config), known_as(envs.make(config.env, config.physics))
+  if found is None:
+    default = inspect.signature(build).parameters.get("threshold")
+    own = "its own default threshold" + (f", {default.default:g}" if default and isinstance(default.default, (int, float)) else "")
+    return (f"detector {config.detector} runs at {own}: none was found for {robot} with these settings, and false alarms may be many; --set threshold=... "
+            "(`mjx-cl leaderboard` finds one)")
+  steps = found.arl0 * found.alarms
+  low, high = (steps / n for n in reversed(special.poisson_interval(found.alarms)))
+  plain = {f.name: (f.default,) for f in dataclasses.fields(RunConfig)} | {"env": (robot,), "agent": (None, robot)}
+  other = [k for k in ("env", "agent", "form", "actions", "deterministic") if getattr(config, k) not in plain[k]]
+  return (f"detector {config.detector} at threshold {found.value:.6g}, at which the shipped {robot} gave {found.alarms} false alarms in {steps:,.0f} healthy control steps, "
+          f"one in {found.arl0:,.0f} [{low:,.0f}, {high:,.0f}]" + (f"; this run has another {' and '.join(other)}" if other else ""))
 
 
 def doubts(config: RunConfig) -> list[str]:
@@ -621,7 +645,7 @@ def execute(config: RunConfig, out, resume: bool = False, overwrite: bool = Fals
       clear(out)
     runner.open()
     store.write_json(out / "config.json", values)
-  for text in [*filter(None, [watching(config, runner.robot, runner.threshold)]), *doubts(config)]:
+  for text in [*filter(None, [watching(config)]), *doubts(config)]:
     tell(f"note: {text}")
   tell(f"{len(config.arms) * config.seeds} streams of {config.steps:,} control steps; what is not compiled yet is compiled first, a minute or two")
   saved = time.monotonic()
@@ -662,12 +686,13 @@ def clear(out: pathlib.Path) -> None:
 
 
 def identity(config: RunConfig) -> dict:
-  """What makes a run what it is, as config.json holds it: its settings, `changes`, what a preset's name stood for when it began, and the SHA-256 of
-  the `files` that robot, fault or detector stand in."""
+  """What makes a run what it is, as config.json holds it: its settings, `changes`, what a preset's name stood for when it began, the `threshold` that its
+  detector takes from the board, and the SHA-256 of the `files` that robot, fault or detector stand in."""
+  found = threshold_of(config)
   sources = {name: plugins.file_of(name) for name in (config.env, config.detector, *(change.fault for change in changes(config)))}
   files = {name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in sources.items() if path is not None and path.is_file()}
   return json.loads(json.dumps({**dataclasses.asdict(config), "changes": [dataclasses.asdict(change) for change in changes(config)],
-                                **({"files": files} if files else {})}))
+                                **({"threshold": found._asdict()} if found else {}), **({"files": files} if files else {})}))
 
 
 def check_same(out: pathlib.Path, values: dict) -> None:
@@ -681,5 +706,8 @@ def check_same(out: pathlib.Path, values: dict) -> None:
     old["adapt"] = {**dataclasses.asdict(AdaptConfig()), **old["adapt"]}
   default = {f.name: f.default for f in dataclasses.fields(RunConfig)}  # of a setting that did not exist when the run began; nor did `changes` always
   changed = [k for k in values if k not in skip and old.get(k, default.get(k, values[k] if k == "changes" else None)) != values[k]]
+  changed += ["threshold"] * ("threshold" in old and "threshold" not in values)
+  if changed == ["threshold"]:
+    raise UserError(f"--resume: {out} was begun when its detector {old.get('detector')} had another default threshold than today; --overwrite begins anew")
   if changed:
     raise UserError(f"--resume: {out} was begun with another {', '.join(changed)}; give the same settings or --overwrite")

@@ -297,26 +297,27 @@ def test_one_threshold_for_both_residuals_is_both_thresholds_in_proportion(robot
 
 @pytest.mark.parametrize("robot", detectors.board())
 def test_what_stands_on_the_board_takes_its_threshold_from_there(robot):
-  """Whoever names a robot and no threshold gets the board's, for just these settings; whoever names one keeps it."""
-  for row in detectors.board()[robot].values():
+  """For just the board's settings, however they are written; whoever names a threshold keeps it."""
+  for name, row in detectors.board()[robot].items():
     own = dict(row["settings"])
-    assert detectors.calibrated(own.pop("use"), robot, **own).value == row["threshold"] > 0
-    assert detectors.calibrated(row["settings"]["use"], robot, **own, threshold=2.0) is None
-  xs = residuals(jax.random.key(8), 1300, invalid=0.0)
-  xs = xs._replace(opr=jnp.where(jnp.arange(1300) < 1100, 1.0, 1.2) * xs.opr)  # some two deviations
-  run = lambda **settings: jax.lax.scan((det := detectors.make("cusum@opr", **settings)).update, det.init(), xs)[1]
-  found, given, plain = run(robot=robot), run(robot=robot, threshold=0.1), run()
-  same, other = run(threshold=detectors.board()[robot]["cusum@opr"]["threshold"]), run(robot=robot, slack=0.25)
-  np.testing.assert_array_equal(found.fired, same.fired)
-  np.testing.assert_array_equal(found.score, same.score)
-  assert given.fired.sum() > plain.fired.sum() > found.fired.sum() and (other.fired == run(slack=0.25).fired).all()
+    use = own.pop("use")
+    assert detectors.calibrated(use, robot, own) == (row["threshold"], row["arl0"], row["alarms"]) and row["threshold"] > 0 and row["alarms"] >= 10
+    assert detectors.calibrated(use, robot, own | {"threshold": 2.0}) is None
+  same = lambda a, b, robot=robot: detectors.calibrated(*a[:1], robot, a[1]) == detectors.calibrated(*b[:1], robot, b[1]) is not None
+  for other in ({"slack": 0.5}, {"patience": 1, "cool_down": 0, "whiten": 0}, {"log": True}, {"log": None}, {"channel": "rpr+opr"}, {"shared": False}):
+    assert same(("cusum", {}), ("cusum", other)), other
+  assert same(("cusum@surprise", {}), ("cusum", {"channel": "surprise"})) and same(("cusum@opr", {}), ("cusum@opr", {"channel": "rpr"}))  # as in `make`
+  assert same(("hotelling", {}), ("hotelling", {"patience": 1})) and not same(("cusum@opr", {}), ("cusum@rpr", {}))
 
 
 def test_the_boards_thresholds_are_for_what_the_board_ran():
-  assert detectors.calibrated("rolling_sigma", "walker") is detectors.calibrated("rolling_sigma_plain", "walker") is detectors.calibrated("random", "walker") is None
-  assert detectors.calibrated("ewma", "a robot of mine") is detectors.calibrated("ewma", None) is detectors.calibrated("ewma", "walker", whiten=3) is None
-  assert detectors.calibrated("cusum@surprise", "car") == detectors.calibrated("cusum", "car", channel="surprise") != detectors.calibrated("cusum@opr", "car")
-  assert {"walker", "quadruped", "car"} == set(detectors.board()) and all(len(rows) > 20 for rows in detectors.board().values())
+  walker = lambda name, **settings: detectors.calibrated(name, "walker", settings)
+  for none in (walker("rolling_sigma"), walker("rolling_sigma_plain"), walker("random"), walker("never"), walker("ewma", whiten=3), walker("ewma", rate=0.2),
+               walker("cusum", log=False), walker("cusum@reward", log=True), walker("cusum", patience=2), walker("mine.py:ewma"), walker("no such detector"),
+               detectors.calibrated("ewma", "a robot of mine", {})):
+    assert none is None
+  assert walker("kswin") is walker("bocpd") is None  # no threshold gives them that rate on the walker: they would stay silent
+  assert {"walker", "quadruped", "car"} == set(detectors.board()) and all(len(rows) >= 20 for rows in detectors.board().values())
 
 
 def echo(threshold):

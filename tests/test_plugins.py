@@ -1,4 +1,5 @@
 """Robots, faults and detectors of other packages: the README's class as a robot, one module with all three, and broken ones."""
+import dataclasses
 import importlib.metadata
 import json
 import os
@@ -153,23 +154,48 @@ def test_what_a_run_takes_with_a_doubt_and_what_it_refuses(capsys, tmp_path):
     assert words in capsys.readouterr().err and not (tmp_path / "r").exists()  # an empty folder is no run either
 
 
-def test_a_detector_in_the_loop_has_the_boards_threshold_and_says_so(capsys, tmp_path):
-  """What a run watches with, whether it was given or not, is told before it starts; what it took from the board stands in config.json."""
+def test_a_detector_in_the_loop_has_the_boards_threshold(tmp_path, monkeypatch):
+  """The one that is built, that config.json names and that the note tells are one; `--resume` and `--merge` take no other."""
+  from mjx_cl import pieces, run
+  from mjx_cl.config import RunConfig
+  from mjx_cl.detectors.base import Detector
+  built = []
+  monkeypatch.setattr(detectors, "make", lambda name, **settings: built.append((name, settings)) or Detector(lambda: (), lambda state, x: (state, None)))
+  config = RunConfig("car", fault="noise", detector="cusum", settings={"whiten": 8, "slack": 0.5}, seeds=1, steps=64, onset=10)
+  row = detectors.board()["car"]["cusum white"]
+  runner, told = run.Runner(config, tmp_path / "r"), []
+  assert built == [("cusum", {"robot": "car", "whiten": 8, "slack": 0.5, "threshold": row["threshold"]})]
+  value = runner.config_dict()
+  assert value["threshold"] == {"value": row["threshold"], "arl0": row["arl0"], "alarms": row["alarms"]} and "threshold" not in value["settings"]
+  monkeypatch.setattr(run.Runner, "step", lambda self: 1 / 0)
+  with pytest.raises(ZeroDivisionError):
+    run.execute(config, tmp_path / "r", tell=told.append)
+  assert told[0] == ("note: detector cusum at threshold " + f"{row['threshold']:.6g}, at which the shipped car gave 33 false alarms in 3,384,480 healthy control steps, one in 102,560 [73,029, 148,993]")
+  held = json.loads((tmp_path / "r" / "config.json").read_text())
+  for other in (None, held["threshold"] | {"value": 7.0}):  # of a version that had no such threshold, or another
+    (tmp_path / "r" / "config.json").write_text(json.dumps({k: v for k, v in held.items() if k != "threshold"} | ({"threshold": other} if other else {})))
+    with pytest.raises(UserError, match="another default threshold than today; --overwrite"):
+      run.execute(config, tmp_path / "r", resume=True)
+  (tmp_path / "r" / "config.json").write_text(json.dumps(held))
+  with pytest.raises(UserError, match="another settings, threshold"):
+    run.execute(dataclasses.replace(config, settings={"whiten": 8, "threshold": 3.0}), tmp_path / "r", resume=True)
+  assert "threshold" in pieces.SAME
+
+
+@pytest.mark.parametrize("robot, detector, change, text", [
+    ("walker", "ewma", {}, "the shipped walker gave 33 false alarms"), ("car_real", "ewma", {}, "148,993]; this run has another env"),
+    ("walker", "hotelling", {"agent": "walker-plain", "form": "streaming"}, "another agent and form"), ("walker", "cusum", {"settings": {"whiten": 4}}, "its own default threshold, 8: none was found for walker"),
+    ("walker", "kswin", {}, "its own default threshold"), ("car", "bfar", {"settings": {"rate": 0.5}}, "--set threshold=..."),
+    ("walker", "ewma", {"settings": {"threshold": 3.0}}, None), ("walker", "ewma", {"arms": ("none", "oracle")}, None), ("walker", "never", {}, None), ("walker", "always", {}, None),
+    ("walker", "random", {}, None), ("walker", "rolling_sigma", {}, None), ("walker", "rolling_sigma_plain", {}, None), ("walker", "rolling_sigma_FILE", {}, "its own default threshold, 4:")])
+def test_what_a_detector_runs_with_is_said(robot, detector, change, text, tmp_path):
   from mjx_cl import run
   from mjx_cl.config import RunConfig
-  runner = run.Runner(RunConfig("car", fault="noise", detector="cusum", settings={"whiten": 8}, seeds=1, steps=64, onset=10), tmp_path / "r")
-  row = detectors.board()["car"]["cusum white"]
-  assert runner.robot == "car" and runner.config_dict()["threshold"] == {"value": row["threshold"], "arl0": row["arl0"], "alarms": row["alarms"]}
-  tell = lambda detector, robot="car", arms=("detector", "none"), **settings: run.watching(
-      RunConfig("car", fault="noise", detector=detector, settings=settings, arms=arms), robot, detectors.calibrated(detector, robot, **settings))
-  assert tell("cusum", whiten=8) == f"detector cusum at threshold {row['threshold']:.6g}, which gave the shipped car 33 false alarms, one in 102,560 healthy control steps"
-  assert tell("kswin", "walker").endswith("no false alarm at all")
-  for other in (tell("cusum", whiten=4), tell("ewma", "mine"), tell("bfar", rate=0.5)):
-    assert "no" in other and "--set threshold=" in other
-  silent = tell("ewma", threshold=3.0), tell("rolling_sigma"), tell("rolling_sigma_plain"), tell("never"), tell("random"), tell("ewma", arms=("none", "oracle"))
-  assert silent == (None,) * 6
-  assert cli.main(["run", "car", "--detector", "ewma", "--set", "rate=0.3", "--agent", str(tmp_path / "none"), "--out", str(tmp_path / "o")]) != 0
-  assert "note" not in capsys.readouterr().err  # nothing runs, nothing is said
+  if detector.endswith("FILE"):
+    (tmp_path / "rolling_sigma_mine.py").write_text("from mjx_cl.detectors.cusum import cusum\ndef mine(threshold=4.0):\n  return cusum(threshold=threshold)\n")
+    detector = f"{tmp_path}/rolling_sigma_mine.py:mine"
+  said = run.watching(RunConfig(robot, fault="noise", detector=detector, **change))
+  assert said is None if text is None else text in said
 
 
 def test_a_board_is_not_replaced_unasked(capsys, tmp_path):

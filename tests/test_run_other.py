@@ -16,7 +16,7 @@ from mjx_cl.config import CHUNK, PRESETS, AdaptConfig, RunConfig
 from mjx_cl.dreamer.agent import Agent
 from mjx_cl.types import EnvState, Model, Spec, Step, Var
 
-STEPS, ONSET, EPISODE, WARMUP, REPEAT = 512, 200, 150, 60, 2
+STEPS, ONSET, EPISODE, WARMUP, REPEAT = 1024, 200, 150, 60, 2
 ADAPT = AdaptConfig(warmup=WARMUP, start_windows=40, patience=4, least=64, trend=1e9, fluctuation=1e9, refit=100)
 
 
@@ -48,9 +48,13 @@ class Pendulum:
 
 @pytest.fixture(scope="module")
 def lived(tmp_path_factory):
-  """(config, folder of a run in one go, folder of one that was cut off after two chunks and went on)."""
-  patch = pytest.MonkeyPatch()
-  patch.setitem(envs.ENVS, "pendulum", Pendulum)
+  """(config, folder of a run in one go, folder of one that was cut off after two chunks and went on, chunks that the latter lived then)."""
+  with pytest.MonkeyPatch.context() as patch:
+    patch.setitem(envs.ENVS, "pendulum", Pendulum)
+    yield live(patch, tmp_path_factory)
+
+
+def live(patch, tmp_path_factory):
   agent, folder = tmp_path_factory.mktemp("agents") / "agent", tmp_path_factory.mktemp("runs")
   whole, cut = folder / "whole", folder / "cut"
   tiny = Agent(PRESETS["tiny"].dreamer, 3, 1)
@@ -67,9 +71,10 @@ def lived(tmp_path_factory):
       shutil.copytree(whole, cut)
     runner.step()
   runner.finish()
+  step, later = run.Runner.step, []
+  patch.setattr(run.Runner, "step", lambda self: (later.append(self.done_chunks), step(self))[1])
   assert run.execute(config, cut, resume=True)["arms"]["oracle"]["updates_mean"] > 0
-  yield config, whole, cut
-  patch.undo()
+  return config, whole, cut, later
 
 
 def table(folder, name):
@@ -78,7 +83,8 @@ def table(folder, name):
 
 def test_it_goes_on_where_it_was_cut_off(lived):
   """Every column of what was lived, to the last bit; wall times aside."""
-  _, whole, cut = lived
+  _, whole, cut, later = lived
+  assert later == list(range(2, STEPS // (CHUNK * REPEAT)))  # what lay in the checkpoint was not lived again
   for name in ("trace", "events", "runs"):
     a, b = table(whole, name), table(cut, name)
     assert list(a) == list(b)
@@ -87,7 +93,7 @@ def test_it_goes_on_where_it_was_cut_off(lived):
 
 
 def test_clock_episodes_and_fault_are_those_of_control_steps(lived):
-  config, whole, _ = lived
+  config, whole, _, _ = lived
   trace, steps = table(whole, "trace"), np.arange(STEPS)
   assert trace["step"] == steps.tolist() and json.loads((whole / "config.json").read_text())["physics"] == config.physics
   np.testing.assert_array_equal(trace["severity"], np.where(steps >= ONSET, 0.5, 0.0))
@@ -99,7 +105,7 @@ def test_clock_episodes_and_fault_are_those_of_control_steps(lived):
 
 def test_residuals_are_known_once_a_decision(lived):
   """OPR of a decision is known 14 decisions after it, with the last control step of that one."""
-  _, whole, _ = lived
+  _, whole, _, _ = lived
   trace = table(whole, "trace")
   valid = np.asarray(trace["valid"])
   known = np.asarray([x is not None and np.isfinite(x) for x in trace["opr"]])
@@ -110,14 +116,14 @@ def test_residuals_are_known_once_a_decision(lived):
 
 def test_finetuning_starts_with_the_chunk_of_the_onset_and_is_paid_by_decisions(lived):
   """Chunks are of CHUNK decisions. Updates: the train ratio times the records since the start, over the records of an update."""
-  config, whole, _ = lived
+  config, whole, _, _ = lived
   events, trace = table(whole, "events"), table(whole, "trace")
   chunk = CHUNK * REPEAT
   start = [s for s, k in zip(events["step"], events["kind"]) if k == "start"]
   assert start == [-(-(ONSET + 1) // chunk) * chunk - 1]
   stop = [s for s, k in zip(events["step"], events["kind"]) if k == "stop"]
-  assert stop == ([start[0] + ADAPT.patience * chunk] if start[0] + ADAPT.patience * chunk < STEPS else [])
+  assert stop == [start[0] + ADAPT.patience * chunk] and stop[0] < STEPS - 1
   phase = np.asarray(trace["phase"])
-  assert set(phase[:start[0] + 1]) == {"nominal"} and phase[start[0] + 1] == "adapting"
+  assert set(phase[:start[0] + 1]) == {"nominal"} and set(phase[start[0] + 1:stop[0] + 1]) == {"adapting"} and set(phase[stop[0] + 1:]) == {"converged"}
   updates, (row,) = np.asarray(trace["updates"]), pyarrow.parquet.read_table(whole / "runs.parquet").to_pylist()
-  assert not updates[:start[0] + 1].any() and 0 < row["updates"] <= ADAPT.ratio * (STEPS - ONSET) / REPEAT / (config.adapt.batch * PRESETS["tiny"].dreamer.length)
+  assert not updates[:start[0] + 1].any() and 0 < row["updates"] <= ADAPT.ratio * (stop[0] - start[0]) / REPEAT / (config.adapt.batch * PRESETS["tiny"].dreamer.length)

@@ -68,30 +68,42 @@ def one_threshold(robot: str | None) -> dict:
   return own | {"threshold_rpr": None, "unit_rpr": own.get("threshold_rpr", threshold) / threshold}
 
 
+PAPER = ("rolling_sigma", "rolling_sigma_plain")  # the paper's rule, with figures of its own: CALIBRATED, three deviations
+
 
 class Threshold(NamedTuple):
-  """A threshold that was found on healthy robots. Attributes: value. arl0: control steps per false alarm, None where none came. alarms: that were counted."""
+  """A threshold that was found on healthy robots. Attributes: value. arl0: control steps per false alarm. alarms: that were counted."""
   value: float
-  arl0: float | None
+  arl0: float
   alarms: int
 
 
 @functools.cache
 def board() -> dict:
   """What the leaderboard at ARL0 = 100,000 control steps found: robot -> name on the board -> {settings, threshold, arl0, alarms}; written by
-  benchmarks/thresholds.py from results/leaderboard_100k. Shipped agents, seeds 100 to 109."""
+  benchmarks/thresholds.py from results/leaderboard_100k. Shipped agents, seeds 100 to 109; detectors that can be had at that rate alone."""
   return json.loads((pathlib.Path(__file__).parent / "thresholds.json").read_text())["robots"]
 
 
-def calibrated(name: str, robot: str | None, **settings) -> Threshold | None:
-  """The board's threshold of detector `name` with just these settings on `robot`.
+def calibrated(name: str, robot: str, settings: dict) -> Threshold | None:
+  """The board's threshold of detector `name` with these settings on `robot`; a setting at its default counts as none.
 
-  None where a threshold is among the settings, or the board has no such robot or no detector that is set so. `rolling_sigma` has figures of its own,
-  CALIBRATED; `rolling_sigma_plain` is the paper's rule as it is written, at three deviations.
+  None where a threshold is among the settings, or the board has no such robot or no detector that is set so. PAPER's have figures of their own.
   """
-  name, channel = split(name)
-  own = {k: v for k, v in ({"use": name, "channel": channel} | settings).items() if v is not None}
-  return next((Threshold(row["threshold"], row["arl0"], row["alarms"]) for row in board().get(robot, {}).values() if row["settings"] == own), None)
+  use, channel = split(name)
+  rows = [row for row in board().get(robot, {}).values() if row["settings"]["use"] == use]
+  own = _told(use, {"channel": channel or settings.get("channel")} | {k: v for k, v in settings.items() if k != "channel"}) if rows else None
+  return next((Threshold(row["threshold"], row["arl0"], row["alarms"]) for row in rows
+               if own == _told(use, {k: v for k, v in row["settings"].items() if k != "use"})), None)
+
+
+def _told(use: str, settings: dict) -> dict:
+  """What `settings` say beyond the defaults of `make` and of the factory; channels in the order of their names."""
+  defaults = {p.name: p.default for f in (factory(use), make) for p in inspect.signature(f).parameters.values()}
+  channels = sorted((settings.get("channel") or "opr+rpr").split("+"))
+  if settings.get("log") is True and "reward" not in channels:  # as without it
+    settings = settings | {"log": None}
+  return {k: v for k, v in settings.items() if k != "channel" and v != defaults.get(k, inspect.Parameter.empty)} | {"channel": channels}
 
 
 DETECTORS = {"rolling_sigma": calibrated_rule, "rolling_sigma_plain": paper_rule}
@@ -104,9 +116,6 @@ DETECTORS |= {"never": references.never, "always": references.always, "periodic"
 
 
 DETECTORS = Registry("mjx_cl.detectors", "detector", DETECTORS)
-
-
-DEFAULT = {"log": None, "whiten": 0, "patience": 1, "cool_down": 0}  # of `make`
 
 
 def known_settings(build) -> list[str]:
@@ -156,8 +165,7 @@ def make(name: str, channel: str | None = None, log: bool | None = None, whiten:
     patience: scores in a row above the threshold before a single-residual detector fires, see combine.patience; others have their own setting of
       this name, or none.
     cool_down: samples after an alarm in which no other counts, of the channels together, see combine.cool_down.
-    robot: whose figures are taken where none are given: `rolling_sigma` starts from those in CALIBRATED (default: the walker's), any other
-      detector has the threshold that `calibrated` finds, or else its factory's own.
+    robot: whose figures `rolling_sigma` starts from, where CALIBRATED has them; default: the walker's. Others: see `calibrated`.
     shared: `rolling_sigma` has one threshold for both residuals, see `one_threshold`.
   """
   name, own = split(name)
@@ -166,10 +174,6 @@ def make(name: str, channel: str | None = None, log: bool | None = None, whiten:
     build = _pure(name, build)
   if name == "rolling_sigma":
     settings = (one_threshold(robot) if shared else CALIBRATED.get(robot, {})) | settings
-  elif robot is not None:
-    other = {k: v for k, v in (("log", log), ("whiten", whiten), ("patience", patience), ("cool_down", cool_down)) if v != DEFAULT[k]}
-    found = calibrated(name, robot, channel=channel, **other, **settings)
-    settings = ({"threshold": found.value} if found else {}) | settings
   try:
     if getattr(build, "takes", "residual") != "scalar":
       if channel is not None or log is not None or whiten:
