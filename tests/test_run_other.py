@@ -10,9 +10,9 @@ import numpy as np
 import pyarrow.parquet
 import pytest
 
-from mjx_cl import agents, envs, run, store
+from mjx_cl import agents, envs, run, store, train
 from mjx_cl import physics as physics_lib
-from mjx_cl.config import CHUNK, PRESETS, AdaptConfig, RunConfig
+from mjx_cl.config import CHUNK, PRESETS, AdaptConfig, RunConfig, replace
 from mjx_cl.dreamer.agent import Agent
 from mjx_cl.types import EnvState, Model, Spec, Step, Var
 
@@ -127,3 +127,18 @@ def test_finetuning_starts_with_the_chunk_of_the_onset_and_is_paid_by_decisions(
   assert set(phase[:start[0] + 1]) == {"nominal"} and set(phase[start[0] + 1:stop[0] + 1]) == {"adapting"} and set(phase[stop[0] + 1:]) == {"converged"}
   updates, (row,) = np.asarray(trace["updates"]), pyarrow.parquet.read_table(whole / "runs.parquet").to_pylist()
   assert not updates[:start[0] + 1].any() and 0 < row["updates"] <= ADAPT.ratio * (stop[0] - start[0]) / REPEAT / (config.adapt.batch * PRESETS["tiny"].dreamer.length)
+
+
+@pytest.mark.slow
+def test_training_on_mjx_is_read_back_to_the_bit(tmp_path):
+  """Environment states of MJX hold arrays without an element."""
+  tiny = PRESETS["tiny"]
+  make = lambda: train.Trainer(Pendulum("mjx"), tiny.dreamer, replace(tiny.train, updates=96), tmp_path / "out", seeds=2)
+  trainer = make()
+  while not trainer.done:
+    trainer.step()
+  trainer.save()
+  again = make()
+  again.resume()
+  bits = lambda tree: [np.asarray(jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x).tobytes() for x in jax.tree.leaves(tree)]
+  assert any(x.size == 0 for x in jax.tree.leaves(trainer.state)) and bits(trainer.state) == bits(again.state)
