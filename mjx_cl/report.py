@@ -542,7 +542,10 @@ def in_loop(results: pathlib.Path) -> str:
   for part in parts:
     one, own, worth = plan[part], entries[part]["arms"]["detector"], (entries[part]["scores"]["normalised"] or {}).get("detector")
     new, first = one["env"] not in base, lost[base.setdefault(one["env"], part)]
-    rows.append((f"`{one['env']}`" if new else "", f"`{one['detector']}`", str(own["false_alarm_streams"]), f"{own['alarms']} of {own['seeds']}",
+    if new:  # arm `none` lives the same life whatever watches it
+      none = entries[part]["arms"]["none"]
+      rows.append((f"`{one['env']}`", "none, untouched", "", "", "", "", f"{none['recovered']} of {none['affected']}" if none["affected"] else "-", "", both(none, "return_lost"), "", "", "", "", ""))
+    rows.append(("", f"`{one['detector']}`", str(own["false_alarm_streams"]), f"{own['alarms']} of {own['seeds']}",
                  f"{own['affected_alarmed_within_500']} of {own['affected']}" if own["affected"] else "-", both(own, "latency_median_steps"),
                  f"{own['recovered']} of {own['affected']}" if own["affected"] else "-",
                  few(worth, "normalised", worth["seeds"], 2) if worth and worth["seeds"] else "-", both(own, "return_lost"),
