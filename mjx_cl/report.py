@@ -534,33 +534,38 @@ def in_loop(results: pathlib.Path) -> str:
   folder = results / "loop"
   plan, entries = load(folder / "suite.json")["parts"], load(folder / "bench.json")["entries"]
   parts = [p for p in plan if p in entries]  # in the order of the suite; the first of a robot is what its others are set against
+  of = lambda arm, name: f"{arm[name]} of {arm['affected']}" if arm["affected"] else "-"
   lost, begun, base, rows = {}, {}, {}, []
   for part in parts:
-    lost[part] = {r["seed"]: r["return_lost"] for r in table(folder / part / "runs.parquet") if r["arm"] == "detector" and not r["change"] and r["return_lost"] is not None}
+    own = {(r["arm"], r["seed"]): r for r in table(folder / part / "runs.parquet") if not r["change"]}
+    for (arm, seed), r in own.items():
+      still = own["none", seed]["reward_pre"]  # one measure for both: a false alarm cuts short what a stream's own reward before the onset is a mean of
+      if None not in (r["return_lost"], r["reward_pre"], still):
+        lost.setdefault((part, arm), {})[seed] = r["return_lost"] + (still - r["reward_pre"]) * (plan[part]["steps"] - r["onset"])
     begun[part] = sum(e["kind"] == "start" for e in table(folder / part / "events.parquet") if e["arm"] == "detector")
-  mean = lambda values: f"{number(statistics.mean(values))} {span(bootstrap.interval(values, lambda x, axis: x.mean(axis)))}, {len(values)} seeds" if len(values) > 1 else "-"
+  mean = lambda values: f"{number(statistics.mean(values))} {span(bootstrap.interval(values, lambda x, axis: x.mean(axis)))}" if len(values) > 1 else "-"
   for part in parts:
     one, own, worth = plan[part], entries[part]["arms"]["detector"], (entries[part]["scores"]["normalised"] or {}).get("detector")
-    new, first = one["env"] not in base, lost[base.setdefault(one["env"], part)]
+    new, mine = one["env"] not in base, lost.get((part, "detector"), {})
+    first = lost.get((base.setdefault(one["env"], part), "detector"), {})
     if new:  # arm `none` lives the same life whatever watches it
       none = entries[part]["arms"]["none"]
-      rows.append((f"`{one['env']}`", "none, untouched", "", "", "", "", f"{none['recovered']} of {none['affected']}" if none["affected"] else "-", "", both(none, "return_lost"), "", "", "", "", ""))
-    rows.append(("", f"`{one['detector']}`", str(own["false_alarm_streams"]), f"{own['alarms']} of {own['seeds']}",
-                 f"{own['affected_alarmed_within_500']} of {own['affected']}" if own["affected"] else "-", both(own, "latency_median_steps"),
-                 f"{own['recovered']} of {own['affected']}" if own["affected"] else "-",
-                 few(worth, "normalised", worth["seeds"], 2) if worth and worth["seeds"] else "-", both(own, "return_lost"),
-                 "" if new else mean([first[seed] - lost[part][seed] for seed in first if seed in lost[part]]), number(own["return_lost_healthy_mean"]),
+      rows.append((f"`{one['env']}`", "none, untouched", "", "", "", "", of(none, "recovered"), of(none, "recovered_within_10000"), "",
+                   mean([*lost.get((part, "none"), {}).values()]), "", "", "", ""))
+    rows.append(("", f"`{one['detector']}`", str(own["false_alarm_streams"]), f"{own['alarms']} of {own['seeds']}", of(own, "affected_alarmed_within_500"), both(own, "latency_median_steps"),
+                 of(own, "recovered"), of(own, "recovered_within_10000"), few(worth, "normalised", worth["seeds"], 2) if worth and worth["seeds"] else "-", mean([*mine.values()]),
+                 "" if new else mean([first[seed] - mine[seed] for seed in first if seed in mine]),
                  str(begun[part]), f"{own['converged']} / {own['aborted_by_rule'] + own['aborted_by_budget']} / {own['adapting']}", number(own["updates_mean"])))
   robots = {one["env"]: one for one in plan.values()}.values()
   seeds = sorted({(one["first_seed"], one["first_seed"] + one["seeds"] - 1) for one in plan.values()})
   done = f"{len(entries)} of {len(plan)} parts are finished. " if len(entries) < len(plan) else ""
   text = fill(f"""
       {done}{'; '.join(f"`{one['env']}`: `{one['fault']}` at step {number(one['onset'])} of {number(one['steps'])}" for one in robots)}; seeds {joined([f"{a} to {b}" for a, b in seeds])}. Streams with
-      a false alarm before the onset; streams that alarm after it; affected ones that do within 500 steps; median latency of all streams, misses counted as infinite; affected streams recovered before the run ends;
-      normalised recovery over the last 2,000 steps (0: arm `none`, 1: the reward before onset); return lost from the onset to the run's end (interquartile means, 95 % bootstrap intervals over streams); how much less of it a
-      stream loses than with its robot's first detector, a mean paired over seeds; return lost before the onset by finetuning on a false alarm, a stream's mean; finetunings begun, of all streams together; streams whose last one converged / was given up / still
-      went on; updates a stream. {FEW if any(" to " in row[7] for row in rows) else ""}""")
-  return text + "\n\n" + grid(("robot", "detector", "false alarms", "alarm", "within 500", "latency [steps]", "recovered", "normalised recovery", "return lost", "less", "before onset", "begun",
+      a false alarm before the onset; streams that alarm after it; affected ones that do within 500 steps; median latency of all streams, misses counted as infinite; affected streams recovered before the run ends,
+      and within 10,000 steps; normalised recovery over the last 2,000 steps (0: arm `none`, 1: the reward before onset; interquartile mean); return lost from the onset to the run's end, against the untouched stream's reward before
+      it, a stream's mean; how much less of it than with its robot's first detector, a mean paired over seeds (95 % bootstrap intervals over streams); finetunings begun, of all streams together; streams whose last one converged / was given up / still
+      went on; updates a stream. {FEW if any(" to " in row[8] for row in rows) else ""}""")
+  return text + "\n\n" + grid(("robot", "detector", "false alarms", "alarm", "within 500", "latency [steps]", "recovered", "within 10,000", "normalised recovery", "return lost", "less", "begun",
                                 "converged / given up / going on", "updates"), rows)
 
 

@@ -316,7 +316,7 @@ CONSTANTS = {  # what a block says of itself: windows of the definitions, sizes 
     "again": {"95", "2,000"},
     "study": {"1", "2,000"},
     "full": {"95", "500", "2,000", "1", "2", "3"},
-    "in-loop": {"95", "500", "2,000", "1", "2", "3", "10"},
+    "in-loop": {"95", "500", "2,000", "10,000", "1", "2", "3"},
     "two-agents": {"95", "500", "10,000", "2,000"},
     "gradient": {"95"},
     "quadruped": {"95", "8"},

@@ -22,7 +22,7 @@ def payload(env) -> Fault:
 
     m' = m (1 + 0.4 severity M / m),  I' = I m' / m                       M whole mass, m the trunk's
 
-  Severity: 1 is a load of 40 % of the whole robot [kg]: quadruped 20.9 kg (its randomisation in training is +-5 kg, severity 0.24), walker
+  Severity: 1 is a load of 40 % of the whole robot [kg]: quadruped 20.9 kg (Isaac Lab randomises by +-5 kg, severity 0.24), walker
   11.4, car 1.5. Target: trunk. Owns `mj.body_mass`, `mj.body_inertia`, or `task.mass`, `task.inertia` where there is no MuJoCo model.
   Source: payloads, facts 4.2.
   """
