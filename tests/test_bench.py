@@ -64,7 +64,7 @@ def test_shipped_suites_fit_the_registries(name):
   assert suite.name == name and suite.about and suite.parts
   for part in suite.parts:
     bench.check(part)
-    assert part.config.first_seed == 0  # seeds 0 to 9 report, 100 to 109 tune
+    assert part.config.first_seed == (10 if name == "loop" else 0)  # seeds 0 to 9 report, 100 to 109 tune; the detectors of `loop` were picked on a board of the former
     assert ".." not in part.name and not part.name.startswith("/")
   assert len({p.name for p in suite.parts}) == len(suite.parts)
 
