@@ -16,7 +16,7 @@ from mjx_cl.errors import FileError, UserError
 
 ORDER = {"trace": "step", "events": "step", "runs": "change", "signals": "step", "snapshots": "step", "stop": "since"}  # table -> what follows the stream
 KEPT = ("git_commit", "machine", "python", "versions")
-SAME = ("physics", "agent_card", "repeat", "control_s", "threshold")  # of config.json, beside the settings: one agent, backend and detector lived all the seeds
+SAME = ("physics", "agent_card", "repeat", "control_s")  # of config.json, beside the settings: one agent and one backend lived all the seeds
 
 SUMMED = ("env", "fault", "severity", "onset", "steps", "detector", "invalid_share", "wall_s", "wall_s_arms", "wall_share")  # what `join` takes from summary.json
 

@@ -595,7 +595,8 @@ def watching(config: RunConfig) -> str | None:
   if (name in detectors.PAPER or getattr(build, "reference", False) or "threshold" in config.settings or "threshold" not in detectors.known_settings(build)
       or not any(ARMS[arm].trigger.listens for arm in config.arms)):
     return None
-  found, robot = threshold_of(config), known_as(envs.make(config.env, config.physics))
+  robot = known_as(envs.make(config.env, config.physics))
+  found = detectors.calibrated(config.detector, robot, config.settings)
   if found is None:
     default = inspect.signature(build).parameters.get("threshold")
     own = "its own default threshold" + (f", {default.default:g}" if default and isinstance(default.default, (int, float)) else "")
