@@ -10,6 +10,7 @@ part in front, OUT/bench.json their summaries and what their arms say together (
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 import json
 import os
@@ -199,12 +200,21 @@ def adapting_steps(config: RunConfig, arm: str) -> int:
   return sum(min(limit, config.steps - s) for s in starts)
 
 
-def estimate(part: Part, rate: float) -> Estimate:
+class Robots:
+  """What the parts of a plan share, each built once."""
+
+  def __init__(self):
+    from mjx_cl import agents, envs
+    self.make = functools.cache(envs.make)
+    self.learner = functools.cache(lambda name, agent: agents.of(self.make(name, "auto"), agent).agent.config)
+
+
+def estimate(part: Part, rate: float, robots: Robots | None = None) -> Estimate:
   """Expected cost of a part on a machine whose dense float32 products run at `rate` FLOP/s. Physics is taken to scale alike: an estimate, no promise."""
-  from mjx_cl import agents, envs, memory, run
+  from mjx_cl import memory, run
   c = part.config
-  env = envs.make(c.env)
-  spec, trained = env.spec, agents.of(env, c.agent).agent.config
+  robots = robots or Robots()
+  spec, trained = robots.make(c.env, "auto").spec, robots.learner(c.env, c.agent)
   batch, starts = c.adapt.batch or trained.batch, c.adapt.last_starts
   size = memory.parameters(trained.size, len(spec.obs), len(spec.act), trained.bins)[0] / 640_867  # of size1m on a walker
   streams = len(c.arms) * c.seeds
@@ -217,23 +227,33 @@ def estimate(part: Part, rate: float) -> Estimate:
   return Estimate(streams, streams * c.steps, updates, COMPILE_S + seconds * RATE / rate, memory.resident(need.total(streams)))
 
 
-def estimates(parts) -> dict[str, Estimate]:
+def estimates(parts, robots: Robots | None = None) -> dict[str, Estimate]:
   """Part -> Estimate on this machine."""
-  rate = matmul_rate()
-  return {p.name: estimate(p, rate) for p in parts}
+  rate, robots = matmul_rate(), robots or Robots()
+  return {p.name: estimate(p, rate, robots) for p in parts}
 
 
-def check(part: Part) -> None:
+def check(part: Part, robots: Robots | None = None) -> None:
   """Refuses, before the suite starts, names and values that only the registries know: fault, target, detector, agent."""
-  from mjx_cl import detectors, envs, faults, run
+  from mjx_cl import detectors, faults, run
   from mjx_cl.config import changes
-  c = part.config
+  c, robots = part.config, robots or Robots()
   try:
     detectors.make(c.detector, **c.settings)
-    faults.build(changes(c), envs.make(becomes(c) or c.env, c.physics), c.onset)
-    run.arm_agents(c, envs.make(c.env, c.physics))
+    faults.build(changes(c), robots.make(becomes(c) or c.env, c.physics), c.onset)
+    run.arm_agents(c, robots.make(c.env, c.physics))
   except UserError as e:
     raise UserError(f"part {part.name}: {e}") from None
+
+
+def notes(parts) -> list[tuple[str, str]]:
+  """What `mjx-cl run` would say of these parts' settings before it starts (run.watching, run.doubts), each with the parts that it holds for."""
+  from mjx_cl import run
+  which: dict[str, list[str]] = {}
+  for part in parts:
+    for text in [*filter(None, [run.watching(part.config)]), *run.doubts(part.config)]:
+      which.setdefault(text, []).append(part.name)
+  return [(text, names[0] if len(names) == 1 else f"{names[0]} and {len(names) - 1} more") for text, names in which.items()]
 
 
 # ---- running -------------------------------------------------------------------------------------------------------------------------

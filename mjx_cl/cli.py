@@ -514,10 +514,11 @@ def do_bench(args: Bench) -> None:
   parts = bench.pick(suite.parts, args.only, (int(k), int(n)))
   out = pathlib.Path(args.out or f"runs/bench/{suite.name}")
   done = {p.name for p in parts if bench.finished(out, p)}
-  estimates = bench.estimates(parts)
+  robots = bench.Robots()
+  estimates = bench.estimates(parts, robots)
   for part in parts:  # whatever can be refused is refused before the first part runs
     if part.name not in done:
-      bench.check(part)
+      bench.check(part, robots)
   if args.plan:
     if args.json:
       emit([{"part": p.name, "finished": p.name in done, **estimates[p.name]._asdict()} for p in parts])
@@ -560,8 +561,11 @@ def plan_lines(suite, parts, done, estimates) -> list[str]:
     e = estimates[p.name]
     minutes = "finished" if p.name in done else f"{e.seconds / 60:.0f}"
     lines.append(f"  {p.name:{width}s}  {e.streams:7,d}  {e.stream_steps:12,d}  {e.updates:8,.0f}  {minutes:>7s}  {e.bytes / 2**30:5.1f}")
-  left = sum(estimates[p.name].seconds for p in parts if p.name not in done)
-  return lines + [f"  {len(done)} of {len(parts)} parts finished; about {clock(left)} left, by a one-second measurement of this machine's matrix product"]
+  todo = [p for p in parts if p.name not in done]
+  left = sum(estimates[p.name].seconds for p in todo)
+  lines.append(f"  {len(done)} of {len(parts)} parts finished; about {clock(left)} left, by a one-second measurement of this machine's matrix product")
+  from mjx_cl import bench
+  return lines + [f"  note, {which}: {text}" for text, which in bench.notes(todo)]
 
 
 def do_train(args: Train) -> None:

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import bisect
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -34,6 +35,7 @@ class Need(NamedTuple):
     return seeds * (self.weights + self.replay) + self.weights
 
 
+@functools.lru_cache
 def parameters(size: str, obs_size: int, act_size: int, bins: int = 255) -> tuple[int, int]:
   """Trainable parameters and those of the slow critic."""
   import jax

@@ -153,6 +153,16 @@ def test_the_plan_runs_nothing(mjx, mini, tmp_path):  # noqa: F811
   assert not (tmp_path / "out").exists()
 
 
+def test_the_plan_names_what_a_run_would_be_told(mjx, tmp_path):  # noqa: F811
+  """The board's threshold of a detector that was given none, once for all parts that share it, and an onset that lies in the warm-up."""
+  suite = write(tmp_path, 'name = "x"\n[run]\nenv = "walker"\ndetector = "cusum@surprise"\n[entries.a]\nseverity = [0.25, 0.5]\n'
+                          '[entries.b]\nonset = 600\n[entries.c]\ndetector = "rolling_sigma"')
+  code, out, err = mjx("bench", suite, "--plan")
+  said = [line for line in out.splitlines() if "note, " in line]
+  assert code == 0 and len(said) == 2, out
+  assert "a/severity=0.25 and 2 more: detector cusum@surprise at threshold 128." in said[0] and "note, b: onset 600 lies within" in said[1]
+
+
 def test_updates_of_the_plan():
   """An arm that adapts to the end takes ratio / (batch x length) updates a step once its replay holds start_windows; one that never does, none."""
   c = RunConfig("walker", steps=5000, onset=2000, seeds=3, arms=("always",), adapt=AdaptConfig(warmup=1000, start_windows=1024, ratio=16, batch=4))

@@ -5,6 +5,7 @@ normal. The walls ARE these polylines: lidar and contact are exact against them,
 """
 from __future__ import annotations
 
+import functools
 import pathlib
 from typing import NamedTuple
 
@@ -271,6 +272,13 @@ def reach(track: Track, max_range: float) -> tuple[np.ndarray, np.ndarray]:
   return (np.arange(num) - back) % num, np.minimum(back + 1 + forward, num)
 
 
+@functools.lru_cache
+def _shipped(max_range: float) -> tuple[tuple[Track, ...], tuple]:
+  """All of SHAPES and `reach` of each, which takes half a second."""
+  tracks = tuple(generate(name) for name in SHAPES)
+  return tracks, tuple(reach(t, max_range) for t in tracks)
+
+
 # ---- what a car senses, in JAX -------------------------------------------------------------------------------------------------------
 
 class Course:
@@ -284,10 +292,9 @@ class Course:
   """
 
   def __init__(self, tracks=None, beams: int = 64, fov_rad: float = 4.712389, max_range_m: float = 10.0):
-    self.tracks = tuple(generate(name) for name in SHAPES) if tracks is None else tuple(tracks)
     self.beams, self.max_range = beams, float(max_range_m)
     self.angles = np.linspace(-fov_rad / 2, fov_rad / 2, beams)  # [rad], 0 ahead, positive to the left
-    views = [reach(t, self.max_range) for t in self.tracks]
+    self.tracks, views = _shipped(self.max_range) if tracks is None else (tuple(tracks), [reach(t, self.max_range) for t in tracks])
     self.window = int(max(count.max() for _, count in views))  # cells looked at, one number for all places
     longest = max(len(t.centre) for t in self.tracks)
 
