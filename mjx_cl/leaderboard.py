@@ -102,6 +102,8 @@ def entry(name: str, settings: dict) -> Entry:
   own = None
   if use == "rolling_sigma":
     own = lambda robot: lambda threshold: build(threshold, robot=robot, shared=True)
+  elif "robot" in parameters:
+    own = lambda robot: lambda threshold: build(threshold, robot=robot)
   return Entry(name, build, calibrated, bool(getattr(factory, "reference", False)), about, own)
 
 

@@ -472,3 +472,38 @@ def test_references_do_not_look_at_the_residual():
   b = a._replace(groups=a.groups + 100, surprise=a.surprise + 100, latent=a.latent + 100, rpr=a.rpr + 100)
   for build in REFERENCES.values():
     chex.assert_trees_all_equal(scan(build(), a), scan(build(), b))
+
+
+# ---- multichart ----------------------------------------------------------------------------------------------------------------------
+
+@pytest.mark.parametrize("robot, units_of", [("quadruped", "quadruped"), ("mine", "walker"), (None, "walker")])
+def test_multichart_is_its_charts_in_their_units(robot, units_of):
+  """Each chart alone, at its own threshold: the alarm of any, the largest score in units of these thresholds, each one's restart."""
+  charts, level = ("cusum@surprise", "hotelling", "cusum white"), 0.003  # low, so that each alarms here and starts afresh
+  steps = 2600
+  xs = gaussian(jax.random.key(3), (steps,))
+  shift = lambda x, at, by: x + by * (np.arange(steps) >= at).reshape((-1,) + (1,) * (x.ndim - 1))
+  xs = xs._replace(opr=jnp.exp(shift(xs.opr, 2100, 4.0)), rpr=jnp.exp(xs.rpr), surprise=jnp.exp(shift(xs.surprise, 1700, 2.0)), groups=jnp.exp(shift(xs.groups, 2400, 6.0)))
+  got = scan(detectors.make("multichart", robot=robot, threshold=level, charts=",".join(charts)), xs)
+  board = detectors.board()[units_of]
+  alone = [scan(detectors.make(**({"name": (s := dict(board[c]["settings"])).pop("use")} | s), threshold=level * board[c]["threshold"]), xs) for c in charts]
+  assert all(a.fired.any() for a in alone)
+  np.testing.assert_array_equal(got.fired, np.any([a.fired for a in alone], 0))
+  want = np.stack([np.asarray(a.score, np.float64) / board[c]["threshold"] for a, c in zip(alone, charts)])
+  known = ~np.isnan(want).all(0)
+  np.testing.assert_array_equal(np.isnan(got.score), ~known)
+  np.testing.assert_allclose(got.score[known], np.nanmax(want[:, known], 0), rtol=1e-5)  # float32, another order of the same sums
+  np.testing.assert_array_equal(got.fired, np.nan_to_num(got.score, nan=-1) > np.float32(level))
+
+
+def test_the_units_of_multichart_are_the_robots():
+  xs = gaussian(jax.random.key(4), (1500,))
+  score = lambda robot: scan(detectors.make("multichart", robot=robot, charts="cusum@surprise"), xs).score[-1]
+  known = detectors.board()
+  np.testing.assert_allclose(score("walker") / score("car"), known["car"]["cusum@surprise"]["threshold"] / known["walker"]["cusum@surprise"]["threshold"], rtol=1e-5)
+
+
+@pytest.mark.parametrize("charts, word", [("cusum@surprise,nobody", "'nobody'"), ("mewma,mewma", "twice"), ("", "choose from"), ("multichart", "choose from")])
+def test_charts_that_are_none_are_refused(charts, word):
+  with pytest.raises(UserError, match=word):
+    detectors.make("multichart", charts=charts)

@@ -27,6 +27,7 @@ from mjx_cl.detectors.knn import knn
 from mjx_cl.detectors.kswin import kswin
 from mjx_cl.detectors.max_variables import max_variables
 from mjx_cl.detectors.mewma import mewma
+from mjx_cl.detectors.multichart import multichart
 from mjx_cl.detectors.rolling_sigma import rolling_sigma
 from mjx_cl.detectors.surprise import surprise
 from mjx_cl.detectors.shiryaev_roberts import shiryaev_roberts
@@ -110,7 +111,7 @@ DETECTORS = {"rolling_sigma": calibrated_rule, "rolling_sigma_plain": paper_rule
 DETECTORS |= {"z_score": z_score, "ewma": ewma, "cusum": cusum, "page_hinkley": page_hinkley, "shiryaev_roberts": shiryaev_roberts, "glr": glr}
 DETECTORS |= {"adwin": adwin, "kswin": kswin, "bocpd": bocpd, "e_detector": e_detector, "conformal": conformal}
 # over several fields of the residual
-DETECTORS |= {"hotelling": hotelling, "mewma": mewma, "max_variables": max_variables, "surprise": surprise, "knn": knn, "bfar": bfar}
+DETECTORS |= {"hotelling": hotelling, "mewma": mewma, "max_variables": max_variables, "surprise": surprise, "knn": knn, "bfar": bfar, "multichart": multichart}
 # what every score is printed beside; the oracle, which must be told the onset, is in references.REFERENCES alone
 DETECTORS |= {"never": references.never, "always": references.always, "periodic": references.periodic, "random": references.random}
 
@@ -165,7 +166,8 @@ def make(name: str, channel: str | None = None, log: bool | None = None, whiten:
     patience: scores in a row above the threshold before a single-residual detector fires, see combine.patience; others have their own setting of
       this name, or none.
     cool_down: samples after an alarm in which no other counts, of the channels together, see combine.cool_down.
-    robot: whose figures `rolling_sigma` starts from, where CALIBRATED has them; default: the walker's. Others: see `calibrated`.
+    robot: whose figures `rolling_sigma` starts from, where CALIBRATED has them, default the walker's; handed on
+      to a factory that takes it. Others: see `calibrated`.
     shared: `rolling_sigma` has one threshold for both residuals, see `one_threshold`.
   """
   name, own = split(name)
@@ -174,6 +176,8 @@ def make(name: str, channel: str | None = None, log: bool | None = None, whiten:
     build = _pure(name, build)
   if name == "rolling_sigma":
     settings = (one_threshold(robot) if shared else CALIBRATED.get(robot, {})) | settings
+  elif "robot" in inspect.signature(build).parameters:
+    settings = {"robot": robot} | settings
   try:
     if getattr(build, "takes", "residual") != "scalar":
       if channel is not None or log is not None or whiten:
