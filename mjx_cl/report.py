@@ -196,7 +196,9 @@ def leaderboard(results: pathlib.Path) -> str:
   """Detectors on the recorded streams: those that beat never alarming, and their own plain form, as a table, the others in a sentence."""
   meta = load(results / "leaderboard.json")
   overall = sorted(table(results / "leaderboard_overall.parquet"), key=lambda r: (-r["cost_standard"], r["detector"]))
-  rows = table(results / "leaderboard.parquet", ["detector", "reference", "robot", "fault", "severity", "arl0_alarms", "cost_standard", "control_s"])
+  from mjx_cl.scoring import metrics
+  rows = table(results / "leaderboard.parquet", ["detector", "reference", "robot", "fault", "severity", "arl0_alarms", "cost_standard", "control_s", "streams",
+                                                 "stream_latency_steps", "stream_healthy_alarms", "healthy_steps"])
   robots, faults = sorted({r["robot"] for r in rows}), len({(r["robot"], r["fault"], r["severity"]) for r in rows})
   alarms = statistics.mode(r["arl0_alarms"] for r in rows if not r["reference"])
   (low, high), minutes = meta["seeds"]["score"], meta["wall_s"] / 60
@@ -208,13 +210,16 @@ def leaderboard(results: pathlib.Path) -> str:
       if r["robot"] == robot and not r["reference"] and r["cost_standard"] is not None:
         means.setdefault(r["detector"], []).append(r["cost_standard"])
     best[robot] = max((statistics.fmean(x), name) for name, x in means.items())
+  first, second = [r["detector"] for r in overall if "(oracle)" not in r["detector"]][:2]
+  ahead, interval = metrics.difference(rows, first, second)
   text = fill(f"""
       Every detector sees the same recorded streams of frozen agents: {joined(robots)}, {faults} fault settings (fault x severity),
       {high - low + 1} scoring seeds each; thresholds at ARL0 = {number(meta['arl0_target'])} control steps, calibrated on other seeds' healthy
       streams ({alarms} alarms for most{', so every rate is an order of magnitude and marked so' if alarms < 50 else ''}): asked for are
       {joined([f"{number(asked[r], 1)} ({r})" for r in robots])} false alarms an hour, what came on the scoring seeds stands in the table. Score: 0 for never
       alarming, 100 for alarming at the onset and at no other time, a mean over robots; intervals over seeds. Best on each robot:
-      {joined([f"`{name}` {number(x)} ({robot})" for robot, (x, name) in best.items()])}. Mean ranks closer than {number(meta['critical_difference'], 1)} are not
+      {joined([f"`{name}` {number(x)} ({robot})" for robot, (x, name) in best.items()])}. `{first}` lies {number(ahead, 1)} {span(interval, 1)} above
+      `{second}` (paired, intervals over seeds; it says nothing of other faults). Mean ranks closer than {number(meta['critical_difference'], 1)} are not
       told apart (Nemenyi). `mjx-cl leaderboard` ({len(overall)} detectors;
       {number(meta['stream_steps'] / 1e6, 1)} million stream-steps, {number(minutes, 1)} minutes on {meta["machine"]["cores"]} shared core{'s' if meta['machine']['cores'] > 1 else ''}; goal 3
       minutes{', missed' if minutes > 3 else ''}). The page: [results/leaderboard.html](results/leaderboard.html), one file, sortable, a page per

@@ -190,6 +190,33 @@ def test_auroc_interval_equals_a_bootstrap_by_loop():
   assert 0.02 < got[1] - got[0] < 0.5
 
 
+def test_difference_of_two_detectors_is_paired_over_seeds():
+  """Against the loop: a drawn seed counts for both detectors, with all faults of its robot; a constant lead has no width."""
+  rows = []
+  for name, false in (("a", 1), ("b", 0)):
+    rng = np.random.default_rng(4)
+    for robot, severity in (("walker", 0.5), ("walker", 1.0), ("car", 0.5)):
+      latency, false_alarms = rng.integers(100, 300, SEEDS), np.full(SEEDS, false)
+      rows.append({"detector": name, "robot": robot, "fault": "gear", "severity": severity, "streams": SEEDS, "control_s": CONTROL, "healthy_steps": 5000,
+                   "stream_latency_steps": latency.tolist(), "stream_healthy_alarms": false_alarms.tolist()})
+      rows[-1] |= {k: float(np.mean(v)) for k, v in metrics.per_stream(latency.astype(float), false_alarms, 5000, CONTROL).items()}
+  value, (low, high) = metrics.difference(rows, "b", "a", reps=400)
+  assert value > 0 and low == pytest.approx(value) == high
+  rows[-1]["stream_latency_steps"] = rows[-1]["stream_latency_steps"][::-1]  # no longer the same lead in every stream
+  value, interval = metrics.difference(rows, "b", "a", reps=400)
+  cost = lambda r: metrics.per_stream(np.array(r["stream_latency_steps"], float), np.array(r["stream_healthy_alarms"]), 5000, CONTROL)["cost_standard"]
+  strata, loop = {"car": [2], "walker": [0, 1]}, []
+  gains = [cost(b) - cost(a) for a, b in zip(rows[:3], rows[3:])]
+  draws = {robot: bootstrap.draws(SEEDS, 400, k) for k, robot in enumerate(sorted(strata))}
+  for i in range(400):
+    loop.append(sum(gains[j][draws[robot][i]].mean() for robot, own in strata.items() for j in own) / 3)
+  assert interval == pytest.approx(bootstrap.ends([loop])[0]) and interval[0] < value < interval[1]
+  with pytest.raises(UserError, match="same faults; got 3 and 2"):
+    metrics.difference(rows[:5], "a", "b")
+  with pytest.raises(UserError, match="no streams"):
+    metrics.difference([{k: v for k, v in r.items() if k != "stream_latency_steps"} for r in rows], "a", "b")
+
+
 # ---- bootstrap -----------------------------------------------------------------------------------------------------------------------
 
 def test_weights_are_the_draws_and_ends_are_quantiles():

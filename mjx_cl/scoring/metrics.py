@@ -271,13 +271,37 @@ def _ranks(x: list[float]) -> np.ndarray:
   return (x[:, None] > x).sum(1) + ((x[:, None] == x).sum(1) + 1) / 2
 
 
-def _means(rows: list[dict], reps: int) -> dict:
-  """Means over rows of one detector, and their intervals from the rows' streams."""
-  drawn, names, strata = 0.0, list(per_stream(np.zeros(1), np.zeros(1), 1, 1.0)), {}
+def difference(rows: list[dict], first: str, second: str, measure: str = "cost_standard", reps: int = REPS) -> tuple[float, list[float]]:
+  """How far detector `first` lies above `second` in the mean over all robots x faults x severities, and its 95 % interval.
+
+  Paired: both detectors saw the same streams, and a drawn seed counts for both with all of its faults (`overall`).
+
+  Args:
+    rows: as `overall` takes them. measure: one of its means over streams.
+  Returns:
+    (mean difference, [low, high]).
+  Raises:
+    UserError where the two were not scored on the same faults, or rows lack their streams.
+  """
+  mine = [{(r["robot"], r["fault"], r["severity"]): r for r in rows if r["detector"] == name} for name in (first, second)]
+  if mine[0].keys() != mine[1].keys() or not mine[0]:
+    raise UserError(f"detectors {first!r} and {second!r} must be scored on the same faults; got {len(mine[0])} and {len(mine[1])} rows")
+  names, (one, other) = list(per_stream(np.zeros(1), np.zeros(1), 1, 1.0)), [_drawn(list(own.values()), reps) for own in mine]
+  if one is None or other is None:
+    raise UserError(f"detectors {first!r} and {second!r}: the rows hold no streams to draw from")
+  k = names.index(measure)
+  value = float(np.mean([r[measure] for r in mine[0].values()]) - np.mean([r[measure] for r in mine[1].values()]))
+  return value, bootstrap.ends((one - other)[k:k + 1])[0]
+
+
+def _drawn(rows: list[dict], reps: int) -> np.ndarray | None:
+  """Means over one detector's rows on seeds drawn anew, float (measures of per_stream, reps), the same draw for every detector; None without streams."""
+  drawn, strata = 0.0, {}
   for r in rows:
     strata.setdefault(r["robot"], []).append(r)
-  enough = all("stream_latency_steps" in r and r["streams"] > 1 for r in rows)
-  for seed, (robot, mine) in enumerate(sorted(strata.items())) if enough else ():
+  if not all("stream_latency_steps" in r and r["streams"] > 1 for r in rows):
+    return None
+  for seed, (robot, mine) in enumerate(sorted(strata.items())):
     if len({r["streams"] for r in mine}) > 1:
       raise UserError(f"the faults of robot {robot!r} must have the same seeds; got {sorted({r['streams'] for r in mine})} streams")
     sums = 0.0
@@ -285,15 +309,23 @@ def _means(rows: list[dict], reps: int) -> dict:
       latency = np.array([np.inf if x is None else x for x in r["stream_latency_steps"]], float)
       sums = sums + np.stack(list(per_stream(latency, np.array(r["stream_healthy_alarms"]), r["healthy_steps"], r["control_s"]).values()))
     drawn = drawn + sums @ bootstrap.weights(sums.shape[1], reps, seed).T / len(rows)
+  return drawn
+
+
+def _means(rows: list[dict], reps: int) -> dict:
+  """Means over rows of one detector, and their intervals from the rows' streams."""
+  names, drawn = list(per_stream(np.zeros(1), np.zeros(1), 1, 1.0)), _drawn(rows, reps)
+  enough = drawn is not None
+  strata = {r["robot"]: r for r in rows}
   ends = bootstrap.ends(drawn) if enough else [None] * len(names)
-  seeds = sum(mine[0]["streams"] for mine in strata.values())
+  seeds = sum(r["streams"] for r in strata.values())
   out = {}
   for name, interval in zip(names, ends):
     value = float(np.mean([r[name] for r in rows])) if all(r[name] is not None for r in rows) else None
     if enough and name in SHARES and value in (0.0, 1.0):
       interval = bootstrap.wilson(int(value) * seeds, seeds)
     elif enough and name == "false_alarms_per_hour" and value == 0:
-      hours = sum(r["streams"] * r["healthy_steps"] * r["control_s"] for r in (mine[0] for mine in strata.values())) / 3600.0
+      hours = sum(r["streams"] * r["healthy_steps"] * r["control_s"] for r in strata.values()) / 3600.0
       interval = [x / hours for x in special.poisson_interval(0)]
     out |= {name: value, f"{name}_ci": None if value is None else interval}
   return out
