@@ -572,28 +572,36 @@ def do_train(args: Train) -> None:
   preset = choose("preset", args.preset, PRESETS)
   names = {f.name for f in dataclasses.fields(TrainConfig)}
   changes = settings(args.set)
-  train_config = replace(preset.train, **{k: v for k, v in changes.items() if k in names})
+  from mjx_cl import bench
+  kept = {k: v for k, v in changes.items() if k in names}
+  bench.check_kinds("--set", TrainConfig, kept)
+  train_config = replace(preset.train, **kept)
   rest = {k: v for k, v in changes.items() if k not in names}
   known = {f.name for f in dataclasses.fields(preset.dreamer)}
   for name in rest:
     if name not in known:
       raise UserError(f"unknown setting {name!r}; choose from: {', '.join(sorted(names | known))}")
+  bench.check_kinds("--set", type(preset.dreamer), rest)
   dreamer = replace(preset.dreamer, **rest)
   if args.seeds < 1:
     raise UserError(f"seeds must be above 0; got {args.seeds}")
-  from mjx_cl import agents, envs, run, store, train
+  from mjx_cl import envs, run, store, train
   env = envs.make(args.env, args.physics)
   if args.demonstrator not in (None, "ppo"):  # whatever can be refused is refused before an earlier training is touched
     train.expert(env, args.demonstrator)
   train.faults_of(env, train_config)
-  if args.agent:
-    agents.of(env, args.agent)
+  train.check(env, dreamer, train_config, args.agent)
   state = store.claim_folder(args.out, args.resume, args.overwrite, done_marker="agent/card.json")
   if state == "done":
     say(f"{args.out}: this training is finished")
     return
   if state == "new" and args.overwrite:
-    run.clear(train.pathlib.Path(args.out))
+    out = pathlib.Path(args.out)
+    for name, given in (("agent", args.agent), ("demonstrator", args.demonstrator)):
+      if given and out.resolve() in pathlib.Path(given).resolve().parents:
+        raise UserError(f"--overwrite removes {out}, which --{name} {given} lies in; give another --out")
+    run.clear(out)
+    train.clear(out)
   command = "mjx-cl " + " ".join(sys.argv[1:]) if len(sys.argv) > 1 else "mjx-cl train"
   trainer = train.build(env, dreamer, train_config, args.out, args.seed, args.seeds, args.demonstrator, args.agent, args.preset, command, state == "resume")
   display = TrainDisplay(train_config.updates)

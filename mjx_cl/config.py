@@ -21,6 +21,14 @@ def positive(config, *names: str) -> None:
       raise UserError(f"{name} must be above 0; got {value}")
 
 
+def not_below_0(config, *names: str) -> None:
+  """Raises unless every named field is a finite number of at least 0."""
+  for name in names:
+    value = getattr(config, name)
+    if not (math.isfinite(value) and value >= 0):
+      raise UserError(f"{name} must be 0 or above; got {value}")
+
+
 def fraction(config, *names: str) -> None:
   """Raises unless every named field lies in [0, 1]."""
   for name in names:
@@ -84,14 +92,17 @@ class DreamerConfig:
     elif self.obs_scale not in (None, "spec"):
       raise UserError(f"obs_scale is `spec`, numbers above 0, or none; got {self.obs_scale!r}")
     positive(self, "batch", "length", "imagine", "horizon", "lr", "policy_lr", "bins")
-    if not (math.isfinite(self.anchor) and self.anchor >= 0):
-      raise UserError(f"anchor must be 0 or above; got {self.anchor}")
     if not 0 < self.min_std < self.max_std <= 1:
       raise UserError(f"min_std and max_std must lie above 0 and up to 1, min_std below; got {self.min_std} and {self.max_std}")
     if self.context != 1:
       raise UserError(f"context must be 1, as in the authors' code; got {self.context}")
-    if not 0 <= self.last_starts <= self.length:
-      raise UserError(f"last_starts must lie in 0..length={self.length}; got {self.last_starts}")
+    if self.length < 2:  # the value of a replayed state is learnt from the one behind it
+      raise UserError(f"length must be at least 2; got {self.length}")
+    if self.last_starts == 1 or not 0 <= self.last_starts <= self.length:
+      raise UserError(f"last_starts must be 0, or lie in 2..length={self.length}; got {self.last_starts}")
+    positive(self, "agc", "range_rate", "slow_rate")
+    not_below_0(self, "anchor", "warmup", "entropy", "free_nats", "rep_scale", "repval_scale")
+    fraction(self, "lam")
     if self.bins % 2 == 0:
       raise UserError(f"bins must be odd; got {self.bins}")
 
@@ -161,9 +172,8 @@ class TrainConfig:
     if self.fault is not None and fault_presets.named(self.fault) and self.severity != 1.0:
       raise UserError(f"preset {self.fault!r} brings its own severity; leave severity out")
     fraction(self, "demo_share", "clone_until", "shake", "shake_share", "severity")
-    for name in ("jitter", "hold", "fall_cost", "penalties"):
-      if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
-        raise UserError(f"{name} must be 0 or above; got {getattr(self, name)}")
+    positive(self, "clone_std")
+    not_below_0(self, "jitter", "hold", "fall_cost", "penalties", "demo_noise", "clone", "clone_weight", "fade", "pure", *(("lr_end",) if self.lr_end is not None else ()))
     if self.fall_cost and self.pure >= self.updates:
       raise UserError(f"fall_cost is not taken in the last pure={self.pure} updates, and there are no more than updates={self.updates}; set pure below that")
     if self.demonstrator and self.clone + self.fade + self.pure > self.updates:
@@ -243,8 +253,7 @@ class AdaptConfig:
     if self.period_steps >= self.period:
       raise UserError(f"period_steps must be below period={self.period}; got {self.period_steps}")
     positive(self, *(name for name in ("lr", "policy_lr", "batch") if getattr(self, name) is not None))
-    if self.anchor is not None and not (math.isfinite(self.anchor) and self.anchor >= 0):
-      raise UserError(f"anchor must be 0 or above; got {self.anchor}")
+    not_below_0(self, *(("anchor",) if self.anchor is not None else ()))
 
 
 @dataclass(frozen=True)

@@ -203,9 +203,11 @@ class Runner:
     return choices(self.labels, c.adapt, c.steps, [own + onsets for own in moves])
 
   def onsets(self) -> list[int | None]:
-    """Each stream's onset; where the robot becomes another one: as far as it is known. None: not in this run, or an arm whose robot is spared."""
+    """Each stream's onset; where the robot becomes another one: as far as it is known. None: not in this run, an arm whose robot is spared, or a
+    run without a fault or with one of severity 0, which changes nothing."""
     if self.other is None:
-      return [self.config.onset if breaks else None for breaks in self.breaks]
+      met = self.config.onset < self.config.steps and any(acts(change) for change in self.changes)
+      return [self.config.onset if breaks and met else None for breaks in self.breaks]
     return [int(step) if step < self.config.steps else None for step in np.asarray(self.state.streams.after.enter)[:, 0]]
 
   def _later(self, onset: int) -> dict[int, str]:
@@ -214,7 +216,7 @@ class Runner:
     for change in self.changes:
       begin = c.onset + change.after
       for step, kind in ((begin, "onset"), (begin + (change.duration or FOREVER), "repair")):
-        if change.fault != "none" and onset < step < c.steps and out.get(step) != "onset":
+        if acts(change) and onset < step < c.steps and out.get(step) != "onset":
           out[step] = kind
     return dict(sorted(out.items()))
 
@@ -311,6 +313,8 @@ class Runner:
     if self.snapshots:
       self.save()  # their evaluation takes a while; one that is cut off goes on from here
     trace = {k: v[:steps] if v.shape[0] >= steps else v for k, v in self._trace().items()}
+    outside = (trace["decision"] == phase_lib.START) & (trace["since"] >= steps)  # the last chunk lives on to its end
+    trace["decision"] = np.where(outside, phase_lib.NOTHING, trace["decision"])
     if self.other is None:
       targets = np.asarray(self.state.streams.injection.target)[:, 0]  # (groups, F)
       names = ["+".join(f"{f.name}:{f.targets[t]}" for f, t in zip(self.faults, row)) for row in targets]
@@ -405,7 +409,7 @@ class Runner:
         add(onset, "onset", f"becomes {self.other.spec.name}, severity 1")
       for change in self.changes:
         begin = c.onset + change.after
-        if self.breaks[g] and change.fault != "none" and begin < c.steps:
+        if self.breaks[g] and acts(change) and begin < c.steps:
           several = f"{change.fault}, " if len(self.changes) > 1 or self.other is not None else ""
           add(begin, "onset", f"{several}severity {change.severity:g}" + ("" if change.schedule == "abrupt" else f", {change.schedule}"))
           if change.duration and begin + change.duration < c.steps:
@@ -444,7 +448,7 @@ class Runner:
       begun[g] = acted[0] if acted else None
       pre[g] = recovery.reward_pre(reward, onset, c.adapt.warmup, begun[g])
       if arm == "none":
-        drop[seed] = recovery.reward_drop(reward, onset, pre[g]) if c.fault != "none" and onset < c.steps else None
+        drop[seed] = recovery.reward_drop(reward, onset, pre[g]) if onset < c.steps else None
     for g, (arm, seed) in enumerate(self.labels):  # no alarm ends the window of an arm that does not listen: the same life goes on in arm `none`
       if not ARMS[arm].trigger.listens and not ARMS[arm].agent and ("none", seed) in self.labels:
         pre[g] = pre[self.labels.index(("none", seed))]
@@ -483,7 +487,7 @@ class Runner:
 
   def _summary(self, runs, trace) -> dict:
     """summary.json: per arm the aggregates, each with its interval; arm `detector` also at the top level."""
-    severity = 1.0 if self.other is not None else max(c.severity for c in self.changes)
+    severity = 1.0 if self.other is not None else max(c.severity if acts(c) else 0.0 for c in self.changes)
     out = {"env": self.config.env, "fault": self.config.fault, "severity": severity, "onset": self.config.onset, "steps": self.config.steps,
            "detector": self.config.detector}
     out |= by_arm(runs, self.config, self.env.spec.control_s)
@@ -520,6 +524,11 @@ def arm_agents(config: RunConfig, env) -> dict[str, agents.Trained]:
       raise UserError(f"arm {arm!r}: agent {name!r} differs from the run's in size, obs_scale or repeat")
     out[arm] = other
   return out
+
+
+def acts(change) -> bool:
+  """Whether a change of the robot is one: a fault of a severity above 0."""
+  return change.fault != "none" and change.severity > 0
 
 
 def spared(plan: faults.Plan, breaks) -> faults.Plan:
@@ -612,13 +621,18 @@ def watching(config: RunConfig) -> str | None:
 
 def doubts(config: RunConfig) -> list[str]:
   """What a user may not have meant, one line each."""
-  warmup = config.adapt.warmup
+  adapt, warmup, said = config.adapt, config.adapt.warmup, []
+  if config.onset >= config.steps and becomes(config) is None and any(acts(change) for change in changes(config)):
+    said.append(f"the run ends at step {config.steps:,}, before its fault at {config.onset:,}: no stream meets it")
+  least = max(adapt.least, adapt.patience * CHUNK)
+  if adapt.budget < least and any(ARMS[arm].end.rule for arm in config.arms):
+    said.append(f"adapt.budget={adapt.budget:,} ends every finetuning before one may converge, after {least:,} steps (adapt.least, {CHUNK} adapt.patience)")
   if warmup >= config.steps:
-    return [f"the run ends at step {config.steps:,}, within adapt.warmup={warmup:,}: no alarm can start anything"]
+    return said + [f"the run ends at step {config.steps:,}, within adapt.warmup={warmup:,}: no alarm can start anything"]
   if warmup > config.onset and any(ARMS[arm].trigger.listens for arm in config.arms):
-    return [f"onset {config.onset:,} lies within adapt.warmup={warmup:,}: an alarm before its end starts nothing, and without a reward before the onset no stream "
+    return said + [f"onset {config.onset:,} lies within adapt.warmup={warmup:,}: an alarm before its end starts nothing, and without a reward before the onset no stream "
             "counts as affected or recovered; a later --onset or a smaller --adapt.warmup would do"]
-  return []
+  return said
 
 
 def execute(config: RunConfig, out, resume: bool = False, overwrite: bool = False, progress=lambda p: None, save_every_s: float = 60.0,

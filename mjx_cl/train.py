@@ -127,6 +127,31 @@ def faults_of(env, config: TrainConfig):
   return faults.build(changes, env)
 
 
+def check(env, dreamer: DreamerConfig, config: TrainConfig, agent_name: str | None = None) -> None:
+  """Refuses a replay that can never hold one update's windows, and an agent that sees or acts otherwise than this training would have it.
+
+  Raises:
+    UserError. Size, bins and obs_scale decide what weights mean, repeat what an action does; what else differs a training may change.
+  """
+  from mjx_cl import agents
+  least = max(2 * CHUNK, dreamer.length + -(-dreamer.batch * dreamer.length // config.envs))
+  if config.capacity < least:
+    raise UserError(f"capacity={config.capacity} records of each of {config.envs} robots never hold the {dreamer.batch} x {dreamer.length} steps of an update; "
+                    f"capacity={least} would")
+  if agent_name:
+    trained = agents.of(env, agent_name)
+    of, spec = lambda c, repeat: {"size": c.size, "bins": c.bins, "obs_scale": scaled(env, c).obs_scale, "repeat": repeat}, dataclasses.replace(dreamer, obs_scale="spec")
+    has, wanted = of(trained.agent.config, int(trained.card.get("repeat", 1))), of(dreamer, config.repeat)
+    say = lambda x: "spec" if x == scaled(env, spec).obs_scale else x if isinstance(x, str) else json.dumps(x)
+    for name in (n for n in has if has[n] != wanted[n]):
+      raise UserError(f"agent {agent_name!r} has {name} {say(has[name])}, this training {say(wanted[name])}; --set {name}={say(has[name])} goes on with its own")
+
+
+def scaled(env, dreamer: DreamerConfig) -> DreamerConfig:
+  """`dreamer` with the robot's own deviations in the place of obs_scale `spec`."""
+  return dataclasses.replace(dreamer, obs_scale=tuple(float(v.scale) for v in env.spec.obs)) if dreamer.obs_scale == "spec" else dreamer
+
+
 class Returns:
   """Returns of finished episodes, per stream, from chunks of rewards."""
 
@@ -154,6 +179,7 @@ class Trainer:
   """
 
   def __init__(self, env, dreamer: DreamerConfig, config: TrainConfig, out, seed: int = 0, seeds: int = 1):
+    check(env, dreamer, config)
     self.env, self.dreamer, self.config, self.out = env, dreamer, config, pathlib.Path(out)
     env = eased(cut(env, config.episode), config.penalties)
     self.seeds = seeds
@@ -391,23 +417,53 @@ def build(env, dreamer: DreamerConfig, config: TrainConfig, out, seed: int, seed
     config = dataclasses.replace(config, demonstrator=str(path))
   elif demonstrator_name:
     config = dataclasses.replace(config, demonstrator=demonstrator_name)
-  if dreamer.obs_scale == "spec":
-    dreamer = dataclasses.replace(dreamer, obs_scale=tuple(float(v.scale) for v in env.spec.obs))
+  dreamer = scaled(env, dreamer)
   trainer = Trainer(env, dreamer, config, out, seed, seeds)
   trainer.about = {"env": env.spec.name, "preset": preset, "command": command, "seed": seed, "repeat": config.repeat,
                    "dreamer": dataclasses.asdict(dreamer), "train": dataclasses.asdict(config), "started_from": agent_name}
-  values = {"command": "train", **trainer.about, **store.provenance()}
+  values = {"command": "train", "seeds": seeds, **trainer.about, **store.provenance()}
   if resume:
+    check_same(out, values)
     trainer.resume()
+    store.write_json(out / "config.json", values)  # `updates` may have grown
   else:
     if agent_name:
+      check(env, dreamer, config, agent_name)
       trained = agents.of(env, agent_name)
-      if trained.agent.config.size != dreamer.size:
-        raise UserError(f"agent {agent_name!r} has size {trained.agent.config.size}, this training {dreamer.size}")
       spread = jax.tree.map(lambda x: jnp.broadcast_to(x, (seeds,) + x.shape).copy(), trained.train)
       trainer.state = trainer.state._replace(train=spread._replace(updates=jnp.zeros_like(spread.updates)))
     store.write_json(out / "config.json", values)
   return trainer
+
+
+def check_same(out: pathlib.Path, values: dict) -> None:
+  """Refuses to resume a training with other settings than it began with; the number of updates may be another.
+
+  Raises:
+    UserError that names them; FileError where config.json is not a training's.
+  """
+  try:
+    old = json.loads((out / "config.json").read_text())
+    defaults = {"dreamer": DreamerConfig(), "train": TrainConfig()}  # of a setting that did not exist when the training began
+    flat = lambda v: {"env": v["env"], "seed": v["seed"], "seeds": v.get("seeds", values["seeds"]), "started_from": v["started_from"],
+                      **{k: x for part in ("dreamer", "train") for k, x in (dataclasses.asdict(defaults[part]) | v[part]).items()}}
+    before, now = flat(old), flat(json.loads(json.dumps(values)))
+    for v in (before, now):  # the folder may be named in another way
+      v["demonstrator"] = v["demonstrator"] and pathlib.Path(v["demonstrator"]).name
+  except (OSError, ValueError, KeyError, TypeError):
+    raise FileError(f"{out / 'config.json'} is not a training's; give --overwrite or another --out") from None
+  changed = [k for k in now if k != "updates" and json.dumps(before.get(k)) != json.dumps(now[k])]
+  if changed:
+    raise UserError(f"--resume: {out} was begun with another {', '.join(changed)}; give the same settings, --overwrite, or another --out with "
+                    f"--agent {out / 'agent'} once it has ended")
+
+
+def clear(out: pathlib.Path) -> None:
+  """Removes the agent and the demonstrator that an earlier training wrote, nothing else; the rest: run.clear."""
+  for name in ("agent/agent.npz", "agent/card.json"):
+    (out / name).unlink(missing_ok=True)
+  for path in (out / "demonstrator").glob("policy*.npz"):
+    path.unlink()
 
 
 def export(trainer: Trainer, episodes: int = 20) -> dict:

@@ -149,6 +149,8 @@ def test_what_a_run_takes_with_a_doubt_and_what_it_refuses(capsys, tmp_path):
   assert "onset 600 lies within adapt.warmup=1,000" in run.doubts(config())[0] and not run.doubts(config(warmup=500))
   assert "the run ends at step 1,500, within" in run.doubts(config(warmup=5000))[0]
   assert not run.doubts(replace(config(), arms=("none",)))  # nobody listens
+  assert "before its fault at 1,500" in run.doubts(replace(config(), onset=1500))[0] and not run.doubts(replace(config(), onset=1500, fault="none"))
+  assert "adapt.budget=3,000 ends every finetuning before" in run.doubts(replace(config(warmup=500, budget=3000)))[0]
   for argv, words in ((("--adapt.warmup", "-1"), "warmup must be 0 or above"), (("--fault", "gera"), "unknown fault")):
     assert cli.main(["run", "walker", "--out", str(tmp_path / "r"), *argv]) == 2
     assert words in capsys.readouterr().err and not (tmp_path / "r").exists()  # an empty folder is no run either

@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import io
 import json
+import math
 import os
 import pathlib
 import signal
@@ -18,7 +19,7 @@ import pyarrow.parquet
 import pytest
 
 from mjx_cl import agents, cli, envs, plots, run, store, workers
-from mjx_cl.config import RunConfig
+from mjx_cl.config import AdaptConfig, RunConfig
 from mjx_cl.dreamer.agent import Agent
 from mjx_cl.envs.walker import Walker
 from mjx_cl.errors import FileError, UserError
@@ -267,11 +268,33 @@ def test_a_preset_of_several_faults_ends_in_all_files(saved, tmp_path):
   assert rows["reward_final"] == pytest.approx([reward[:70].mean(), reward.mean()]) and rows["reward_pre"][1] == pytest.approx(reward[:70].mean())
 
 
-def test_a_healthy_run_has_no_severity(saved, tmp_path):
-  config = RunConfig("walker", fault="none", onset=40, steps=128, seeds=1, arms=("none",), agent=str(saved), physics="native")
-  run.execute(config, tmp_path / "out")
-  trace = table(tmp_path / "out", "trace")
-  assert not any(trace["fault_active"]) and not any(trace["severity"]) and not table(tmp_path / "out", "events")["kind"].count("onset")
+@pytest.mark.parametrize("change", [{"fault": "none"}, {"severity": 0.0}, {"onset": 128}], ids=str)
+def test_a_healthy_run_has_no_severity_no_onset_and_no_detection(saved, tmp_path, change):
+  """Without a fault, with one of severity 0, or with one after the last step: every alarm is a false one, at the step that would be the onset's and later too."""
+  config = RunConfig("walker", **({"fault": "gear", "onset": 40} | change), steps=128, seeds=1, arms=("none",), agent=str(saved), physics="native",
+                     detector="periodic", settings={"threshold": math.log(30)}, adapt=AdaptConfig(warmup=20))
+  summary = run.execute(config, tmp_path / "out")
+  trace, events, rows = (table(tmp_path / "out", name) for name in ("trace", "events", "runs"))
+  assert not any(trace["fault_active"]) and not any(trace["severity"]) and not events["kind"].count("onset")
+  alarms = np.flatnonzero(trace["alarm"])
+  assert (alarms > 40).any() and rows["false_alarms"] == [len(alarms)] and all("false alarm" in r for k, r in zip(events["kind"], events["reason"]) if k == "alarm")
+  assert (rows["onset"], rows["alarm_step"], rows["latency_steps"], rows["affected"], rows["reward_drop"], rows["return_lost"]) == ([None],) * 6
+  assert summary["arms"]["none"]["alarms"] == 0 and summary["arms"]["none"]["miss_probability"] is None and summary["arms"]["none"]["affected"] == 0
+  assert summary["arms"]["none"]["false_alarms_per_hour"] == pytest.approx(len(alarms) / (128 * 0.025 / 3600))
+  assert summary["severity"] == (0.5 if "onset" in change else 0.0)
+
+
+def test_an_alarm_behind_the_last_step_starts_nothing(saved, tmp_path):
+  """The last chunk lives on to its end; what is decided on its surplus is no part of the run."""
+  config = lambda steps: RunConfig("walker", onset=40, steps=steps, seeds=1, arms=("detector",), agent=str(saved), physics="native",
+                                   detector="periodic", settings={"threshold": math.log(30)}, adapt=AdaptConfig(warmup=100))
+  run.execute(config(128), tmp_path / "whole")
+  events = table(tmp_path / "whole", "events")
+  (since,) = [int(r.split()[-1]) for k, r in zip(events["kind"], events["reason"]) if k == "start"]
+  assert since > 100
+  run.execute(config(since), tmp_path / "cut")
+  events, rows = table(tmp_path / "cut", "events"), table(tmp_path / "cut", "runs")
+  assert "start" not in events["kind"] and (rows["adapt_start"], rows["outcome"]) == ([None], ["nominal"])
 
 
 def test_smooth_is_a_trailing_mean_that_leaves_nan_out():

@@ -52,6 +52,8 @@ def test_reward_drop_covers_2000_steps_from_onset():
   assert recovery.reward_drop(reward, 2600, 0.8) == 1.0  # 500 steps are left: the mean of those
   assert recovery.reward_drop(reward, 100, None) is None
   assert recovery.reward_drop(reward, 100, 0.0) is None  # a share of nothing
+  assert recovery.reward_drop(np.full(200, -3.0), 100, -1.0) == 2.0  # twice of what it was is lost
+  assert recovery.reward_drop(np.full(200, -0.5), 100, -1.0) == -0.5  # half of it gained
 
 
 def test_return_lost_is_the_sum_from_onset():
@@ -105,6 +107,14 @@ def test_recovery_step_at_the_edges():
   assert recovery.recovery_step(trace((1000, 1.0), (2000, 0.0), (1899, 1.0)), 1000, 1.0) is None   # back, but the run ends before the hold
   for pre in (None, 0.0):
     assert recovery.recovery_step(trace((5000, 1.0)), 1000, pre) is None
+
+
+def test_recovery_of_a_reward_below_0():
+  """A tenth below the reward before is as far down where that is negative: -1.1 of -1."""
+  assert recovery.recovery_step(trace((1000, -1.0), (4000, -1.05)), 1000, -1.0) == 1000
+  assert recovery.recovery_step(trace((1000, -1.0), (4000, -1.2)), 1000, -1.0) is None
+  # the mean falls by 0.002 a step and is below -1.1 after 51; at step 3,000 + j it has j + 1 good ones among 1,000 and is at -1.1 with 950
+  assert recovery.recovery_step(trace((1000, -1.0), (2000, -3.0), (4000, -1.0)), 1000, -1.0) == 3000 + 949
 
 
 # ---- aggregates ----------------------------------------------------------------------------------------------------------------------

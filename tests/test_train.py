@@ -1,5 +1,6 @@
 """Pretraining: exact resume, the train ratio, phases with a demonstrator, checkpoints that survive kills and refuse damage."""
 import copy
+import json
 import os
 import pathlib
 import shutil
@@ -13,7 +14,7 @@ import numpy as np
 import pyarrow.parquet
 import pytest
 
-from mjx_cl import checkpoint, demonstrator, envs, replay as replay_lib, train
+from mjx_cl import agents, checkpoint, cli, demonstrator, envs, replay as replay_lib, train
 from mjx_cl.config import PRESETS, TrainConfig, replace
 from mjx_cl.errors import FileError, UserError
 
@@ -128,6 +129,49 @@ def test_a_preset_is_trained_under_as_it_is(short_walker, tmp_path):
                     (dict(fault="quadruped/rh-velocity-third"), "of robot 'quadruped'")):
     with pytest.raises(UserError, match=text):
       train.Trainer(short_walker, DREAMER, TrainConfig(**bad), tmp_path)
+
+
+@pytest.fixture
+def begun(tmp_path, monkeypatch):
+  """(arguments, folder) of a training that was cut off before its first chunk."""
+  def cut(self):
+    raise KeyboardInterrupt
+  monkeypatch.setattr(train.Trainer, "step", cut)
+  argv = ["train", "walker", "--preset", "tiny", "--out", str(tmp_path / "out")]
+  assert cli.main(argv) == 130
+  return argv, tmp_path / "out"
+
+
+def test_an_agent_of_before_is_gone_once_overwrite_begins(begun, capsys):
+  """Else --resume would find its card, call the new training finished, and leave the old agent."""
+  argv, out = begun
+  for name in ("agent/card.json", "agent/agent.npz", "demonstrator/policy.npz", "agent/notes.txt"):
+    (out / name).parent.mkdir(exist_ok=True)
+    (out / name).write_text("old")
+  assert cli.main([*argv, "--overwrite"]) == 130
+  assert not [p.name for p in (*(out / "agent").iterdir(), *(out / "demonstrator").iterdir()) if p.name != "notes.txt"] and (out / "agent/notes.txt").exists()
+  capsys.readouterr()
+  assert cli.main([*argv, "--resume"]) == 130 and "finished" not in capsys.readouterr().err
+
+
+def test_overwrite_of_the_folder_that_the_agent_lies_in_is_refused(begun, capsys):
+  argv, out = begun
+  config = (out / "config.json").read_text()
+  shutil.copytree(agents.HERE / "walker", out / "agent")
+  assert cli.main([*argv, "--overwrite", "--agent", str(out / "agent"), "--set", "size=size1m", "bins=255"]) == 2
+  assert "another --out" in capsys.readouterr().err and (out / "agent/agent.npz").exists() and (out / "config.json").read_text() == config
+
+
+def test_a_training_is_resumed_with_its_own_settings(begun, capsys):
+  argv, out = begun
+  before = (out / "config.json").read_text()
+  assert cli.main([*argv, "--resume", "--seed", "7", "--set", "repeat=2", "lr=0.5"]) == 2
+  said = capsys.readouterr().err.splitlines()[-1]
+  assert "another seed, lr, repeat;" in said and (out / "config.json").read_text() == before
+  assert cli.main([*argv, "--resume", "--set", "updates=300"]) == 130  # more of the same
+  assert json.loads((out / "config.json").read_text())["train"]["updates"] == 300
+  (out / "config.json").write_text('{"command": "run"}')
+  assert cli.main([*argv, "--resume"]) == 1 and "not a training's" in capsys.readouterr().err
 
 
 def test_resume_without_a_checkpoint(short_walker, tmp_path):

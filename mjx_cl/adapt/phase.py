@@ -115,8 +115,8 @@ def update(state: PhaseState, signals, posture, alarm, alarm_step, now, acts, ac
   reward = jnp.nanmean(ring[:, SIGNALS.index("reward")])
   accepted = (reward >= acceptance) & (jnp.mean(postures) >= least_posture)
   full = adapting & (count >= config.patience) & (age >= config.least)
-  # progress: the reward over the patience has not risen by 5 % of acceptance above its best for a third of `give_up`
-  better = full & (reward > state.best + 0.05 * acceptance)
+  # progress: the reward over the patience has not risen by 5 % of |acceptance| above its best for a third of `give_up`
+  better = full & (reward > state.best + 0.05 * jnp.abs(acceptance))
   best = jnp.where(better, reward, state.best)
   best_at = jnp.where(better, now, state.best_at)
   stuck = full & (age >= config.give_up) & (now - best_at >= config.give_up // 3) & (~accepted | (age >= 5 * config.give_up // 4)) & rule

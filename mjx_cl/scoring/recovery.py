@@ -5,7 +5,7 @@ import numpy as np
 
 TRAIL = 1000  # steps of the trailing mean
 HOLD = 2000   # steps for which it must stay
-SHARE = 0.9   # of reward_pre
+SHARE = 0.9   # of reward_pre; where that is negative, as much below it as 90 % are below a positive one
 DROP = 2000   # steps after onset over which the drop is taken
 FINAL = 2000  # last steps of the run
 
@@ -20,12 +20,14 @@ def reward_pre(reward: np.ndarray, onset: int, warmup: int, first_alarm: int | N
 
 
 def reward_drop(reward: np.ndarray, onset: int, pre: float | None) -> float | None:
-  """1 - mean(onset .. onset + 2,000) / reward_pre, of arm `none`."""
-  return None if not pre else float(1.0 - np.mean(reward[onset:onset + DROP]) / pre)
+  """(reward_pre - mean(onset .. onset + 2,000)) / |reward_pre|, of arm `none`."""
+  return None if not pre else float(np.copysign(1.0, pre) * (1.0 - np.mean(reward[onset:onset + DROP]) / pre))
 
 
 def recovery_step(reward: np.ndarray, onset: int, pre: float | None) -> int | None:
   """First step from which the trailing 1,000-step mean stays at or above 90 % of reward_pre for 2,000 steps, after it had fallen below.
+
+    mean >= reward_pre - 0.1 |reward_pre|
 
   The mean lags by up to 1,000 steps. A stream whose mean never falls below after onset was never down: its recovery step is the onset.
   None: censored, or the run ends before the hold does.
@@ -36,7 +38,7 @@ def recovery_step(reward: np.ndarray, onset: int, pre: float | None) -> int | No
   steps = np.arange(len(reward))
   begin = np.maximum(0, steps + 1 - TRAIL)
   trailing = (sums[steps + 1] - sums[begin]) / (steps + 1 - begin)
-  good = trailing >= SHARE * pre
+  good = trailing >= (SHARE if pre > 0 else 2 - SHARE) * pre
   fallen = np.flatnonzero(~good[onset:])
   if not len(fallen):
     return onset
