@@ -5,6 +5,7 @@ the streams of the seeds that score are run once. A detector is one jitted progr
 """
 from __future__ import annotations
 
+import collections
 import inspect
 import math
 import time
@@ -269,22 +270,26 @@ def score(streams: StreamSet, entries: list[Entry], robots=(), extra=(), progres
     data = load(streams, robot)
     nominal = joined(data.tune.residual, data.score.residual)
     samples = passes.samples(nominal, data.fault.residual, data.fault.onset, data.fault.seed, data.horizon, room.samples) if entries else None
-    known = oracles.oracles(streams, data)
-    rows += oracle_rows(data, known)
-    done += 1
-    progress(robot, "oracles", done, n, time.perf_counter() - begin)
     alarms: dict[str, np.ndarray] = {}
     runner = lambda e: passes.Runner(e.own(robot), room) if e.own else runners[e.name]
     jobs = [(e.name, lambda d, e=e: _guarded(e, d, runner(e), samples)) for e in entries] + list(extra)
+    rate = lambda name, result, known: rows_of(name, next((e.reference for e in entries if e.name == name), False), result, data, known)
 
     def rated(name, get):
       result = get(data)
-      return result, rows_of(name, next((e.reference for e in entries if e.name == name), False), result, data, known)
+      return result, rate(name, result, oracle.result()) if oracle.done() else None
     with _workers() as pool:
-      waiting = [(name, pool.submit(rated, name, get)) for name, get in jobs]
+      oracle = pool.submit(oracles.oracles, streams, data)  # one thread's work for a while: detectors run beside it, and are rated once it is there
+      waiting = collections.deque((name, pool.submit(rated, name, get)) for name, get in jobs)
       try:
-        for name, job in waiting:
+        known = oracle.result()
+        rows += oracle_rows(data, known)
+        done += 1
+        progress(robot, "oracles", done, n, time.perf_counter() - begin)
+        while waiting:
+          name, job = waiting.popleft()  # what a job found is let go of once it is rated
           result, own = job.result()
+          own = rate(name, result, known) if own is None else own
           rows += own
           curves.setdefault(name, {})[robot] = result.curve
           alarms[name] = result.fired

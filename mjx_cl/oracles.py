@@ -83,6 +83,16 @@ def _thresholds(ratio: np.ndarray, lanes: int, count_from: int, most: float) -> 
   return high
 
 
+def _ratios(x: np.ndarray, fits) -> np.ndarray:
+  """Log-likelihood ratios (T, faults x S) of healthy channels (T, S, C), nan over the first ORDER steps; one healthy model stands in all fits."""
+  out, lanes = np.full((len(x), len(fits) * x.shape[1]), np.nan), x.shape[1]
+  x = limits.lagged(x, ORDER)
+  before = limits.log_density(x, fits[0].before)
+  for k, one in enumerate(fits):
+    out[ORDER:, k * lanes:(k + 1) * lanes] = limits.log_density(x, one.after) - before
+  return out
+
+
 def oracles(streams: StreamSet, data) -> dict[tuple[str, float], Oracle]:
   """The likelihood-ratio CUSUM of every fault: fitted on the seeds that tune, calibrated on their healthy streams, run on the seeds that score.
 
@@ -92,7 +102,6 @@ def oracles(streams: StreamSet, data) -> dict[tuple[str, float], Oracle]:
   lanes = data.tune.residual.opr.shape[1]
   each = lanes // len(dict.fromkeys(data.tune.seed.tolist()))
   tune, score = (channels(x.residual) for x in (data.tune, data.score))
-  ratio = lambda x, p: np.concatenate([np.full((ORDER, x.shape[1]), np.nan), limits.log_ratio(x, p)])
   normal = tune[data.count_from:, ::each]
   normal, first, known = limits.Healthy(normal, ORDER), limits.Healthy(normal[..., 0], ORDER), {}
   for key in streams.faults(data.robot):
@@ -101,16 +110,20 @@ def oracles(streams: StreamSet, data) -> dict[tuple[str, float], Oracle]:
     known[key] = _known(normal, first, after, data.arl0)
   out = {key: Oracle(limit, None) for key, (_, limit) in known.items()}
   fits = {key: fit for key, (fit, _) in known.items() if fit is not None}
-  levels = []
-  if fits:
-    every = np.concatenate([ratio(tune, p) for p in fits.values()], 1)
-    levels = _thresholds(every, lanes, data.count_from, lanes * (len(tune) - data.count_from) / data.arl0)
-  for (key, fit), level in zip(fits.items(), levels):
-    run = lambda x: restarted(ratio(x, fit), np.full(x.shape[1], level))
+  if not fits:
+    return out
+  each_fault = list(fits.values())
+  tuned = _ratios(tune, each_fault)
+  levels = _thresholds(tuned, lanes, data.count_from, lanes * (len(tune) - data.count_from) / data.arl0)
+  tuned = restarted(tuned, np.repeat(levels, lanes))[0]
+  scored = restarted(_ratios(score, each_fault), np.repeat(levels, score.shape[1]))
+  part = lambda x, k: x[:, k * (x.shape[1] // len(fits)):(k + 1) * (x.shape[1] // len(fits))]  # of fault k
+  for k, (key, fit) in enumerate(fits.items()):
     own = data.own(key)
-    fired, evidence = run(channels(data.fault.residual, own))
-    nominal = [healthy.by_seed(x, data.score.seed, data.count_from) for x in run(score)]
-    arl0 = metrics.arl0(run(tune)[0], data.count_from)
+    ratio = _ratios(channels(data.fault.residual, own), [fit])
+    fired, evidence = restarted(ratio, np.full(ratio.shape[1], levels[k]))
+    nominal = [healthy.by_seed(part(x, k), data.score.seed, data.count_from) for x in scored]
+    arl0 = metrics.arl0(part(tuned, k), data.count_from)
     latency = metrics.latencies(fired, data.fault.onset[own], data.horizon)
-    out[key] = Oracle(out[key].limits, OracleRun(latency, fired, evidence, *nominal, float(level), arl0))
+    out[key] = Oracle(out[key].limits, OracleRun(latency, fired, evidence, *nominal, float(levels[k]), arl0))
   return out

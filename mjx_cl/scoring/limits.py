@@ -106,19 +106,30 @@ def _streams(x, name: str) -> np.ndarray:
   return x.reshape(x.shape + (1,) * (3 - x.ndim))
 
 
-def _design(x: np.ndarray, order: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-  """Past (T - order, S, order C), newest first, present (T - order, S, C) and where both are known (T - order, S)."""
+class Lagged(NamedTuple):
+  """Streams beside their own past, for many models of one order. Attributes: past (T - order, S, order C), newest first, now (T - order, S, C), known
+  (T - order, S), where all of both is finite."""
+  past: np.ndarray
+  now: np.ndarray
+  known: np.ndarray
+
+
+def lagged(x, order: int) -> Lagged:
+  """Streams (T,), (T, S) or (T, S, C), or what this gave, beside their past."""
+  if isinstance(x, Lagged):
+    return x
+  x = _streams(x, "x")
   if len(x) <= order:
     raise UserError(f"an autoregression of order {order} needs more than {order} steps; got {len(x)}")
   steps = len(x) - order
   past = np.concatenate([x[order - 1 - k:order - 1 - k + steps] for k in range(order)], -1) if order else np.zeros(x.shape[:2] + (0,))
   now = x[order:]
-  return past, now, np.isfinite(past).all(-1) & np.isfinite(now).all(-1)
+  return Lagged(past, now, np.isfinite(past).all(-1) & np.isfinite(now).all(-1))
 
 
 def _conditional(x: np.ndarray, order: int, floor: np.ndarray) -> Conditional:
   """Least squares over all streams of x (T, S, C)."""
-  past, now, known = _design(x, order)
+  past, now, known = lagged(x, order)
   past, now = past[known], now[known]
   channels = now.shape[1]
   if len(now) < 2 * (past.shape[1] + 1) + channels:
@@ -182,17 +193,22 @@ def fit(nominal, faulty, order: int = 8) -> Parameters:
 
 
 def innovations(x, model: Conditional) -> np.ndarray:
-  """Whitened one-step errors (T - order, S, C) of streams x: independent standard normal where the model holds; nan where a lag is unknown."""
-  x = _streams(x, "x")
-  past, now, known = _design(x, len(model.lags))
-  flat = np.swapaxes(model.lags, 1, 2).reshape(-1, x.shape[2])
+  """Whitened one-step errors (T - order, S, C) of streams x, or of `lagged` ones: independent standard normal where the model holds; nan where a lag
+  is unknown."""
+  past, now, known = lagged(x, len(model.lags))
+  flat = np.swapaxes(model.lags, 1, 2).reshape(-1, now.shape[2])
   return np.where(known[..., None], (now - model.intercept - past @ flat) @ model.whitener.T, np.nan)
+
+
+def log_density(x, model: Conditional) -> np.ndarray:
+  """ln p(x_t | past) of each step, but for a constant, (T - order, S); nan where a lag is unknown."""
+  return -0.5 * (np.sum(innovations(x, model) ** 2, -1) + model.log_det)
 
 
 def log_ratio(x, parameters: Parameters) -> np.ndarray:
   """ln p_after(x_t | past) - ln p_before(x_t | past) of each step, (T - order, S); nan where a lag is unknown."""
-  term = lambda m: -0.5 * (np.sum(innovations(x, m) ** 2, -1) + m.log_det)
-  return term(parameters.after) - term(parameters.before)
+  x = lagged(x, len(parameters.after.lags))
+  return log_density(x, parameters.after) - log_density(x, parameters.before)
 
 
 def information(nominal, faulty, order: int = 8, reps: int = REPS) -> dict:
