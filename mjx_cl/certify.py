@@ -164,22 +164,23 @@ def write(folder, rows: list[dict]) -> None:
 
 
 def table(rows: list[dict]) -> str:
-  """The certificates for a reader: one line per robot, fault and target, its greatest severity."""
+  """The certificates for a reader: one line per robot, fault and target, its greatest severity; backends apart."""
   number = lambda x, form: "" if x is None else format(x, form)
   out = ["# Certificates: every fault acts", "",
          "Made by `mjx-cl certify`; all severities are in certificates.parquet. Each line is a fault at severity 1 (a preset: its own). `first` is the first control",
          "step from the onset whose outcome differs under the same commands, `after 1, 10, 100` the difference so many steps on (root mean square over the",
          "channels, in typical deviations). `return lost`: mean over episodes of the shipped agent, which does not adapt, with its 95 % bootstrap interval over",
          "episodes. `KL`: normal fits to ln OPR, ln RPR against the nominal robot's, nats per step.", ""]
-  for robot in dict.fromkeys(r["robot"] for r in rows):
-    mine = [r for r in rows if r["robot"] == robot and r["fault"] != "none" and r["severity"] > 0]
+  for robot, physics in dict.fromkeys((r["robot"], r["physics"]) for r in rows):
+    mine = [r for r in rows if (r["robot"], r["physics"]) == (robot, physics) and r["fault"] != "none" and r["severity"] > 0]
     top = {}
     for r in mine:
       key = (r["fault"], r["target"])
       if key not in top or r["severity"] > top[key]["severity"]:
         top[key] = r
     agent = next((r for r in mine if r["episodes"]), None)
-    out += [f"## {robot}", "", "No agent is shipped for it, so no return is given." if agent is None else
+    several = len({r["physics"] for r in rows if r["robot"] == robot}) > 1
+    out += [f"## {robot}" + (f", physics {physics}" if several else ""), "", "No agent is shipped for it, so no return is given." if agent is None else
             f"Nominal return {agent['return_nominal']:.0f} over {agent['episodes']} episodes of agent `{agent['agent']}`.", "",
             "| family | fault | target | severity | first | after 1 | 10 | 100 | return lost | KL |", "|---|---|---|---|---|---|---|---|---|---|"]
     for r in top.values():

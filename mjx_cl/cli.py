@@ -731,7 +731,7 @@ def do_leaderboard(args: Leaderboard) -> None:
   held = streams.StreamSet(args.streams)
   robots = held.choose(args.robot)
   if args.export:
-    files = submissions.export(held, args.export, robots)
+    files = submissions.export(held, args.export, robots, args.overwrite)
     emit(files) if args.json else print("\n".join(files))
     return
   if os.path.exists(args.out) and not os.path.isdir(args.out):
@@ -855,8 +855,21 @@ def detect_table(rows: list[dict], columns: bool):
   return table
 
 
+def plain(x):
+  """A database's value as JSON has it: decimals are numbers, what is not finite is null, keys of a map and whatever else there is are text."""
+  import decimal
+  if isinstance(x, dict):
+    return {str(k): plain(v) for k, v in x.items()}
+  if isinstance(x, (list, tuple)):
+    return [plain(v) for v in x]
+  if isinstance(x, decimal.Decimal):
+    x = float(x)
+  if isinstance(x, float):
+    return x if math.isfinite(x) else None
+  return x if x is None or isinstance(x, (bool, int, str)) else str(x)
+
+
 def do_query(args: Query) -> None:
-  import math
   from mjx_cl import store
   *folder, sql = args.words or (None,)
   if sql is not None and not folder and os.path.isdir(sql):
@@ -869,7 +882,7 @@ def do_query(args: Query) -> None:
   if args.json:
     for k, name in enumerate(names):  # two columns of one name would be one in JSON
       names[k] = name if name not in names[:k] else f"{name}_{k}"
-    emit(json.loads(json.dumps([{n: None if isinstance(x, float) and not math.isfinite(x) else x for n, x in zip(names, r)} for r in rows], default=str)))
+    emit([{n: plain(x) for n, x in zip(names, r)} for r in rows])
     return
   from rich.table import Table
   from rich.text import Text

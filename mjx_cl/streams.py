@@ -64,6 +64,11 @@ class Suite:
     def need(holds, text):
       if not holds:
         raise UserError(f"suite {self.name!r}: {text}")
+    whole = {"count_from": [self.count_from], "onset": list(self.onset), **{f"[seeds] {k}": list(v) for k, v in self.seeds.items()},
+             **{f"[nominal] {k}": [v] for k, v in self.nominal.items()}, **{"[latents] nominal": [v] for k, v in self.latents.items() if k == "nominal"}}
+    for name, values in whole.items():
+      need(all(type(v) is int for v in values), f"{name} must be made of whole numbers; got {', '.join(map(str, values))}")
+    need(all(len(v) == 2 for v in self.seeds.values()), "[seeds] are [first, last]")
     need(self.arl0 > 0 and self.horizon_s > 0, "arl0 and horizon_s must be above 0")
     need(len(self.onset) == 2 and 0 <= self.count_from <= self.onset[0] < self.onset[1], "onset must be [low, high] with count_from <= low < high")
     for table, keys in (("seeds", {"score", "tune"}), ("nominal", {"steps", "score", "tune"}), ("latents", {"nominal", "after_s"})):

@@ -174,9 +174,18 @@ def _least(alarms: Callable[[float], int], target: float, what: str) -> float:
   return high
 
 
-def export(streams: StreamSet, folder, robots=()) -> list[str]:
-  """Every stream that a submission needs, in full, as ROBOT.parquet with its past joined: for tools that know nothing of this package."""
+def export(streams: StreamSet, folder, robots=(), overwrite: bool = False) -> list[str]:
+  """Every stream that a submission needs, in full, as ROBOT.parquet with its past joined: for tools that know nothing of this package.
+
+  Raises:
+    UserError where `folder` is a recorded set, whose files have these names, or holds one of the files already.
+  """
   folder = pathlib.Path(folder)
+  if (folder / "config.json").exists():
+    raise UserError(f"{folder} is the folder of a recording or a run; give --export another one")
+  there = [robot for robot in streams.choose(robots) if (folder / f"{robot}.parquet").exists()]
+  if there and not overwrite:
+    raise UserError(f"{folder} holds {there[0]}.parquet already; give --overwrite to replace it, or --export another folder")
   folder.mkdir(parents=True, exist_ok=True)
   written = []
   for robot in streams.choose(robots):

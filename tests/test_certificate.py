@@ -162,6 +162,9 @@ def test_files_keep_the_rows_of_other_robots(tmp_path, short):
   assert "## car" in text and "## other" in text and "| sensor | noise | lidar | 1 |" in text
   assert all(row["holds"] for row in certify.summary(rows) if row["goal"])
   json.dumps(certify.summary(rows))
+  both = certify.table([r | {"kl_nats": 1.0} for r in rows] + [r | {"physics": "mjx", "kl_nats": 7.0} for r in rows])
+  one, other = both.split("## car, physics ")[1:]
+  assert one.startswith("jax") and "| 1 |\n" in one and other.startswith("mjx") and "| 7 |\n" in other
 
 
 def test_what_is_in_the_way_is_said_before_anything_is_measured(tmp_path):

@@ -109,6 +109,9 @@ def test_query(mjx, refused, tmp_path):
   assert (code, err) == (0, "") and json.loads(out) == [{"seed": 0, "x": 0.5}, {"seed": 1, "x": None}]
   code, out, err = mjx("query", tmp_path, "select count(*) as n from runs")
   assert (code, err) == (0, "") and "n" in out and "2" in out
+  sql = "select 0.5 * count(*) as half, list(x order by seed) as xs, {'a': 'nan'::double} as s, map {date '2026-01-02': [1.0 / 0]} as m, histogram(seed * 1.5) as h from runs"
+  code, out, err = mjx("query", tmp_path, sql, "--json")
+  assert (code, err) == (0, "") and json.loads(out) == [{"half": 1.0, "xs": [0.5, None], "s": {"a": None}, "m": {"2026-01-02": [None]}, "h": {"0.0": 1, "1.5": 1}}]
   assert "runs" in refused(2, "query", tmp_path, "select y from runs")
   assert "no .parquet" in refused(2, "query", tmp_path / "none", "select 1")
 

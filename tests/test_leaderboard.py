@@ -1,6 +1,7 @@
 """Recorded streams and the leaderboard on a synthetic set: exact joins, thresholds at the asked rate, submissions, the same numbers whatever is added."""
 import dataclasses
 import json
+import pathlib
 
 import jax
 import jax.numpy as jnp
@@ -425,6 +426,13 @@ def test_export_is_whole_streams(small, tmp_path):
   own = table["stream"] == n
   np.testing.assert_array_equal(table["opr"][own], held.get("walker", [n]).residual.opr[:, 0])
   assert set(table) == {"stream", "step", "episode", "terminated"} | set(streams.COLUMNS)
+  before = pathlib.Path(file).stat().st_mtime_ns
+  with pytest.raises(UserError, match="holds walker.parquet already; give --overwrite"):
+    submissions.export(held, tmp_path)
+  assert pathlib.Path(file).stat().st_mtime_ns == before and submissions.export(held, tmp_path, overwrite=True) == [file]
+  (tmp_path / "config.json").write_text("{}")  # as a recorded set has it, whose files have these names
+  with pytest.raises(UserError, match="folder of a recording"):
+    submissions.export(held, tmp_path, overwrite=True)
 
 
 def test_files(small, board, tmp_path):

@@ -300,6 +300,15 @@ def suite(levels, robots=("walker", "car"), faults=4, spread=40, seed=0):
   return rows
 
 
+def test_a_reference_takes_no_rank_and_makes_none():
+  rivals = suite({"slow": 200, "quick": 5, "middle": 100})
+  told = [r | {"reference": True} for r in suite({"oracle": 0})]
+  told[0]["cost_standard"] = None  # nor does a fault without it cost the others their ranks
+  want, got = metrics.overall(rivals), metrics.overall([r | {"reference": False} for r in rivals] + told)
+  ranks = lambda o: {r["detector"]: r["mean_rank"] for r in o.rows}
+  assert ranks(got) == ranks(want) | {"oracle": None} and got[1:] == want[1:] and want.critical_difference
+
+
 def test_overall_means_ranks_and_order():
   rows = suite({"slow": 200, "quick": 5, "middle": 100})
   got = metrics.overall(rows)

@@ -90,6 +90,15 @@ robots.car = {score = {friction = [0.5]}, tune = {wind = [1.0]}}
 """
 
 
+@pytest.mark.parametrize("good, bad", [("count_from = 50", "count_from = 5e1"), ("[100, 120]", "[100.0, 120]"), ("tune = [100, 101]", "tune = [100, 101.0]"),
+                                       ("steps = 128", "steps = 1.28e2"), ("{nominal = 1,", "{nominal = true,")])
+def test_counts_of_a_suite_are_whole_numbers(tmp_path, good, bad):
+  """TOML's 5e1 is a float, which indexes nothing: said before hours of recording."""
+  (tmp_path / "two.toml").write_text(TWO.replace(good, bad))
+  with pytest.raises(UserError, match="whole numbers; got .*[.T]"):
+    streams.suite(str(tmp_path / "two.toml"))
+
+
 @pytest.fixture
 def two(tmp_path, monkeypatch):
   """record(name, robots, seed): bytes of the tables and config.json of the set in tmp_path / name, of a suite of two robots, lives made up from the seed."""

@@ -74,6 +74,7 @@ def test_where_nobody_recovers_and_where_all_do():
   curve = survival.kaplan_meier([5, 7], [False, False])
   assert len(curve.time) == 0 and curve.last == 7 and survival.quantile(curve) == (None, [None, None])
   assert survival.restricted_mean([5, 7], [False, False], 6) == (6.0, None)
+  assert survival.restricted_mean([5, 5, 5], [True] * 3, 10) == (5.0, None)  # all at once: Greenwood's only term is undefined
   assert survival.restricted_mean([5, 7], [False, False], 8) == (None, None)  # nobody was watched for so long
   assert survival.restricted_mean([5, 7], [True, True], 8)[0] == 6.0
   assert survival.restricted_mean([5, 7, 9], [True, True, False], 9)[0] == pytest.approx(5 + 2 * 2 / 3 + 2 / 3)

@@ -73,6 +73,7 @@ def widen(model: Model, name: str, share, wheels: tuple[int, ...]) -> Model:
 
     acceleration, grip, mass: x (real / simulator)^share             mass: of every body; grip: friction of the wheels
     the others:               x + share (real - simulator)           yaw_inertia: all of it in the chassis
+  Masses scale the wheels' part of the yaw inertia too: with the whole gap it is 0.0569 kg m2, 1.9 % below the real one.
 
   Share 0 leaves every bit. A fault of the same item is this function of its severity; constants that follow from masses are the backend's business.
 

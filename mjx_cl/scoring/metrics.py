@@ -231,7 +231,7 @@ def overall(rows: list[dict], reps: int = REPS) -> Overall:
   """Means of each detector over all of its robots x faults x severities, equal weight for each, and ranks.
 
     mean rank: rank by cost_standard within a block, 1 = best, ties share; critical difference = q sqrt(k (k + 1) / (6 n)), q = studentised
-    range / sqrt(2), k detectors, n blocks
+    range / sqrt(2), k detectors, n blocks; what a row calls a reference takes no rank and makes none
 
   Intervals: bootstrap over seeds, stratified by robot. The faults of one robot share their seeds' healthy streams, so a seed is drawn with all of
   its faults; a share of 0 or 1 and a rate of 0 have Wilson's and Poisson's over the seeds of all robots. They say how far another set of seeds would
@@ -239,7 +239,7 @@ def overall(rows: list[dict], reps: int = REPS) -> Overall:
   somewhat too small.
 
   Args:
-    rows: of `row`, with detector, robot, fault, severity.
+    rows: of `row`, with detector, robot, fault, severity, and perhaps reference.
   Returns:
     Overall; each row has detector, blocks, and for every mean over streams its value and its _ci, None where any of its rows has none; mean_rank.
   Reference: Demsar 2006, Journal of Machine Learning Research 7, 1-30.
@@ -251,12 +251,14 @@ def overall(rows: list[dict], reps: int = REPS) -> Overall:
       raise UserError(f"two rows of detector {r['detector']!r} on {block}")
     table[r["detector"]][block] = r
   out = [{"detector": name, "blocks": len(mine)} | _means(list(mine.values()), reps) for name, mine in table.items()]
-  shared = [b for b in (next(iter(table.values())) if table else ()) if all(b in t and t[b]["cost_standard"] is not None for t in table.values())]
-  ranks = np.array([_ranks([-t[b]["cost_standard"] for t in table.values()]) for b in shared])
-  for r, rank in zip(out, ranks.mean(0) if len(shared) else [None] * len(out)):
-    r["mean_rank"] = bootstrap.finite(rank)
+  rivals = {name: t for name, t in table.items() if not any(r.get("reference") for r in t.values())}
+  shared = [b for b in (next(iter(rivals.values())) if rivals else ()) if all(b in t and t[b]["cost_standard"] is not None for t in rivals.values())]
+  ranks = np.array([_ranks([-t[b]["cost_standard"] for t in rivals.values()]) for b in shared])
+  mean = dict(zip(rivals, ranks.mean(0))) if len(shared) else {}
+  for r in out:
+    r["mean_rank"] = bootstrap.finite(mean.get(r["detector"]))
   out.sort(key=lambda r: -np.inf if r["cost_standard"] is None else r["cost_standard"], reverse=True)
-  n, k = len(shared), len(table)
+  n, k = len(shared), len(rivals)
   if n < 2 or k < 2:
     return Overall(out, None, None, n)
   spread = (ranks - (k + 1) / 2).sum(0)

@@ -105,7 +105,7 @@ def restricted_mean(time, seen, horizon: float) -> tuple[float | None, list[floa
   live = left_risk > events  # where nobody is left, A_i is 0
   variance = float(np.sum(left[live] ** 2 * events[live] / (left_risk[live] * (left_risk[live] - events[live]))))
   mean, half = float(areas.sum()), Z * math.sqrt(variance)
-  return mean, [max(0.0, mean - half), min(float(horizon), mean + half)] if len(at) else None
+  return mean, [max(0.0, mean - half), min(float(horizon), mean + half)] if live.any() else None
 
 
 def paired_difference(a, b, horizon: float, reps: int = bootstrap.REPS, seed: int = 0) -> tuple[float | None, list[float | None] | None]:
