@@ -113,7 +113,9 @@ class Train:
   """Seconds between checkpoints."""
   json: bool = False
   resume: bool = False
+  """Go on with a training that was cut off, with the settings it began with; `updates` may be others."""
   overwrite: bool = False
+  """Replace an earlier training in --out, its agent and its demonstrator too."""
 
 
 @dataclass(frozen=True)
@@ -177,7 +179,7 @@ class Leaderboard:
   out: str = "runs/leaderboard"
   """Result folder."""
   overwrite: bool = False
-  """Replace an earlier board in --out."""
+  """Replace an earlier board in --out, or files that --export left."""
   robot: tuple[str, ...] = ()
   """Only these robots of the set."""
   detector: tuple[str, ...] = ()
@@ -592,14 +594,18 @@ def do_train(args: Train) -> None:
   train.faults_of(env, train_config)
   train.check(env, dreamer, train_config, args.agent)
   state = store.claim_folder(args.out, args.resume, args.overwrite, done_marker="agent/card.json")
+  if state != "new":
+    updates = train.check_same(args.out, env, dreamer, train_config, args.seed, args.seeds, args.demonstrator, args.agent)
   if state == "done":
+    if updates != train_config.updates:
+      raise UserError(f"{args.out}: this training has finished its {updates:,} updates; go on with --agent {pathlib.Path(args.out, 'agent')} and another --out")
     say(f"{args.out}: this training is finished")
     return
   if state == "new" and args.overwrite:
     out = pathlib.Path(args.out)
     for name, given in (("agent", args.agent), ("demonstrator", args.demonstrator)):
-      if given and out.resolve() in pathlib.Path(given).resolve().parents:
-        raise UserError(f"--overwrite removes {out}, which --{name} {given} lies in; give another --out")
+      if given and any(pathlib.Path(given).resolve().is_relative_to((out / own).resolve()) for own in ("agent", "agents", "demonstrator", "checkpoints", "work")):
+        raise UserError(f"--overwrite removes --{name} {given} with {out}; give another --out")
     run.clear(out)
     train.clear(out)
   command = "mjx-cl " + " ".join(sys.argv[1:]) if len(sys.argv) > 1 else "mjx-cl train"

@@ -250,6 +250,8 @@ class AdaptConfig:
       raise UserError(f"warmup must be 0 or above; got {self.warmup}")
     if self.patience < 4:
       raise UserError(f"patience must be at least 4 chunks; got {self.patience}")
+    if self.last_starts is not None and (self.last_starts < 0 or self.last_starts == 1):
+      raise UserError(f"last_starts must be 0 (all), or 2 or more; got {self.last_starts}")
     if self.period_steps >= self.period:
       raise UserError(f"period_steps must be below period={self.period}; got {self.period_steps}")
     positive(self, *(name for name in ("lr", "policy_lr", "batch") if getattr(self, name) is not None))

@@ -221,7 +221,7 @@ def leaderboard(results: pathlib.Path) -> str:
       {joined([f"`{name}` {number(x)} ({robot})" for robot, (x, name) in best.items()])}. `{first}` lies {number(ahead, 1)} {span(interval, 1)} above
       `{second}` (paired, intervals over seeds; it says nothing of other faults). Mean ranks closer than {number(meta['critical_difference'], 1)} are not
       told apart (Nemenyi; references take no rank). `mjx-cl leaderboard` ({len(overall)} detectors;
-      {number(meta['stream_steps'] / 1e6, 1)} million stream-steps, {number(minutes, 1)} minutes on {meta["machine"]["cores"]} shared core{'s' if meta['machine']['cores'] > 1 else ''}; goal 3
+      {number(meta['stream_steps'] / 1e6, 1)} million stream-steps, {number(minutes, 1)} minutes on {meta["machine"]["cores"]} core{'s' if meta['machine']['cores'] > 1 else ''}; goal 3
       minutes{', missed' if minutes > 3 else ''}). The page: [results/leaderboard.html](results/leaderboard.html), one file, sortable, a page per
       fault.""")
   score = {r["detector"]: r["cost_standard"] for r in overall}

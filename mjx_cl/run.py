@@ -96,7 +96,7 @@ class Runner:
     robot = known_as(self.env)
     found = threshold_of(config)
     settings = config.settings | ({"threshold": found.value} if found else {})
-    detector = detectors.make(config.detector, robot=robot, **settings)
+    detector = detectors.make(config.detector, **({"robot": robot} | settings))
     monitor = Monitor(agent, n=15, form=config.form, actions=config.actions, spec=spec)
     if self.other is None:
       self.rollout = Rollout(self.env, agent, self.faults, self.repeat, config.deterministic)
@@ -196,7 +196,7 @@ class Runner:
     return jnp.where(streams.after.enter[:, 0] < now, jnp.float32(self.other.spec.acceptance), jnp.float32(self.env.spec.acceptance))
 
   def _choices(self, streams) -> Choices:
-    """The arms, with every true onset of their robots that is known by now."""
+    """The arms, with every true onset of their robots that is known by now; arms that are told one begin there even where the fault's severity is 0."""
     c = self.config
     onsets = tuple(c.onset + change.after for change in self.changes if change.fault != "none")
     moves = [()] * self.groups if self.other is None else [(int(step),) for step in np.asarray(streams.after.enter)[:, 0]]

@@ -408,22 +408,19 @@ def build(env, dreamer: DreamerConfig, config: TrainConfig, out, seed: int, seed
   """A Trainer with its folder and config.json; trains the demonstrator first where `demonstrator_name` is `ppo`."""
   from mjx_cl import agents, store
   out = pathlib.Path(out)
+  config = shown(config, out, demonstrator_name)
   if demonstrator_name == "ppo":
-    path = out / "demonstrator" / "policy.npz"
+    path = pathlib.Path(config.demonstrator)
     if not path.exists():
       demonstrator.train(env, out / "demonstrator", getattr(env, "demonstration", {}).get("steps", DEMONSTRATOR_STEPS), seed, progress=lambda row: print(
           f"demonstrator: {row['step']:,} steps, return {row['return']:.0f}", file=sys.stderr, flush=True))
       os.replace(sorted((out / "demonstrator").glob("policy_*.npz"))[-1], path)
-    config = dataclasses.replace(config, demonstrator=str(path))
-  elif demonstrator_name:
-    config = dataclasses.replace(config, demonstrator=demonstrator_name)
   dreamer = scaled(env, dreamer)
   trainer = Trainer(env, dreamer, config, out, seed, seeds)
   trainer.about = {"env": env.spec.name, "preset": preset, "command": command, "seed": seed, "repeat": config.repeat,
                    "dreamer": dataclasses.asdict(dreamer), "train": dataclasses.asdict(config), "started_from": agent_name}
   values = {"command": "train", "seeds": seeds, **trainer.about, **store.provenance()}
   if resume:
-    check_same(out, values)
     trainer.resume()
     store.write_json(out / "config.json", values)  # `updates` may have grown
   else:
@@ -436,26 +433,36 @@ def build(env, dreamer: DreamerConfig, config: TrainConfig, out, seed: int, seed
   return trainer
 
 
-def check_same(out: pathlib.Path, values: dict) -> None:
-  """Refuses to resume a training with other settings than it began with; the number of updates may be another.
+def shown(config: TrainConfig, out, demonstrator_name: str | None) -> TrainConfig:
+  """The settings with their demonstrator: the policy that `ppo` leaves in the folder, or what the user named."""
+  if not demonstrator_name:
+    return config
+  own = pathlib.Path(out, "demonstrator", "policy.npz")
+  return dataclasses.replace(config, demonstrator=str(own) if demonstrator_name == "ppo" else demonstrator_name)
+
+
+def check_same(out, env, dreamer: DreamerConfig, config: TrainConfig, seed: int, seeds: int, demonstrator_name: str | None, agent_name: str | None) -> int:
+  """Refuses to resume a training with other settings than it began with; the number of updates may be another. Returns the one it has.
 
   Raises:
-    UserError that names them; FileError where config.json is not a training's.
+    UserError that names the flags; FileError where config.json is not a training's.
   """
+  path = pathlib.Path(out, "config.json")
+  place = lambda name: str(pathlib.Path(name).resolve()) if name and pathlib.Path(name).exists() else name  # the same file may be named in another way
+  flat = lambda about, settings, agent: {**about, **settings, "demonstrator": place(settings["demonstrator"]), "agent": place(agent)}
+  now = flat({"env": env.spec.name, "seed": seed, "seeds": seeds}, json.loads(json.dumps(dataclasses.asdict(scaled(env, dreamer)) | dataclasses.asdict(
+      shown(config, out, demonstrator_name)))), agent_name)
   try:
-    old = json.loads((out / "config.json").read_text())
-    defaults = {"dreamer": DreamerConfig(), "train": TrainConfig()}  # of a setting that did not exist when the training began
-    flat = lambda v: {"env": v["env"], "seed": v["seed"], "seeds": v.get("seeds", values["seeds"]), "started_from": v["started_from"],
-                      **{k: x for part in ("dreamer", "train") for k, x in (dataclasses.asdict(defaults[part]) | v[part]).items()}}
-    before, now = flat(old), flat(json.loads(json.dumps(values)))
-    for v in (before, now):  # the folder may be named in another way
-      v["demonstrator"] = v["demonstrator"] and pathlib.Path(v["demonstrator"]).name
+    old = json.loads(path.read_text())
+    settings = dataclasses.asdict(DreamerConfig()) | dataclasses.asdict(TrainConfig()) | old["dreamer"] | old["train"]  # of a setting younger than the training
+    before = flat({"env": old["env"], "seed": old["seed"], "seeds": old.get("seeds", seeds)}, settings, old.get("started_from"))
   except (OSError, ValueError, KeyError, TypeError):
-    raise FileError(f"{out / 'config.json'} is not a training's; give --overwrite or another --out") from None
-  changed = [k for k in now if k != "updates" and json.dumps(before.get(k)) != json.dumps(now[k])]
+    raise FileError(f"{path} is not a training's; give --overwrite or another --out") from None
+  changed = [k for k in now if k != "updates" and before.get(k) != now[k]]
   if changed:
     raise UserError(f"--resume: {out} was begun with another {', '.join(changed)}; give the same settings, --overwrite, or another --out with "
-                    f"--agent {out / 'agent'} once it has ended")
+                    f"--agent {pathlib.Path(out, 'agent')} once it has ended")
+  return int(before["updates"])
 
 
 def clear(out: pathlib.Path) -> None:

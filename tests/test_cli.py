@@ -159,6 +159,8 @@ OTHER = {
     "train: a fraction for a count": (["train", "walker", "--set", "envs=2.5"], ["envs takes int", "2.5"]),
     "train: rises for ever": (["train", "walker", "--set", "lr_end=-1"], ["lr_end", "-1"]),
     "train: never an update": (["train", "walker", "--preset", "tiny", "--set", "capacity=16"], ["capacity=16", "capacity=128 would"]),
+    "detector setting of another kind": (["run", "walker", "--detector", "multichart", "--set", "charts=5"], ["charts", "commas", "5"]),
+    "adapting without a state behind": (["run", "walker", "--adapt.last-starts", "1"], ["last_starts", "2 or more"]),
     "train: no state behind": (["train", "walker", "--set", "last_starts=1"], ["last_starts", "2..length"]),
     "train: an agent that sees otherwise": (["train", "quadruped", "--agent", "quadruped"], ["obs_scale spec", "--set obs_scale=spec"]),
     "train: an agent of another size": (["train", "walker", "--preset", "tiny", "--agent", "walker"], ["size size1m", "tiny"]),

@@ -503,7 +503,7 @@ def test_the_units_of_multichart_are_the_robots():
   np.testing.assert_allclose(score("walker") / score("car"), known["car"]["cusum@surprise"]["threshold"] / known["walker"]["cusum@surprise"]["threshold"], rtol=1e-5)
 
 
-@pytest.mark.parametrize("charts, word", [("cusum@surprise,nobody", "'nobody'"), ("mewma,mewma", "twice"), ("", "choose from"), ("multichart", "choose from")])
+@pytest.mark.parametrize("charts, word", [("cusum@surprise,nobody", "'nobody'"), ("mewma,mewma", "twice"), ("", "choose from"), ("multichart", "choose from"), (5, "commas")])
 def test_charts_that_are_none_are_refused(charts, word):
   with pytest.raises(UserError, match=word):
     detectors.make("multichart", charts=charts)

@@ -162,6 +162,12 @@ def test_overwrite_of_the_folder_that_the_agent_lies_in_is_refused(begun, capsys
   assert "another --out" in capsys.readouterr().err and (out / "agent/agent.npz").exists() and (out / "config.json").read_text() == config
 
 
+def test_a_shipped_agent_does_not_lie_in_the_folder_of_the_command(begun, monkeypatch, capsys):
+  argv, out = begun
+  monkeypatch.chdir(out)
+  assert cli.main([*argv[:-1], ".", "--overwrite", "--agent", "walker", "--set", "size=size1m", "bins=255"]) == 130, capsys.readouterr().err
+
+
 def test_a_training_is_resumed_with_its_own_settings(begun, capsys):
   argv, out = begun
   before = (out / "config.json").read_text()
@@ -170,6 +176,13 @@ def test_a_training_is_resumed_with_its_own_settings(begun, capsys):
   assert "another seed, lr, repeat;" in said and (out / "config.json").read_text() == before
   assert cli.main([*argv, "--resume", "--set", "updates=300"]) == 130  # more of the same
   assert json.loads((out / "config.json").read_text())["train"]["updates"] == 300
+  assert cli.main([*argv, "--resume", "--seeds", "2"]) == 2 and "another seeds;" in capsys.readouterr().err
+  ratio = json.loads((out / "config.json").read_text())["train"]["ratio"]
+  assert cli.main([*argv, "--resume", "--set", f"ratio={ratio:g}", "updates=300"]) == 130  # 16 is 16.0
+  (out / "agent").mkdir()
+  (out / "agent/card.json").write_text("{}")
+  assert cli.main([*argv, "--resume", "--set", "updates=300"]) == 0 and "is finished" in capsys.readouterr().err
+  assert cli.main([*argv, "--resume", "--set", "updates=400"]) == 2 and "finished its 300 updates; go on with --agent" in capsys.readouterr().err
   (out / "config.json").write_text('{"command": "run"}')
   assert cli.main([*argv, "--resume"]) == 1 and "not a training's" in capsys.readouterr().err
 

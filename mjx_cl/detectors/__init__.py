@@ -176,7 +176,7 @@ def make(name: str, channel: str | None = None, log: bool | None = None, whiten:
     build = _pure(name, build)
   if name == "rolling_sigma":
     settings = (one_threshold(robot) if shared else CALIBRATED.get(robot, {})) | settings
-  elif "robot" in inspect.signature(build).parameters:
+  elif robot is not None and "robot" in inspect.signature(build).parameters:
     settings = {"robot": robot} | settings
   try:
     if getattr(build, "takes", "residual") != "scalar":

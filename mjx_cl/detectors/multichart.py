@@ -34,6 +34,8 @@ def multichart(threshold: float = 1.0, charts: str = CHARTS, robot: str | None =
   from mjx_cl import detectors  # the table that names the charts holds this detector too
   demand("multichart", threshold=(threshold, above(threshold, 0), "above 0"))
   known = detectors.board().get(robot) or detectors.board()["walker"]
+  if not isinstance(charts, str):
+    raise UserError(f"detector 'multichart': charts are names, joined by commas; got {charts!r}")
   names = [name.strip() for name in charts.split(",")]
   for name in names:
     if name not in known or known[name]["settings"]["use"] == "multichart":
