@@ -448,8 +448,7 @@ def check_same(out, env, dreamer: DreamerConfig, config: TrainConfig, seed: int,
     UserError that names the flags; FileError where config.json is not a training's.
   """
   path = pathlib.Path(out, "config.json")
-  place = lambda name: str(pathlib.Path(name).resolve()) if name and pathlib.Path(name).exists() else name  # the same file may be named in another way
-  flat = lambda about, settings, agent: {**about, **settings, "demonstrator": place(settings["demonstrator"]), "agent": place(agent)}
+  flat = lambda about, settings, agent: {**about, **settings, "agent": agent}
   now = flat({"env": env.spec.name, "seed": seed, "seeds": seeds}, json.loads(json.dumps(dataclasses.asdict(scaled(env, dreamer)) | dataclasses.asdict(
       shown(config, out, demonstrator_name)))), agent_name)
   try:
@@ -458,6 +457,10 @@ def check_same(out, env, dreamer: DreamerConfig, config: TrainConfig, seed: int,
     before = flat({"env": old["env"], "seed": old["seed"], "seeds": old.get("seeds", seeds)}, settings, old.get("started_from"))
   except (OSError, ValueError, KeyError, TypeError):
     raise FileError(f"{path} is not a training's; give --overwrite or another --out") from None
+  for key in ("demonstrator", "agent"):  # one file may be named in two ways, and a folder may have moved
+    names = [pathlib.Path(v[key]) for v in (before, now) if v[key]]
+    if len(names) == 2 and (names[0].resolve() == names[1].resolve() if all(n.exists() for n in names) else names[0].name == names[1].name):
+      before[key] = now[key]
   changed = [k for k in now if k != "updates" and before.get(k) != now[k]]
   if changed:
     raise UserError(f"--resume: {out} was begun with another {', '.join(changed)}; give the same settings, --overwrite, or another --out with "

@@ -1,5 +1,6 @@
 """Pretraining: exact resume, the train ratio, phases with a demonstrator, checkpoints that survive kills and refuse damage."""
 import copy
+import dataclasses
 import json
 import os
 import pathlib
@@ -166,6 +167,27 @@ def test_a_shipped_agent_does_not_lie_in_the_folder_of_the_command(begun, monkey
   argv, out = begun
   monkeypatch.chdir(out)
   assert cli.main([*argv[:-1], ".", "--overwrite", "--agent", "walker", "--set", "size=size1m", "bins=255"]) == 130, capsys.readouterr().err
+
+
+def test_the_demonstrator_of_a_resumed_training_may_be_named_in_another_way(tmp_path, monkeypatch):
+  """As a relative path, from another folder, and where its folder has moved; another file of the same name is another."""
+  env, dreamer = envs.make("walker"), PRESETS["tiny"].dreamer
+  config = PRESETS["tiny"].train
+  for name in ("a", "b"):
+    (tmp_path / name).mkdir()
+    (tmp_path / name / "policy.npz").write_text("")
+  begun = dataclasses.replace(config, demonstrator=str(tmp_path / "a/policy.npz"))
+  (tmp_path / "config.json").write_text(json.dumps({"env": "walker", "seed": 0, "seeds": 1, "started_from": None, "dreamer": dataclasses.asdict(dreamer),
+                                                    "train": dataclasses.asdict(begun)}))
+  same = lambda name: train.check_same(tmp_path, env, dreamer, config, 0, 1, name, None)
+  monkeypatch.chdir(tmp_path / "b")
+  assert same("../a/policy.npz") == same("elsewhere/policy.npz") == config.updates
+  for name in ("policy.npz", None, "elsewhere/other.npz", "reference", "ppo"):
+    if name == "ppo":  # its policy would lie in the training's own folder
+      (tmp_path / "demonstrator").mkdir()
+      (tmp_path / "demonstrator/policy.npz").write_text("")
+    with pytest.raises(UserError, match="another demonstrator;"):
+      same(name)
 
 
 def test_a_training_is_resumed_with_its_own_settings(begun, capsys):
