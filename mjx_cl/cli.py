@@ -592,6 +592,7 @@ def do_train(args: Train) -> None:
   if args.demonstrator not in (None, "ppo"):  # whatever can be refused is refused before an earlier training is touched
     train.expert(env, args.demonstrator)
   train.faults_of(env, train_config)
+  train.shown(train_config, args.out, args.demonstrator)
   train.check(env, dreamer, train_config, args.agent)
   state = store.claim_folder(args.out, args.resume, args.overwrite, done_marker="agent/card.json")
   if state != "new":

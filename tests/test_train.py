@@ -163,6 +163,13 @@ def test_overwrite_of_the_folder_that_the_agent_lies_in_is_refused(begun, capsys
   assert "another --out" in capsys.readouterr().err and (out / "agent/agent.npz").exists() and (out / "config.json").read_text() == config
 
 
+def test_what_a_demonstrator_asks_for_is_said_before_an_earlier_training_is_gone(begun, capsys):
+  argv, out = begun
+  before = (out / "config.json").read_text()
+  assert cli.main([*argv, "--overwrite", "--demonstrator", "ppo", "--set", "clone=1000"]) == 2
+  assert "exceeds updates" in capsys.readouterr().err and (out / "config.json").read_text() == before
+
+
 def test_a_shipped_agent_does_not_lie_in_the_folder_of_the_command(begun, monkeypatch, capsys):
   argv, out = begun
   monkeypatch.chdir(out)
@@ -172,7 +179,7 @@ def test_a_shipped_agent_does_not_lie_in_the_folder_of_the_command(begun, monkey
 def test_the_demonstrator_of_a_resumed_training_may_be_named_in_another_way(tmp_path, monkeypatch):
   """As a relative path, from another folder, and where its folder has moved; another file of the same name is another."""
   env, dreamer = envs.make("walker"), PRESETS["tiny"].dreamer
-  config = PRESETS["tiny"].train
+  config = replace(PRESETS["tiny"].train, clone=10, fade=10, pure=10)
   for name in ("a", "b"):
     (tmp_path / name).mkdir()
     (tmp_path / name / "policy.npz").write_text("")
