@@ -330,7 +330,7 @@ def test_null_is_an_unknown_score_unless_nothing_sets_the_threshold(small, tmp_p
 def test_one_robot_of_several(tmp_path):
   make_set(tmp_path / "set", dataclasses.replace(SUITE, robots={r: SUITE.robots["walker"] for r in ("walker", "car")}), ("walker", "car"))
   held = streams.StreamSet(tmp_path / "set")
-  assert [submissions.export(held, tmp_path / "out", r) for r in ((), ("car",))] == [[str(tmp_path / "out" / f"{r}.parquet") for r in rs]
+  assert [submissions.export(held, tmp_path / "out", r, True) for r in ((), ("car",))] == [[str(tmp_path / "out" / f"{r}.parquet") for r in rs]
                                                                                       for rs in (("walker", "car"), ("car",))]
   own = np.isin(list(held.scored()), list(held.scored(("car",))))
   assert 0 < own.sum() < len(own)
