@@ -862,13 +862,13 @@ def detect_table(rows: list[dict], columns: bool):
   return table
 
 
-def plain(x):
+def json_value(x):
   """A database's value as JSON has it: decimals are numbers, what is not finite is null, keys of a map and whatever else there is are text."""
   import decimal
   if isinstance(x, dict):
-    return {str(k): plain(v) for k, v in x.items()}
+    return {str(k): json_value(v) for k, v in x.items()}
   if isinstance(x, (list, tuple)):
-    return [plain(v) for v in x]
+    return [json_value(v) for v in x]
   if isinstance(x, decimal.Decimal):
     x = float(x)
   if isinstance(x, float):
@@ -889,7 +889,7 @@ def do_query(args: Query) -> None:
   if args.json:
     for k, name in enumerate(names):  # two columns of one name would be one in JSON
       names[k] = name if name not in names[:k] else f"{name}_{k}"
-    emit([{n: plain(x) for n, x in zip(names, r)} for r in rows])
+    emit([{n: json_value(x) for n, x in zip(names, r)} for r in rows])
     return
   from rich.table import Table
   from rich.text import Text

@@ -65,7 +65,7 @@ class Suite:
       if not holds:
         raise UserError(f"suite {self.name!r}: {text}")
     whole = {"count_from": [self.count_from], "onset": list(self.onset), **{f"[seeds] {k}": list(v) for k, v in self.seeds.items()},
-             **{f"[nominal] {k}": [v] for k, v in self.nominal.items()}, **{"[latents] nominal": [v] for k, v in self.latents.items() if k == "nominal"}}
+             **{f"[nominal] {k}": [v] for k, v in self.nominal.items()}, "[latents] nominal": [self.latents.get("nominal", 0)]}
     for name, values in whole.items():
       need(all(type(v) is int for v in values), f"{name} must be made of whole numbers; got {', '.join(map(str, values))}")
     need(all(len(v) == 2 for v in self.seeds.values()), "[seeds] are [first, last]")

@@ -48,7 +48,7 @@ def distance(a: jax.Array, b: jax.Array) -> jax.Array:
   """size times the Kolmogorov-Smirnov distance of two samples of equal size, int32 ()."""
   both = jnp.concatenate([a, b])
 
-  def turn(ahead, pair):  # one sample of each at a time: 5 times as fast as the table of all pairs, which the compiler sums along its rows
+  def turn(ahead, pair):  # one sample of each at a time: the detector is 1.4 times as fast as with a table of all pairs, which the compiler sums along its rows
     return ahead + jnp.where(pair[0] <= both, 1, 0) - jnp.where(pair[1] <= both, 1, 0), None
   return jnp.max(jnp.abs(jax.lax.scan(turn, jnp.zeros(both.shape, jnp.int32), (a, b), unroll=4)[0]))
 
