@@ -31,6 +31,17 @@ def unpack(tree, like):
   return jax.tree.map(lambda x, l: jax.random.wrap_key_data(x) if _is_key(l) else l if _is_empty(l) else x, tree, like)
 
 
+def free(leaves: list, like: list) -> None:
+  """Unbinds arrays from their device, in place, where those of `like` are not bound to one.
+
+  Orbax binds all that it reads. To `jax.jit` a bound argument is another program than a free one: a run that goes on would compile anew what the
+  compile cache holds.
+  """
+  for i, model in enumerate(like):
+    if isinstance(leaves[i], jax.Array) and not getattr(model, "committed", False):
+      leaves[i] = jax.numpy.array(np.asarray(leaves[i]))
+
+
 class Checkpoints:
   """Numbered checkpoints of one run in FOLDER, each an array tree and a JSON dict."""
 
@@ -67,7 +78,10 @@ class Checkpoints:
     same = jax.tree.map(lambda a, b: a.shape == b.shape, out["tree"], packed)
     if not all(jax.tree.leaves(same)):
       raise FileError(f"checkpoint {number} in {self.folder} belongs to another size or robot")
-    return unpack(out["tree"], like), out["meta"]
+    (leaves, structure), meta = jax.tree.flatten(out["tree"]), out["meta"]
+    del out  # the arrays are held once
+    free(leaves, jax.tree.leaves(packed))
+    return unpack(jax.tree.unflatten(structure, leaves), like), meta
 
   def close(self) -> None:
     self._manager.close()

@@ -313,10 +313,10 @@ class Told(NamedTuple):
   digest: object
 
 
-def tell(kind, config=EAGER, used=0, block=None):
+def tell(kind, config=EAGER, used=0, block=1):
   """Lives the script with an agent of class `kind` whose optimiser state is `used` more than fresh: (start, [Told of each chunk]).
 
-  block: None: the loop itself, all streams in one program; else a crew with blocks of so many streams, on two threads.
+  block: streams in a block of the crew, which has two threads; one, as on a CPU: a program for all sizes.
   """
   agent = kind(dataclasses.replace(PRESETS["tiny"].dreamer, batch=4, length=8, imagine=4), 24, 6)
   loop = Loop(agent, Monitor(agent, n=4, least=2), scripted(), types.SimpleNamespace(acceptance=0.6, posture=None), config, capacity=256)
@@ -328,7 +328,7 @@ def tell(kind, config=EAGER, used=0, block=None):
   keys, chosen = jax.random.split(jax.random.key(1), 3), choices(ARMS, config, CHUNKS * STEPS)
   copy = lambda tree: jax.tree.map(lambda x: np.array(x), tree)
   begin, told = copy(state), []
-  crew = Crew(loop, 3, block or 3, threads=2)
+  crew = Crew(loop, 3, block, threads=2)
   states = crew.split(state._replace(replay=[cut(state.replay, own, 0) for own in crew.blocks]))
   whole = lambda joined: joined._replace(replay=jax.tree.map(lambda *x: np.concatenate(x), *joined.replay))
   for c in range(CHUNKS):
@@ -347,8 +347,8 @@ def story():
   return tell(Agent)
 
 
-def test_blocks_of_streams_live_as_all_in_one_program(story):
-  """Blocks of two streams and of one: the same decisions, alarms, phases and updates. Numbers differ by rounding alone, since XLA rounds a product by its shape,
+def test_blocks_of_streams_live_as_each_alone(story):
+  """A block of two streams and one of one: the same decisions, alarms, phases and updates. Numbers differ by rounding alone, since XLA rounds a product by its shape,
   which a dozen updates make larger: 1e-3 of a signal, a twentieth of the largest step that an array of weights has taken."""
   begin, told = story
   again, blocks = tell(Agent, block=2)

@@ -15,7 +15,7 @@ import pytest
 from mjx_cl import agents, envs, run
 from mjx_cl.adapt import phase as phase_lib
 from mjx_cl.adapt.arms import ARMS, FOREVER
-from mjx_cl.adapt.loop import FRESH, Loop, choices
+from mjx_cl.adapt.loop import FRESH, WIDTH, Loop, choices
 from mjx_cl.adapt.phase import ABORT_BUDGET, ENDED, END, START, STOP
 from mjx_cl.config import PRESETS, AdaptConfig, RunConfig
 from mjx_cl.detectors import Alarm, Detector
@@ -48,7 +48,9 @@ def test_choices_of_all_arms():
   assert len(drawn) == 1 and 1000 <= drawn[0] <= 1440
   on = lambda field: {name for name, row in rows.items() if getattr(row, field)}
   assert on("listens") == {"detector", "world-model", "no-fault"} and on("world_only") == {"world-model"} and on("fresh") == {"scratch"}
-  assert choices([("detector", 0), ("none", 0)], c, 1500).fresh is None
+  few = choices([("detector", 0), ("none", 0)], c, 1500)
+  assert few.fresh is None and few.at.shape[1] == x.at.shape[1] == WIDTH  # one program
+  assert choices([("periodic", 0)], dataclasses.replace(c, period=100, warmup=100), 1500).at.shape == (1, 2 * WIDTH)
   assert on("rule") == {"detector", "oracle", "scratch", "world-model", "no-fault"}
   assert {name: int(row.limit) for name, row in rows.items()} == dict.fromkeys(NAMES, 777) | {
       "none": FOREVER, "always": FOREVER, "randomised": FOREVER, "periodic": 30, "random": 60}
@@ -358,7 +360,7 @@ def test_the_robot_of_arm_no_fault_never_breaks(lived):
   assert all(r.endswith(", on a healthy robot: a false alarm") for _, r in alarms) and any(s >= FAULT for s, _ in alarms)
   assert row["false_alarms"] == len(alarms) and row["fault"] == "none"
   assert all(row[k] is None for k in ("onset", "alarm_step", "latency_steps", "affected", "recovery_step", "reward_drop", "return_lost"))
-  healthy, broken = columns(lived(FOUR), "trace", "no-fault"), columns(lived(FOUR), "trace", "detector")
+  healthy, broken = columns(out, "trace", "no-fault"), columns(out, "trace", "detector")
   # rows of one batch may be summed in another order, which hundreds of steps of a walker let grow
   np.testing.assert_allclose(healthy["reward"][:50], broken["reward"][:50], atol=1e-3)
   assert np.abs(np.subtract(healthy["reward"][FAULT:], broken["reward"][FAULT:])).max() > 0.02
@@ -402,10 +404,10 @@ def test_the_ledger_of_each_arm(lived):
 
 def test_an_arm_with_an_agent_of_its_own(lived):
   """It lives as a run whose agent that is, the others as they do without it; the card is kept."""
-  out, whole = lived(("none", "randomised")), lived(NAMES)
+  out, whole = lived(("none", "randomised", "scratch")), lived(NAMES)  # with fresh parameters, all runs here are one program
   folder = json.loads((out / "config.json").read_text())
   assert folder["agent_card"]["seed"] == 0 and {k: v["seed"] for k, v in folder["arm_cards"].items()} == {"randomised": 1}
-  other = lived(("none",), suffix="-randomised")
+  other = lived(("none", "scratch"), suffix="-randomised")
   mine, same, first = columns(out, "trace", "randomised"), columns(other, "trace", "none"), columns(out, "trace", "none")
   # a product of one row and of two may be summed in another order, which hundreds of steps of a walker let grow
   np.testing.assert_allclose(mine["reward"][:50], same["reward"][:50], atol=1e-3)

@@ -207,6 +207,8 @@ def test_parts_run_once_go_on_and_merge(mjx, refused, mini, tmp_path, monkeypatc
   monkeypatch.setattr(run.Runner, "step", lambda self: lived.append(self.done_chunks) or step(self))
   assert mjx("bench", mini, "--out", out, "--only", "grip", "--jobs", "1")[0] == 0
   assert lived == [1, 2] + [0, 1, 2]  # the part that was cut off goes on, the other begins
+  config = bench.suite(str(mini)).parts[0].config
+  assert run.Runner(config, tmp_path).crew.loop._program._cache_size() == 1  # a run that goes on compiles nothing anew
   del begun[:], lived[:]
 
   assert mjx("bench", mini, "--out", other, "--shard", "2/3")[0] == 0

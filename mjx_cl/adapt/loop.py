@@ -63,11 +63,14 @@ class Digest(NamedTuple):
   skipped: jax.Array
 
 
+WIDTH = 8  # of Choices.at: runs of any arms share a program, also the one that starts again and again
+
+
 class Choices(NamedTuple):
   """The arms of a run as arrays, leading (groups,); see arms.Arm.
 
   Attributes:
-    listens: bool, alarms are acted on. at: int32 (groups, K), control steps at which adaptation is due, FOREVER: none.
+    listens: bool, alarms are acted on. at: int32 (groups, K), control steps at which adaptation is due, FOREVER: none; K is a multiple of WIDTH.
     rule: bool, stop and abort rules are in force. limit: int32, most control steps of one adaptation.
     world_only: bool, actor and critic keep what they are. fresh: bool, every start draws new parameters; None: no arm of the run does, and the
       program goes without the drawing, a quarter of what there is to compile.
@@ -92,7 +95,7 @@ def choices(labels, config: AdaptConfig, steps: int, onsets=None) -> Choices:
   arms = [choose("arm", arm, arms_lib.ARMS) for arm, _ in labels]
   onsets = [()] * len(arms) if onsets is None else onsets
   at = [arm.trigger.steps(config, own if arm.breaks else (), steps, seed) for arm, own, (_, seed) in zip(arms, onsets, labels)]
-  width = max(1, max(map(len, at)))
+  width = WIDTH * max(1, -(-max(map(len, at)) // WIDTH))
   at = [[step if step < steps else arms_lib.FOREVER for step in row] + [arms_lib.FOREVER] * (width - len(row)) for row in at]
   flags = lambda get: jnp.asarray([get(arm) for arm in arms], bool)
   return Choices(flags(lambda a: a.trigger.listens), jnp.asarray(at, jnp.int32), flags(lambda a: a.end.rule),
@@ -143,9 +146,9 @@ class Loop:
     shapes = jax.eval_shape(lambda: replay_lib.init(1, self.capacity, a.obs_size, a.act_size, a.size.deter, a.size.stoch))
     replay = jax.tree.map(lambda x: jnp.zeros((groups,) + x.shape, x.dtype), shapes)  # empty: all zeros; a copy of one would be held twice for a while
     rows = max(1, self.config.refit // self.repeat)
-    past = jax.tree.map(lambda x: jnp.asarray(x, x.dtype), unknown((rows, groups), a.obs_size))  # a weak type would be a second trace
-    return LoopState(spread(train), spread(train.params), replay, self.monitor.init(groups, 1), spread(self.detector.init()), spread(phase_lib.init(self.config)),
-                     past, jnp.zeros(groups), jnp.zeros(groups, jnp.int32))
+    state = LoopState(spread(train), spread(train.params), replay, self.monitor.init(groups, 1), spread(self.detector.init()),
+                      spread(phase_lib.init(self.config)), unknown((rows, groups), a.obs_size), jnp.zeros(groups), jnp.zeros(groups, jnp.int32))
+    return jax.tree.map(lambda x: jnp.asarray(x, x.dtype) if x.weak_type else x, state)  # a weak type would be a second trace, also of a run that goes on
 
   def digest(self, state: LoopState, rows, now, choices: Choices, keys, acceptance=None) -> tuple[LoopState, Digest]:
     """One chunk, jitted; `state` is used up.
