@@ -66,6 +66,8 @@ def test_resume_gives_the_same_bits(short_walker, tmp_path, same):
   whole = make_trainer(short_walker, tmp_path / "whole", ratio=0.25)
   for _ in range(4):
     whole.step()
+  programs = lambda: {name: learn._cache_size() for name, learn in whole.learn.items()}
+  known = programs()
   first = make_trainer(short_walker, tmp_path / "parts", ratio=0.25)
   first.learn = whole.learn
   for _ in range(2):
@@ -79,6 +81,7 @@ def test_resume_gives_the_same_bits(short_walker, tmp_path, same):
   for _ in range(2):
     second.step()
   assert same(second.state, whole.state)  # parameters, moments, robots, replay and key
+  assert programs() == known  # a training that goes on compiles nothing anew
   assert second.updates == whole.updates == 8
   np.testing.assert_array_equal(second.returns.sums, whole.returns.sums)
   assert (second.phase, second.owed, second.own) == (whole.phase, whole.owed, whole.own) and whole.own
