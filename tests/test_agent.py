@@ -3,6 +3,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import quick
 
 from mjx_cl.config import DreamerConfig, replace
 from mjx_cl.dreamer import nets, rssm
@@ -41,10 +42,10 @@ class Fixture:
     def terms(params, slow, range_, batch, key, weights):
       total, (metrics, range_, deter, stoch) = self.agent.loss(params, slow, range_, batch, key, weights)
       return jnp.stack([metrics[f"loss/{k}"] for k in TERMS]), (total, metrics, range_, deter, stoch)
-    self._jac = jax.jit(jax.jacrev(terms, has_aux=True))
-    self.fresh = jax.jit(self.agent.init)(jax.random.key(0)).params
+    self._jac = quick.jit(jax.jacrev(terms, has_aux=True))
+    self.fresh = quick.jit(self.agent.init)(jax.random.key(0)).params
     self.params, self.slow = shake(self.fresh), shake(self.fresh["val"], seed=1)
-    self.observe = jax.jit(self.agent.observe)
+    self.observe = quick.jit(self.agent.observe)
 
   def __call__(self, params, slow, batch, range_=(0.0, 0.0), weights=Weights(0.3, 1.0)):
     jac, aux = self._jac(params, slow, jnp.array(range_), batch, KEY, weights)
@@ -233,7 +234,7 @@ def test_loss_equals_numpy(starts, request):
 
   starts = agent.config.last_starts or LENGTH
   flat = lambda x: x[LENGTH - starts:].reshape((starts * ROWS, -1))
-  i_deter, i_stoch, action = jax.jit(agent.imagine, static_argnums=4)(params, flat(deter), flat(stoch), key_imagine, IMAGINE)
+  i_deter, i_stoch, action = quick.jit(agent.imagine, static_argnums=4)(params, flat(deter), flat(stoch), key_imagine, IMAGINE)
   r, v_logits = np_mean(np.asarray(head("rew", i_deter, i_stoch)), bins), np.asarray(head("val", i_deter, i_stoch))
   c = 1 / (1 + np.exp(-np.asarray(head("con", i_deter, i_stoch), np.float64)[..., 0]))
   v, w = np_mean(v_logits, bins), np_mean(np.asarray(head("val", i_deter, i_stoch, slow)), bins)
@@ -279,13 +280,13 @@ def test_both_forms_of_the_behaviour_losses_agree(starts):
   out = []
   for stepwise in (True, False):
     agent = Agent(DreamerConfig(**SMALL, last_starts=starts), OBS, ACT, stepwise=stepwise)
-    params = shake(jax.jit(agent.init)(jax.random.key(0)).params)
+    params = shake(quick.jit(agent.init)(jax.random.key(0)).params)
     # small biases on the two-hot heads: predictions stay near 1, not near the bins' 5e8
     symlog_bins = np.sign(agent.bins) * np.log1p(np.abs(np.asarray(agent.bins)))
     for name in ("rew", "val"):
       params[name]["out"]["bias"] -= 4 * jnp.abs(jnp.asarray(symlog_bins) - 0.5)
     slow = jax.tree.map(lambda x: 0.9 * x, params["val"])
-    grad = jax.jit(jax.value_and_grad(agent.loss, has_aux=True))
+    grad = quick.jit(jax.value_and_grad(agent.loss, has_aux=True))
     out.append(grad(params, slow, jnp.array([-1.0, 3.0]), make_batch(ends=True), KEY, Weights(0.0, 0.6)))
   ((total, (metrics, range_, _, _)), grads), ((total_b, (metrics_b, range_b, _, _)), grads_b) = out
   np.testing.assert_allclose(total, total_b, rtol=1e-5)  # order of float32 sums
@@ -303,9 +304,9 @@ def test_both_forms_of_the_behaviour_losses_agree(starts):
 def updater(clone_std):
   """Agent, its compiled update (weights always traced: one program) and a fresh state."""
   agent = Agent(DreamerConfig(**SMALL), OBS, ACT, clone_std)
-  jitted = jax.jit(agent.update)
+  jitted = quick.jit(agent.update)
   update = lambda state, batch, key, weights=Weights(): jitted(state, batch, key, jax.tree.map(jnp.float32, weights))
-  return agent, update, jax.jit(agent.init)(jax.random.key(0))
+  return agent, update, quick.jit(agent.init)(jax.random.key(0))
 
 
 @pytest.fixture(scope="module")
@@ -361,7 +362,7 @@ def test_policy_lr_scales_the_steps_of_the_policy_alone(plain):
   assert agent.config.policy_lr == 1.0
   state, _, _ = update(state, make_batch(), KEY)
   full, _, _ = update(state, make_batch(1), KEY)
-  quarter, _, _ = jax.jit(slow.update)(state, make_batch(1), KEY, jax.tree.map(jnp.float32, Weights()))
+  quarter, _, _ = quick.jit(slow.update)(state, make_batch(1), KEY, jax.tree.map(jnp.float32, Weights()))
   wanted = jax.tree.map(lambda a, b: 0.75 * a + 0.25 * b, state.params["pol"], full.params["pol"])
   assert gap(quarter.params["pol"], wanted) < 1e-6  # float32 rounding of gains near 1
   assert gap(full.params["pol"], quarter.params["pol"]) > 1e-6
@@ -405,7 +406,7 @@ def test_anchor_is_the_likelihood_of_the_actions_taken_and_moves_the_mean_alone(
   held = Agent(replace(agent.config, anchor=0.5, min_std=0.05), agent.obs_size, agent.act_size)
   params, batch = shake(state.params), make_batch(ends=True)
   loose = Agent(replace(held.config, anchor=0.0), agent.obs_size, agent.act_size)
-  grad = lambda a: jax.jit(jax.value_and_grad(a.loss, has_aux=True))(params, state.slow, jnp.zeros(2), batch, KEY)
+  grad = lambda a: quick.jit(jax.value_and_grad(a.loss, has_aux=True))(params, state.slow, jnp.zeros(2), batch, KEY)
   ((total, (metrics, _, _, _)), with_it), ((without, (rest, _, _, _)), plain_grads) = grad(held), grad(loose)
   assert "loss/anchor" not in rest
   np.testing.assert_allclose(total - without, 0.5 * metrics["loss/anchor"], rtol=1e-3)  # difference of two float32 sums
@@ -443,9 +444,9 @@ def test_least_deviation_of_the_actions(plain):
 def test_vmap_over_seeds_equals_a_loop(plain):
   agent, update, _ = plain
   keys = jax.random.split(jax.random.key(3), 2)
-  states = jax.jit(jax.vmap(agent.init))(keys)
+  states = quick.jit(jax.vmap(agent.init))(keys)
   batches = jax.tree.map(lambda *x: jnp.stack(x), make_batch(1), make_batch(2))
-  many, metrics, latents = jax.jit(jax.vmap(agent.update))(states, batches, keys)
+  many, metrics, latents = quick.jit(jax.vmap(agent.update))(states, batches, keys)
   for i in range(2):
     one, one_metrics, one_latents = update(jax.tree.map(lambda x: x[i], states), make_batch(i + 1), keys[i])
     got = jax.tree.map(lambda x: x[i], many)
@@ -464,7 +465,7 @@ def test_act_is_one_step_of_observe(full):
   deters, _, logits = full.observe(params, batch, KEY)
   row, key = 1, jax.random.key(5)
   carry = agent.carry()._replace(deter=batch.deter[row, 0], stoch=agent.hot(batch.stoch[row, 0]), action=batch.action[row, 0])
-  new, action = jax.jit(agent.act)(params, carry, batch.obs[row, 1], key)
+  new, action = quick.jit(agent.act)(params, carry, batch.obs[row, 1], key)
   np.testing.assert_allclose(new.deter, deters[0, row], atol=1e-5)  # float32 sums of 200 in another order
   key_z, key_a = jax.random.split(key)
   stoch = rssm.sample(logits[0, row], jax.random.uniform(key_z, (1, 8))[0]).reshape(-1)
@@ -496,7 +497,7 @@ def test_open_loop_equals_a_loop(full):
   agent, params, steps = full.agent, full.params, 5
   deter, stoch = start_rows(agent)
   actions = jnp.asarray(np.random.default_rng(0).standard_normal((steps, ROWS, ACT)), jnp.float32)
-  obs, reward = jax.jit(agent.open_loop)(params, deter, stoch, actions, KEY)
+  obs, reward = quick.jit(agent.open_loop)(params, deter, stoch, actions, KEY)
   deters, stochs, _ = python_steps(agent, params, deter, stoch, jax.random.uniform(KEY, (steps, ROWS, 8)), lambda i, d, s: actions[i])
   raw = np.asarray(agent.dec.apply({"params": params["dec"]}, deters, stochs))
   np.testing.assert_allclose(obs, np.sign(raw) * np.expm1(np.abs(raw)), rtol=1e-3, atol=1e-4)  # float32 over 5 steps, then exp
@@ -508,7 +509,7 @@ def test_imagine_equals_a_loop_and_has_no_gradient(full):
   agent, params = full.agent, full.params
   deter, stoch = start_rows(agent)
   run = lambda params, deter, stoch: agent.imagine(params, deter, stoch, KEY, IMAGINE)
-  got = jax.jit(run)(params, deter, stoch)
+  got = quick.jit(run)(params, deter, stoch)
   key_z, key_a = jax.random.split(KEY)
   noise = jax.random.normal(key_a, (IMAGINE + 1, ROWS, ACT))
 
@@ -520,5 +521,5 @@ def test_imagine_equals_a_loop_and_has_no_gradient(full):
   np.testing.assert_allclose(got[0], jnp.concatenate([deter[None], deters]), atol=1e-4)  # float32 over 3 steps
   np.testing.assert_allclose(got[1], jnp.concatenate([stoch[None], stochs]), atol=1e-4)  # one-hot, up to p - p
   np.testing.assert_allclose(got[2], jnp.concatenate([actions, last[None]]), atol=1e-3)  # float32 through the policy
-  grads = jax.jit(jax.grad(lambda *x: sum(jnp.sum(y) for y in run(*x)), argnums=(0, 1, 2)))(params, deter, stoch)
+  grads = quick.jit(jax.grad(lambda *x: sum(jnp.sum(y) for y in run(*x)), argnums=(0, 1, 2)))(params, deter, stoch)
   assert all(np.all(np.asarray(g) == 0) for g in jax.tree.leaves(grads))
