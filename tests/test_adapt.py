@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import quick
 
 from mjx_cl.adapt import phase as phase_lib
 from mjx_cl.adapt.convergence import SIGNALS, settled
@@ -320,6 +321,7 @@ def tell(kind, config=EAGER, used=0, block=1):
   """
   agent = kind(dataclasses.replace(PRESETS["tiny"].dreamer, batch=4, length=8, imagine=4), 24, 6)
   loop = Loop(agent, Monitor(agent, n=4, least=2), scripted(), types.SimpleNamespace(acceptance=0.6, posture=None), config, capacity=256)
+  loop._program = quick.jit(loop._digest, donate_argnums=0)
   train = jax.jit(agent.init)(jax.random.key(0))
   # fresh heads say exactly 0, and a signal whose median is 0 has no scale to be settled on
   params = jax.tree.map(lambda x: x + 0.01 * jax.random.normal(jax.random.key(x.size), x.shape), train.params)

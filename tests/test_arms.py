@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pyarrow.parquet
 import pytest
+import quick
 
 from mjx_cl import agents, envs, run
 from mjx_cl.adapt import phase as phase_lib
@@ -156,6 +157,7 @@ class Story(NamedTuple):
 def story():
   agent = Agent(dataclasses.replace(PRESETS["tiny"].dreamer, batch=4, length=8, imagine=4), 24, 6)
   loop = Loop(agent, Monitor(agent, n=4, least=2), scripted(), types.SimpleNamespace(acceptance=0.6, posture=None), EAGER, capacity=512)
+  loop._program = quick.jit(loop._digest, donate_argnums=0)
   train = jax.jit(agent.init)(jax.random.key(0))
   # fresh heads say exactly 0, and a signal whose median is 0 has no scale to be settled on; slow critic and moments get values of their own
   shake = lambda tree, seed: jax.tree.map(lambda x: x + (0.01 * jax.random.normal(jax.random.key(x.size + seed), x.shape)).astype(x.dtype), tree)

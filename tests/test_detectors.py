@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import quick
 import scipy.stats
 
 from mjx_cl import detectors
@@ -44,7 +45,7 @@ def case(request):
   """A detector and its one jitted program over several streams."""
   detector = ALL[request.param]()
   start = jax.tree.map(lambda x: jnp.broadcast_to(x, (STREAMS,) + x.shape).astype(x.dtype), detector.init())
-  program = jax.jit(lambda state, xs: jax.lax.scan(jax.vmap(detector.update), state, xs))
+  program = quick.jit(lambda state, xs: jax.lax.scan(jax.vmap(detector.update), state, xs))
   return detector, lambda xs, state=start: program(state, xs)
 
 
@@ -71,7 +72,7 @@ def test_scan_of_vmap_equals_each_stream_alone(case, same):
   xs = residuals(jax.random.key(1), streams=STREAMS)
   state, alarms = program(xs)
   assert alarms.fired.shape == (STEPS, STREAMS)
-  alone = jax.jit(lambda xs: jax.lax.scan(detector.update, detector.init(), xs))
+  alone = quick.jit(lambda xs: jax.lax.scan(detector.update, detector.init(), xs))
   for g in range(STREAMS):
     state_g, alarms_g = alone(jax.tree.map(lambda x: x[:, g], xs))
     chex.assert_trees_all_close(alarms_g.score, alarms.score[:, g], rtol=1e-4, atol=1e-4)  # another order of a sum of the window in float32
@@ -88,7 +89,7 @@ def test_same_input_gives_equal_bits(case, same):
 def test_an_invalid_row_changes_nothing(case, same):
   detector, program = case
   state, _ = program(residuals(jax.random.key(3), streams=STREAMS))
-  nan, update = jnp.full(STREAMS, jnp.nan), jax.jit(jax.vmap(detector.update))
+  nan, update = jnp.full(STREAMS, jnp.nan), quick.jit(jax.vmap(detector.update))
   for filling in (nan, jnp.full(STREAMS, 1e9)):  # whatever the row holds
     wide = lambda n: jnp.tile(filling[:, None], n)
     row = unknown((STREAMS,), 4)._replace(opr=filling, rpr=filling, variables=wide(4), groups=wide(GROUPS))
@@ -181,7 +182,7 @@ def test_blocks_of_a_long_window_add_up_to_the_loop(settings):
   xs = rng.normal(5.0, 2.0, 3 * (settings["window"] + settings["lag"]) + 100).astype(np.float32)
   xs[len(xs) // 3:len(xs) // 3 + 20] += 2000.0
   detector = rolling_sigma(**settings)
-  alarms = jax.jit(lambda xs: jax.lax.scan(detector.update, detector.init(), xs)[1])(jnp.asarray(xs))
+  alarms = quick.jit(lambda xs: jax.lax.scan(detector.update, detector.init(), xs)[1])(jnp.asarray(xs))
   fired, scores = slow_rolling_sigma(xs.astype(float), **settings)
   np.testing.assert_allclose(alarms.score, scores, rtol=1e-4, atol=1e-4)
   np.testing.assert_array_equal(alarms.fired, fired)
@@ -193,7 +194,7 @@ def test_a_sample_that_is_nan_is_none(same):
   settings = dict(window=40, threshold=1.5, warmup=10, smooth=3, lag=5)
   xs = jax.random.normal(jax.random.key(3), (250,))
   detector = rolling_sigma(**settings)
-  run = jax.jit(lambda xs: jax.lax.scan(detector.update, detector.init(), xs))
+  run = quick.jit(lambda xs: jax.lax.scan(detector.update, detector.init(), xs))
   gaps = jnp.stack([jnp.full(250, jnp.nan), xs], 1).reshape(-1)
   (state, alarms), (other, holed) = run(xs), run(gaps)
   assert same(state, other) and same(alarms, jax.tree.map(lambda a: a[1::2], holed))
@@ -239,7 +240,7 @@ def test_arl0_of_three_sigma_is_the_published_370():
   detector = rolling_sigma(window=window, threshold=3.0, warmup=window)
   start = jax.tree.map(lambda x: jnp.broadcast_to(x, (streams,) + x.shape), detector.init())
   xs = jax.random.normal(jax.random.key(0), (window + steps, streams))
-  fired = jax.jit(lambda xs: jax.lax.scan(jax.vmap(detector.update), start, xs)[1].fired)(xs)
+  fired = quick.jit(lambda xs: jax.lax.scan(jax.vmap(detector.update), start, xs)[1].fired)(xs)
   assert not fired[:window].any()
   arl0 = streams * steps / int(fired.sum())
   exact = 1 / (2 * scipy.stats.t.sf(3 * np.sqrt((window - 1) / (window + 1)), window - 1))
@@ -359,7 +360,7 @@ def test_any_of_scores_what_is_known():
 def test_the_papers_rule_is_either_residual():
   detector = detectors.make("rolling_sigma_plain", window=50, warmup=20)
   xs = residuals(jax.random.key(6), 200, invalid=0.0)
-  run = jax.jit(lambda xs: jax.lax.scan(detector.update, detector.init(), xs)[1].fired)
+  run = quick.jit(lambda xs: jax.lax.scan(detector.update, detector.init(), xs)[1].fired)
   opr = slow_rolling_sigma(np.asarray(xs.opr, float), 50, 3.0, 1, True, 20)[0]
   rpr = slow_rolling_sigma(np.asarray(xs.rpr, float), 50, 3.0, 1, True, 20)[0]
   assert (opr & ~rpr).any() or (rpr & ~opr).any()

@@ -3,6 +3,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import quick
 import scipy.stats
 from river.drift import PageHinkley
 
@@ -19,7 +20,7 @@ def stream(seed=0, steps=500):
 
 
 def run(detector, xs):
-  alarms = jax.jit(lambda xs: jax.lax.scan(detector.update, detector.init(), xs)[1])(jnp.asarray(xs))
+  alarms = quick.jit(lambda xs: jax.lax.scan(detector.update, detector.init(), xs)[1])(jnp.asarray(xs))
   return np.asarray(alarms.fired), np.asarray(alarms.score)
 
 
@@ -216,7 +217,7 @@ def test_shiryaev_roberts_is_a_martingale_less_the_time(two_sided):
   streams, steps = 100_000, 20
   start = jax.tree.map(lambda x: jnp.broadcast_to(x, (streams,) + x.shape), detector.init())
   xs = jax.random.normal(jax.random.key(0), (steps, streams))
-  r = np.exp(jax.jit(lambda xs: jax.lax.scan(jax.vmap(detector.update), start, xs)[1].score)(xs).astype(float))
+  r = np.exp(quick.jit(lambda xs: jax.lax.scan(jax.vmap(detector.update), start, xs)[1].score)(xs).astype(float))
   error = r.std(1) / np.sqrt(streams)
   assert (error / np.arange(1, steps + 1) < 0.01).all()
   assert (np.abs(r.mean(1) - np.arange(1, steps + 1)) < 4 * error).all()
@@ -241,14 +242,14 @@ def test_glr_has_room_for_its_candidates():
   def step(carry, key):
     state, _ = jax.vmap(detector.update)(carry[0], jax.random.normal(key, (200,)))
     return (state, jnp.maximum(carry[1], jnp.max(jnp.sum(jnp.isfinite(state.total), -1)))), None
-  most = jax.jit(lambda keys: jax.lax.scan(step, (start, 0), keys)[0][1])(jax.random.split(jax.random.key(0), 5000))
+  most = quick.jit(lambda keys: jax.lax.scan(step, (start, 0), keys)[0][1])(jax.random.split(jax.random.key(0), 5000))
   assert 10 < int(most) < 32
 
 
 def test_a_full_glr_is_never_too_large_and_exact_over_small_shifts():
   """The docstring's claim, with room for three: the largest m S - m^2 n / 2 over shifts 0 <= m <= bound is still found."""
   detector = glr(threshold=1e9, capacity=3, warmup=0)
-  update, state = jax.jit(detector.update), detector.init()
+  update, state = quick.jit(detector.update), detector.init()
   zs = np.random.default_rng(5).normal(size=300).astype(np.float32)
   bound, short, tight = np.inf, 0, 0
   for t, z in enumerate(zs):
@@ -299,6 +300,6 @@ def test_one_program_serves_all_thresholds(factory, more):
   def count(threshold):
     detector = factory(threshold=threshold, warmup=80, **more)
     return jnp.sum(jax.lax.scan(detector.update, detector.init(), xs)[1].fired)
-  counts = jax.jit(jax.vmap(count))(jnp.array(thresholds))
+  counts = quick.jit(jax.vmap(count))(jnp.array(thresholds))
   assert counts[0] > counts[1] > counts[2]
   assert int(counts[1]) == run(factory(threshold=3.0, warmup=80, **more), xs)[0].sum()

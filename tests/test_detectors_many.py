@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import quick
 import scipy.special
 import scipy.stats
 
@@ -38,14 +39,14 @@ def gaussian(key, shape):
 
 def scan(detector, xs):
   """Alarms of one stream (T,)."""
-  return jax.jit(lambda xs: jax.lax.scan(detector.update, detector.init(), xs)[1])(xs)
+  return quick.jit(lambda xs: jax.lax.scan(detector.update, detector.init(), xs)[1])(xs)
 
 
 def simulate(detector, streams, steps, seed=0, make=gaussian):
   """Alarms (steps, streams) of streams whose rows are drawn on the way."""
   start = jax.tree.map(lambda x: jnp.broadcast_to(x, (streams,) + x.shape), detector.init())
   body = lambda state, key: jax.vmap(detector.update)(state, make(key, (streams,)))
-  return jax.tree.map(np.asarray, jax.jit(lambda keys: jax.lax.scan(body, start, keys)[1])(jax.random.split(jax.random.key(seed), steps)))
+  return jax.tree.map(np.asarray, quick.jit(lambda keys: jax.lax.scan(body, start, keys)[1])(jax.random.split(jax.random.key(seed), steps)))
 
 
 def spoilt(rng, steps=300):
@@ -77,7 +78,7 @@ def test_once_computes_only_where_due():
 
   body = lambda state, t: (many.once(t == 3, compute, t + 0.5, state), None)
   due = jnp.array([[1, 3, 5], [0, 0, 7]], jnp.float32)
-  end = jax.jit(jax.vmap(jax.vmap(lambda shift: jax.lax.scan(body, jnp.float32(-1), jnp.arange(4.0) + shift)[0])))(due - 2)
+  end = quick.jit(jax.vmap(jax.vmap(lambda shift: jax.lax.scan(body, jnp.float32(-1), jnp.arange(4.0) + shift)[0])))(due - 2)
   jax.effects_barrier()
   # stream with shift s sees t = s, s + 1, s + 2, s + 3 and is due at t = 3 if that is among them
   np.testing.assert_array_equal(end, np.where((due - 2 <= 3) & (due - 2 >= 0), 35.0, -1.0))
@@ -291,7 +292,7 @@ def test_max_variables_equals_the_loop():
 def test_one_side_is_a_rise_of_residuals_or_a_fall_of_the_reward():
   for two_sided in (True, False):
     detector = max_variables(smooth=5, threshold=30.0, warmup=100, two_sided=two_sided, log=False)
-    program = jax.jit(lambda xs: jax.lax.scan(detector.update, detector.init(), xs)[1].fired)
+    program = quick.jit(lambda xs: jax.lax.scan(detector.update, detector.init(), xs)[1].fired)
     for field, shift, found in (("groups", 5.0, True), ("groups", -5.0, False), ("reward", -5.0, True), ("reward", 5.0, False)):
       xs = gaussian(jax.random.key(0), (300,))
       fired = program(xs._replace(**{field: getattr(xs, field).at[200:].add(shift)}))
@@ -403,7 +404,7 @@ def test_bfar_has_the_stated_probability_of_a_false_alarm(phi, block, warmup):
   reward = jax.lax.scan(lambda r, e: ((new := phi * r + e), new), noise[0] / np.sqrt(1 - phi ** 2), noise)[1]
   detector = bfar(block=block, alpha=alpha, blocks=blocks, warmup=warmup, repetitions=400)
   start = jax.tree.map(lambda x: jnp.broadcast_to(x, (streams,) + x.shape), detector.init())
-  fired = jax.jit(lambda r: jax.lax.scan(jax.vmap(detector.update), start, rows((steps, streams), reward=r))[1].fired)(reward)
+  fired = quick.jit(lambda r: jax.lax.scan(jax.vmap(detector.update), start, rows((steps, streams), reward=r))[1].fired)(reward)
   assert not fired[:warmup].any()
   share = float(fired.any(0).mean())
   # standard error sqrt(0.1 * 0.9 / 1500) = 0.8 %, and 1.5 % of the 400 repetitions, which all streams share; smoothing and serial dependence bias by
@@ -459,7 +460,7 @@ def test_random_has_its_rate_in_streams_that_differ():
 
 def test_oracle_fires_at_the_onset_alone_known_or_not():
   xs = rows((50,), valid=np.zeros(50, bool), reward=np.full(50, np.nan, np.float32))
-  program = jax.jit(lambda onset: jax.lax.scan((d := oracle(onset)).update, d.init(), xs)[1])
+  program = quick.jit(lambda onset: jax.lax.scan((d := oracle(onset)).update, d.init(), xs)[1])
   for onset in (0, 17, 49, 60):  # traced
     alarms = program(jnp.int32(onset))
     np.testing.assert_array_equal(np.flatnonzero(alarms.fired), [onset] if onset < 50 else [])

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import quick
 import river.drift
 import river.drift.adwin
 import scipy.stats
@@ -25,7 +26,7 @@ def run(detector, xs):
   update, state = detector.update, detector.init()
   if np.ndim(xs) == 2:
     update, state = jax.vmap(update), jax.tree.map(lambda a: jnp.broadcast_to(a, (xs.shape[1],) + a.shape), state)
-  alarms = jax.jit(lambda xs: jax.lax.scan(update, state, xs)[1])(jnp.asarray(xs, jnp.float32))
+  alarms = quick.jit(lambda xs: jax.lax.scan(update, state, xs)[1])(jnp.asarray(xs, jnp.float32))
   return np.asarray(alarms.fired), np.asarray(alarms.score)
 
 
@@ -144,7 +145,7 @@ def test_adwin_hides_up_to_a_clock_of_delay():
 @pytest.mark.parametrize("places, rows, steps", [(5, 16, 300), (2, 12, 300), (3, 3, 100)])
 def test_adwin_buckets_hold_the_newest_samples(places, rows, steps):
   xs = np.random.default_rng(2).normal(size=steps).astype(np.float32)
-  windows = jax.jit(lambda xs: jax.lax.scan(lambda w, x: (insert(w, x),) * 2, empty(places, rows), xs)[1])(xs)
+  windows = quick.jit(lambda xs: jax.lax.scan(lambda w, x: (insert(w, x),) * 2, empty(places, rows), xs)[1])(xs)
   for t in (0, places, 37, steps - 1):
     mean, squares, number = (np.asarray(a[t]) for a in windows)
     sizes = [(2 ** i, k, i) for i in reversed(range(rows)) for k in range(number[i])]  # oldest first
@@ -181,7 +182,7 @@ def test_kswin_p_value_is_scipys_exact_one(size):
 
 
 def test_kswin_draws_every_set_as_often():
-  sets = np.sort(jax.jit(jax.vmap(lambda t: draw(jax.random.key_data(jax.random.key(5)), t, 6, 3)))(jnp.arange(20000)), 1)
+  sets = np.sort(quick.jit(jax.vmap(lambda t: draw(jax.random.key_data(jax.random.key(5)), t, 6, 3)))(jnp.arange(20000)), 1)
   assert (np.diff(sets, axis=1) > 0).all() and sets.min() == 0 and sets.max() == 5
   found, counts = np.unique(sets, axis=0, return_counts=True)
   assert found.tolist() == [list(c) for c in itertools.combinations(range(6), 3)]
