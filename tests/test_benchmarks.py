@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+import quick
 from flax import serialization
 
 from test_agent import shake
@@ -125,7 +126,7 @@ def test_ppo_bad_input_is_one_line(ppo, policy, words, message):
 
 def test_policy_gradient_moves_the_policy_by_what_it_says(tiny, tmp_path):
   """Of an agent with made-up heads: five policies at the distances asked for; the unmoved one promises and gains nothing on itself, the others differ."""
-  train = tiny.init(jax.random.key(0))
+  train = quick.jit(tiny.init)(jax.random.key(0))
   params = shake(train.params)
   bins = np.sign(tiny.bins) * np.log1p(np.abs(np.asarray(tiny.bins)))
   for name in ("rew", "val"):  # predictions near 1, not near the bins' 5e8
@@ -192,7 +193,7 @@ def test_socks_at_the_healthy_grip_are_none_and_less_grip_costs(monkeypatch):
   monkeypatch.setattr(socks, "CHUNK", 20)
   env = envs.make("car_real")
   agent = Agent(PRESETS["tiny"].dreamer, len(env.spec.obs), len(env.spec.act))
-  params = jax.vmap(lambda k: agent.init(k).params)(jax.random.split(jax.random.key(0), 2))
+  params = quick.jit(jax.vmap(lambda k: agent.init(k).params))(jax.random.split(jax.random.key(0), 2))
   runner = types.SimpleNamespace(trained=types.SimpleNamespace(agent=agent), acting=params)
   seen = []
 
@@ -206,7 +207,7 @@ def test_socks_at_the_healthy_grip_are_none_and_less_grip_costs(monkeypatch):
   reward, crashes = socks.drive(runner, [100, 101], grips, drives=3, steps=40)
   assert reward.shape == crashes.shape == (2, 3) and np.isfinite(reward).all() and (crashes >= 0).all()
   rollout, streams = seen[-1]
-  mj = jax.vmap(jax.vmap(lambda s: rollout._drive(s, s.key, jnp.zeros(2))[1].model))(streams).mj
+  mj = quick.jit(jax.vmap(jax.vmap(lambda s: rollout._drive(s, s.key, jnp.zeros(2))[1].model)))(streams).mj
   wheel = {side: np.asarray(mj["geom_friction"])[..., env.mj_model.geom(f"wheel_{side}").id, 0] for side in ("front_left", "rear_right")}
   np.testing.assert_allclose(wheel["rear_right"], np.tile(np.repeat(grips, 3).reshape(3, 3), (2, 1)), rtol=1e-6)  # float32
   assert (wheel["front_left"] == wheel["front_left"][0, 0]).all()

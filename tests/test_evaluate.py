@@ -3,6 +3,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import quick
 
 from mjx_cl import envs, evaluate, faults
 from mjx_cl.config import PRESETS
@@ -20,7 +21,7 @@ def case(request):
 
 def by_hand(env, agent, params, seed, rollout, drive=False):
   """Return, the measured figure in all steps but the one that ends, terminated."""
-  stream = start(env, agent, rollout.fault, jax.random.key(seed))
+  stream = quick.jit(lambda key: start(env, agent, rollout.fault, key))(jax.random.key(seed))
   lead = lambda tree: jax.tree.map(lambda x: x[None, None], tree)
   streams, total, seen = lead(stream), 0.0, []
   for _ in range(env.spec.episode_steps):
