@@ -35,7 +35,7 @@ def free(leaves: list, like: list) -> None:
   """Unbinds arrays from their device, in place, where those of `like` are not bound to one.
 
   Orbax binds all that it reads. To `jax.jit` a bound argument is another program than a free one: a run that goes on would compile anew what the
-  compile cache holds.
+  compile cache holds. And what is bound to one device cannot meet what is spread over several.
   """
   for i, model in enumerate(like):
     if isinstance(leaves[i], jax.Array) and not getattr(model, "committed", False):

@@ -317,7 +317,7 @@ class Told(NamedTuple):
 def tell(kind, config=EAGER, used=0, block=1):
   """Lives the script with an agent of class `kind` whose optimiser state is `used` more than fresh: (start, [Told of each chunk]).
 
-  block: streams in a block of the crew, which has two threads; one, as on a CPU: a program for all sizes.
+  block: streams in a block of the crew, which has two threads; one, as on a CPU: any number of blocks shares a program.
   """
   agent = kind(dataclasses.replace(PRESETS["tiny"].dreamer, batch=4, length=8, imagine=4), 24, 6)
   loop = Loop(agent, Monitor(agent, n=4, least=2), scripted(), types.SimpleNamespace(acceptance=0.6, posture=None), config, capacity=256)
@@ -417,8 +417,8 @@ def test_updates_equal_the_ratio(story):
 
 @pytest.fixture(scope="module")
 def cheap_story():
-  """The script with an agent that costs nothing, whose moments and counters are 5 and are forgotten at an alarm."""
-  out = tell(Counting, dataclasses.replace(EAGER, fresh_moments=True), used=5)
+  """The script, all streams in one program as on an accelerator, with an agent that costs nothing, whose moments and counters are 5 and are forgotten at an alarm."""
+  out = tell(Counting, dataclasses.replace(EAGER, fresh_moments=True), used=5, block=3)
   jax.effects_barrier()
   return out
 

@@ -251,8 +251,7 @@ def test_runs_are_sums_of_the_trace(whole):
 
 def test_a_preset_of_several_faults_ends_in_all_files(saved, tmp_path):
   """Six faults at once, repaired after 30 steps; each is an event, and the figure does without a single severity."""
-  config = RunConfig("walker", fault="any/all-easy", onset=40, duration=30, steps=128, seeds=1, arms=("none",), agent=str(saved), physics="native",
-                     detector="periodic", settings={"threshold": math.log(30)})  # the program of the tests below
+  config = RunConfig("walker", fault="any/all-easy", onset=40, duration=30, steps=128, seeds=1, arms=("none",), agent=str(saved), physics="native")
   summary = run.execute(config, tmp_path / "out")
   assert summary["fault"] == "any/all-easy" and summary["severity"] == pytest.approx(1 / 3)
   e = table(tmp_path / "out", "events")

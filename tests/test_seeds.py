@@ -115,6 +115,9 @@ second = train.Trainer(env, test_seeds.DREAMER, test_seeds.CONFIG, {out!r}, seed
 second.resume()
 leaves = [np.asarray(x) for x in jax.tree.leaves(second.state.train)]
 np.savez({out!r} + "/state.npz", *leaves)
+at = second.updates
+second.step()
+assert second.updates > at  # what was read meets what is spread over devices
 """
 
 

@@ -63,7 +63,7 @@ class Digest(NamedTuple):
   skipped: jax.Array
 
 
-WIDTH = 8  # of Choices.at: runs of any arms share a program, also the one that starts again and again
+WIDTH = 8  # Choices.at is padded to a multiple of it: arms with up to eight starts share a program, `periodic` too
 
 
 class Choices(NamedTuple):
