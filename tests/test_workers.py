@@ -13,7 +13,7 @@ from test_bench import mini  # noqa: F401  a fixture
 from test_cli import mjx, refused  # noqa: F401  fixtures
 from test_transfer import agent, saved  # noqa: F401  fixtures
 
-from mjx_cl import bench, checkpoint, memory, store, workers
+from mjx_cl import bench, checkpoint, memory, run, store, workers
 from mjx_cl.errors import FileError, UserError
 
 GB = 2**30
@@ -34,12 +34,22 @@ def test_more_than_fit_are_refused(monkeypatch, asked, words):
     workers.number(asked, [GB] * 5, 2 * GB)
 
 
+def compiled(suite, folder):
+  """Lives one chunk of a suite's first part, whose programs then lie in the cache: two workers that begin together would both compile them."""
+  runner = run.Runner(bench.suite(str(suite)).parts[0].config, folder)
+  folder.mkdir()
+  runner.open()
+  runner.step()
+  runner.checkpoints.close()
+
+
 def test_side_by_side_is_as_one_after_the_other(mjx, refused, mini, tmp_path, monkeypatch):  # noqa: F811
   """The same streams live the same lives on the same share of the cores."""
   own = workers.cores()
   monkeypatch.setattr(workers, "cores", lambda: own[-1:] * 2)  # two workers, also where there is one core
   monkeypatch.setattr(memory, "resident", lambda need: 0)  # ... or little memory free: these robots are small
   assert "1..2" in refused(2, "bench", mini, "--out", tmp_path / "x", "--jobs", "3")
+  compiled(mini, tmp_path / "compiled")
   code, text, err = mjx("bench", mini, "--out", tmp_path / "two", "--only", "grip", "--jobs", "2", "--json")
   assert code == 0, err
   assert json.loads(text)["finished"] == 2 and re.findall(r"finished, (\d) of 2", err) == ["1", "2"]
@@ -118,6 +128,7 @@ def test_a_worker_that_is_killed_is_said(mini, tmp_path):  # noqa: F811
 def test_no_worker_outlives_its_parent_and_all_have_saved(long, tmp_path, number):
   """The parent is killed outright, or asked to end: each worker saves between two chunks and ends."""
   out, parts = tmp_path / "out", ("grip/severity=0.5", "grip/severity=1.0")
+  compiled(long, tmp_path / "compiled")
   parent = subprocess.Popen([sys.executable, "-c", TWO, "bench", str(long), "--out", str(out), "--only", "grip", "--jobs", "2"], stderr=subprocess.PIPE,
                             stdout=subprocess.DEVNULL, text=True)
   lives(parent.stderr, *parts)
