@@ -192,34 +192,44 @@ def dagger(marked: dict[str, set]) -> str:
   return f"† no threshold gives that rate of false alarms, it stays silent: {'; '.join(f'{name} on {joined(sorted(own))}' for name, own in marked.items())}."
 
 
+SCORED = ("detector", "reference", "robot", "fault", "severity", "cost_standard", "streams", "stream_latency_steps", "stream_healthy_alarms", "healthy_steps")
+
+
+def best(rows: list[dict]) -> str:
+  """The best detector of each robot, with its score."""
+  means = {}
+  for r in rows:
+    if not r["reference"] and r["cost_standard"] is not None:
+      means.setdefault(r["robot"], {}).setdefault(r["detector"], []).append(r["cost_standard"])
+  found = {robot: max((statistics.fmean(x), name) for name, x in own.items()) for robot, own in sorted(means.items())}
+  return joined([f"`{name}` {number(x)} ({robot})" for robot, (x, name) in found.items()])
+
+
+def lead(rows: list[dict], overall: list[dict]) -> str:
+  """How far the first detector lies above the second; `rows` hold SCORED, `overall` is in order."""
+  from mjx_cl.scoring import metrics
+  first, second = [r["detector"] for r in overall if "(oracle)" not in r["detector"]][:2]
+  ahead, interval = metrics.difference(rows, first, second)
+  return f"`{first}` lies {number(ahead, 1)} {span(interval, 1)} above `{second}` (paired, intervals over seeds; it says nothing of other faults)."
+
+
 def leaderboard(results: pathlib.Path) -> str:
   """Detectors on the recorded streams: those that beat never alarming, and their own plain form, as a table, the others in a sentence."""
   meta = load(results / "leaderboard.json")
   overall = sorted(table(results / "leaderboard_overall.parquet"), key=lambda r: (-r["cost_standard"], r["detector"]))
-  from mjx_cl.scoring import metrics
-  rows = table(results / "leaderboard.parquet", ["detector", "reference", "robot", "fault", "severity", "arl0_alarms", "cost_standard", "control_s", "streams",
-                                                 "stream_latency_steps", "stream_healthy_alarms", "healthy_steps"])
+  rows = table(results / "leaderboard.parquet", ["arl0_alarms", "control_s", *SCORED])
   robots, faults = sorted({r["robot"] for r in rows}), len({(r["robot"], r["fault"], r["severity"]) for r in rows})
   alarms = statistics.mode(r["arl0_alarms"] for r in rows if not r["reference"])
   (low, high), minutes = meta["seeds"]["score"], meta["wall_s"] / 60
   asked = {r["robot"]: 3600 / r["control_s"] / meta["arl0_target"] for r in rows}
-  silent, best = mute(rows), {}
-  for robot in robots:
-    means = {}
-    for r in rows:
-      if r["robot"] == robot and not r["reference"] and r["cost_standard"] is not None:
-        means.setdefault(r["detector"], []).append(r["cost_standard"])
-    best[robot] = max((statistics.fmean(x), name) for name, x in means.items())
-  first, second = [r["detector"] for r in overall if "(oracle)" not in r["detector"]][:2]
-  ahead, interval = metrics.difference(rows, first, second)
+  silent = mute(rows)
   text = fill(f"""
       Every detector sees the same recorded streams of frozen agents: {joined(robots)}, {faults} fault settings (fault x severity),
       {high - low + 1} scoring seeds each; thresholds at ARL0 = {number(meta['arl0_target'])} control steps, calibrated on other seeds' healthy
       streams ({alarms} alarms for most{', so every rate is an order of magnitude and marked so' if alarms < 50 else ''}): asked for are
       {joined([f"{number(asked[r], 1)} ({r})" for r in robots])} false alarms an hour, what came on the scoring seeds stands in the table. Score: 0 for never
       alarming, 100 for alarming at the onset and at no other time, a mean over robots; intervals over seeds. Best on each robot:
-      {joined([f"`{name}` {number(x)} ({robot})" for robot, (x, name) in best.items()])}. `{first}` lies {number(ahead, 1)} {span(interval, 1)} above
-      `{second}` (paired, intervals over seeds; it says nothing of other faults). Mean ranks closer than {number(meta['critical_difference'], 1)} are not
+      {best(rows)}. {lead(rows, overall)} Mean ranks closer than {number(meta['critical_difference'], 1)} are not
       told apart (Nemenyi; references take no rank). `mjx-cl leaderboard` ({len(overall)} detectors;
       {number(meta['stream_steps'] / 1e6, 1)} million stream-steps, {number(minutes, 1)} minutes on {meta["machine"]["cores"]} core{'s' if meta['machine']['cores'] > 1 else ''}; goal 3
       minutes{', missed' if minutes > 3 else ''}). The page: [results/leaderboard.html](results/leaderboard.html), one file, sortable, a page per
@@ -247,7 +257,7 @@ def leaderboard_100k(results: pathlib.Path) -> str:
   folder = results / "leaderboard_100k"
   meta, held = load(folder / "leaderboard.json"), {r["detector"]: r["cost_standard"] for r in table(results / "leaderboard_overall.parquet")}
   overall = sorted(table(folder / "leaderboard_overall.parquet"), key=lambda r: (-r["cost_standard"], r["detector"]))
-  rows = [r for r in table(folder / "leaderboard.parquet", ["detector", "reference", "robot", "arl0_alarms", "arl0", "arl0_low", "arl0_high", "control_s"]) if not r["reference"]]
+  rows = [r for r in table(folder / "leaderboard.parquet", ["arl0_alarms", "arl0", "arl0_low", "arl0_high", "control_s", *SCORED]) if not r["reference"]]
   alarms = statistics.mode(r["arl0_alarms"] for r in rows)
   like = next(r for r in rows if r["arl0_alarms"] == alarms)
   asked = {r["robot"]: 3600 / r["control_s"] / meta["arl0_target"] for r in rows}
@@ -255,7 +265,8 @@ def leaderboard_100k(results: pathlib.Path) -> str:
   text = fill(f"""
       Thresholds at ARL0 = {number(meta['arl0_target'])} control steps, calibrated on {number(alarms * like['arl0'])} healthy steps for each robot ({alarms} alarms for most: ARL0
       {number(like['arl0'])} {span((like["arl0_low"], like["arl0_high"]))}), {high - low + 1} scoring seeds; asked for are {joined([f"{number(x, 2)} ({robot})" for robot, x in sorted(asked.items())])} false alarms
-      an hour. Score as on the board: 0 for never alarming, 100 for alarming at the onset and at no other time; detectors that score above 0. `mjx-cl leaderboard runs/streams-100k`:
+      an hour. Score as on the board: 0 for never alarming, 100 for alarming at the onset and at no other time; detectors that score above 0. Best on each robot: {best(rows)}.
+      {lead(rows, overall)} `mjx-cl leaderboard runs/streams-100k`:
       {number(meta['stream_steps'] / 1e6)} million stream-steps, {number(minutes)} minutes on {meta["machine"]["cores"]} shared core{'s' if meta['machine']['cores'] > 1 else ''}.""")
   whole = lambda x: f"{percent(x)}%"
   marked = {name: own for name, own in mute(rows).items() if any(r["detector"] == name and r["cost_standard"] > 0 for r in overall)}

@@ -126,7 +126,7 @@ def test_two_devices_equal_one(tmp_path):
   out = {}
   for devices in (1, 2):
     folder = tmp_path / str(devices)
-    flags = f"--xla_force_host_platform_device_count={devices} --xla_backend_optimization_level=0"  # compiles in half the time, see quick.py
+    flags = f"--xla_force_host_platform_device_count={devices} --xla_backend_optimization_level=0"  # compiles sooner, see quick.py
     code = DEVICES.format(devices=devices, tests=str(pathlib.Path(__file__).parent), out=str(folder))
     done = subprocess.run([sys.executable, "-c", code], env=os.environ | {"XLA_FLAGS": flags}, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-2000:]
