@@ -187,7 +187,8 @@ class Runner:
                     digest.phase, digest.signals[:, 2], self._alarms, digest.updates)
 
   def _physics_seconds(self) -> float:
-    return sum(getattr(envs.physics_of(robot), "seconds", 0.0) for robot in self.robots)
+    hosts = {id(host): host for host in (getattr(envs.physics_of(robot), "host", None) for robot in self.robots)}  # robots of one model share theirs
+    return sum(getattr(host, "seconds", 0.0) for host in hosts.values())
 
   def _acceptance(self, streams, now: int):
     """Level (groups,) of the robot that each stream has after `now` control steps; None where robots stay what they are."""

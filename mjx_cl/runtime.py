@@ -94,7 +94,7 @@ def setup() -> None:
   except OSError:
     return  # a read-only home: everything works, programs are compiled anew
   jax.config.update("jax_compilation_cache_dir", str(folder))
-  jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+  jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)  # a run starts with hundreds of small ones, some 30 ms each
   jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
 
 

@@ -330,3 +330,14 @@ def test_encoder_equals_numpy():
   assert len(p["mlp"]) == 3
   want = np_mlp(p["mlp"], np.sign(obs) * np.log1p(np.abs(obs)))
   np.testing.assert_allclose(module.apply({"params": params}, obs), want, atol=5e-5)  # float32 through 3 layers
+
+
+# ---- draws -----------------------------------------------------------------------------------------------------------------------------
+
+@pytest.mark.parametrize("draw", [jax.random.uniform, jax.random.normal])
+def test_draws_in_a_row_are_the_draws(draw):
+  """To the last bit, for one key and for a batch of them."""
+  key = jax.random.key(3)
+  np.testing.assert_array_equal(nets.in_a_row(draw, key, (5, 3, 2)), draw(key, (5, 3, 2)))
+  keys = jax.random.split(key, 4)
+  np.testing.assert_array_equal(jax.vmap(lambda k: nets.in_a_row(draw, k, (3, 7)))(keys), jax.vmap(lambda k: draw(k, (3, 7)))(keys))

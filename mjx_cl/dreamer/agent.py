@@ -171,7 +171,7 @@ class Agent:
     length, rows = batch.obs.shape[1] - 1, batch.obs.shape[0]
     params = self.prepare(params)
     tokens = self._encode(params, batch.obs[:, 1:].swapaxes(0, 1))
-    uniform = jax.random.uniform(key, (length, rows, self.size.stoch))
+    uniform = nets.in_a_row(jax.random.uniform, key, (length, rows, self.size.stoch))
     wide = lambda x, axis: jnp.repeat(x, 2, axis) if rows == 1 else x  # on a CPU the product of a single row takes twice the time of that of two
 
     def step(state, x):
@@ -206,7 +206,7 @@ class Agent:
   def draws(self, key, steps: int, rows: int):
     """Uniform numbers (steps, rows, stoch) for the prior and normal ones (steps + 1, rows, A) for the policy."""
     key_z, key_a = jax.random.split(key)
-    return jax.random.uniform(key_z, (steps, rows, self.size.stoch)), jax.random.normal(key_a, (steps + 1, rows, self.act_size))
+    return nets.in_a_row(jax.random.uniform, key_z, (steps, rows, self.size.stoch)), nets.in_a_row(jax.random.normal, key_a, (steps + 1, rows, self.act_size))
 
   def choose(self, params, deter, stoch, noise):
     """The policy's action (N, A) for standard normal `noise`."""
@@ -331,7 +331,7 @@ class Agent:
       xhat_{t+1..t+n} (n, N, O) in raw units (symexp applied) and rhat (n, N).
     """
     params = self.prepare(params)
-    uniform = jax.random.uniform(key, (actions.shape[0], deter.shape[0], self.size.stoch))
+    uniform = nets.in_a_row(jax.random.uniform, key, (actions.shape[0], deter.shape[0], self.size.stoch))
 
     def step(state, x):  # decoded where the state is at hand: the stacked states would be a hundred times the predictions
       state = self.follow(params, state, *x)

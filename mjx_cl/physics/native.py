@@ -2,13 +2,18 @@
 
 The row is MuJoCo's float64 integration state (time, qpos, qvel, act, warm start, ctrl, applied forces, ...) viewed as uint32,
 so nothing is rounded on the way. Every call writes the whole row and every overridden model field before it steps, so no
-result depends on what the batch object held before: XLA may repeat or reorder callbacks.
+result depends on what the batch object held before: XLA may repeat or reorder callbacks, and instances of one model share a host.
 """
 from __future__ import annotations
 
+import copy
 import functools
+import hashlib
+import json
 import threading
 import time
+import types
+import uuid
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +21,7 @@ import mujoco
 import numpy as np
 
 from mjx_cl.errors import UserError
-from mjx_cl.physics import DERIVING
+from mjx_cl.physics import DERIVING, by_name
 
 
 def float64_bits(x: jax.Array) -> jax.Array:
@@ -31,6 +36,40 @@ def float64_bits(x: jax.Array) -> jax.Array:
   high = jnp.where(normal, sign | ((exponent + 896) << 20) | (mantissa >> 3), sign)  # 1023 - 127 = 896
   low = jnp.where(normal, (mantissa & 7) << 29, jnp.uint32(0))
   return jnp.stack([low, high], -1).reshape(-1)
+
+
+def identity(mj_model: mujoco.MjModel, substeps: int, outputs: tuple[str, ...], law) -> str:
+  """A name for all that a host's results depend on: 32 hexadecimal digits, the same in every process, of the model's bytes, the arguments and the motor law.
+
+  A law counts by its module, code and what it closes over: a name has to tell the laws of one process apart, no more. Where it cannot (a callable object, a closure
+  over one), it is a new one each time, and programs with it are not found in the cache.
+  """
+  model = np.empty(mujoco.mj_sizeModel(mj_model), np.uint8)
+  mujoco.mj_saveModel(mj_model, None, model)
+  digest = hashlib.sha256(model.tobytes())
+  try:
+    digest.update(repr((substeps, outputs, _words(law))).encode())
+  except TypeError:
+    return uuid.uuid4().hex
+  return digest.hexdigest()[:32]
+
+
+def _words(x):
+  """What tells a motor law from another, or a value that it closes over."""
+  if x is None or x is Ellipsis or isinstance(x, (bool, int, float, complex, str, bytes)):
+    return (type(x).__name__, x)
+  if isinstance(x, frozenset):
+    return ("frozenset", *sorted(map(repr, map(_words, x))))
+  if isinstance(x, (tuple, list)):
+    return (type(x).__name__, *map(_words, x))
+  if isinstance(x, (np.ndarray, np.generic)) and x.dtype != object:
+    return ("array", x.dtype.str, x.shape, x.tobytes())
+  if isinstance(x, types.CodeType):
+    return ("code", x.co_code, x.co_names, x.co_freevars, *map(_words, x.co_consts))
+  if isinstance(x, types.FunctionType):
+    cells = [c.cell_contents for c in x.__closure__ or ()]
+    return ("law", x.__module__, x.__qualname__, *map(_words, (x.__code__, cells, x.__defaults__, sorted((x.__kwdefaults__ or {}).items()))))
+  raise TypeError(f"no name for {type(x).__name__}")
 
 
 class Native:
@@ -48,65 +87,88 @@ class Native:
 
   def __init__(self, mj_model: mujoco.MjModel, substeps: int, outputs: tuple[str, ...] = ("qpos", "qvel"), law=None):
     try:
-      import mjbatch
+      import mjbatch  # noqa: F401
     except ImportError:
       raise UserError("physics 'native' needs the package mjbatch (pip install mjbatch==0.1.4; Linux and macOS)") from None
-    self._mjbatch = mjbatch
     self.mj_model, self.substeps, self.outputs, self.law = mj_model, substeps, tuple(outputs), law
-    self._forward = any(o not in ("qpos", "qvel") for o in outputs)
-    data = mujoco.MjData(mj_model)
-    spec = mujoco.mjtState.mjSTATE_INTEGRATION
-    row = np.empty(mujoco.mj_stateSize(mj_model, spec))
-    mujoco.mj_getState(mj_model, data, row, spec)
-    self._template = row.view(np.uint32).copy()
+    make, name = lambda: Host(copy.copy(mj_model), substeps, self.outputs, law), identity(mj_model, substeps, self.outputs, law)
+    self.host = by_name.shared(name, make)
+    if getattr(self.host.law, "__globals__", None) is not getattr(law, "__globals__", None):  # the same words in another module of the same name
+      name = uuid.uuid4().hex
+      self.host = by_name.shared(name, make)
+    self._name = name
     self._qpos_at = mujoco.mj_stateSize(mj_model, mujoco.mjtState.mjSTATE_TIME)
-    self._shapes = {o: np.shape(getattr(data, o)) for o in self.outputs}
-    if law is not None:
-      self._shapes |= {"ctrl": (mj_model.nu,), "qvel_before": (mj_model.nv,)}
-    self._batches: dict[int, object] = {}
-    self._lock = threading.Lock()
-    self.seconds = 0.0  # spent in callbacks since the start, for a run's wall_share
 
   def init(self, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
     """Row (uint32, opaque) of the model's initial state with qpos (nq,) and qvel (nv,). Makes no callback."""
     at = 2 * self._qpos_at
     nq, nv = 2 * self.mj_model.nq, 2 * self.mj_model.nv
-    row = jnp.asarray(self._template)
+    row = jnp.asarray(self.host.template)
     return row.at[at:at + nq].set(float64_bits(qpos)).at[at + nq:at + nq + nv].set(float64_bits(qvel))
 
   def step(self, fields: dict[str, jax.Array], state: jax.Array, ctrl: jax.Array, task=None, force=None):
     """`substeps` x mj_step of one robot; a vmap of it steps all robots in one call on all threads.
 
-    Everything crosses to the host and back as one array of bits each way: an operand of a callback costs some 20 us, however small.
+    Everything crosses to the host and back as one array of bits each way: an operand of its own would cost a copy each way and a kernel.
     """
     given = {"ctrl": ctrl} | ({} if force is None else {"force": force}) | {f"field {k}": v for k, v in fields.items()}
     given |= {f"task {k}": v for k, v in (task or {}).items()} if self.law is not None else {}
     given = {k: jnp.asarray(v, jnp.float32) for k, v in given.items()}
-    layout = tuple((k, v.shape) for k, v in given.items())
+    layout = json.dumps([(k, v.shape) for k, v in given.items()])
     bits = lambda x: jax.lax.bitcast_convert_type(x, jnp.uint32).reshape(-1)
-    width = state.shape[0] + sum(int(np.prod(s)) for s in self._shapes.values())
-    out = jax.pure_callback(functools.partial(self._packed_step, layout), jax.ShapeDtypeStruct((width,), jnp.uint32),
-                            jnp.concatenate([state] + [bits(v) for v in given.values()]), vmap_method="broadcast_all")
+    width = state.shape[0] + sum(int(np.prod(s)) for s in self.host.shapes.values())
+    out = by_name.call(self._name, layout, width, jnp.concatenate([state] + [bits(v) for v in given.values()]))
     values, at = {}, state.shape[0]
-    for name, shape in self._shapes.items():
+    for name, shape in self.host.shapes.items():
       size = int(np.prod(shape))
       values[name] = jax.lax.bitcast_convert_type(out[at:at + size], jnp.float32).reshape(shape)
       at += size
     return out[:state.shape[0]], values
 
-  def _packed_step(self, layout, packed):
-    """`_host_step` on one array of bits, (..., state + everything in `layout`) -> (..., state + outputs)."""
-    packed = np.asarray(packed)
-    lead, at, given = packed.shape[:-1], self._template.shape[0], {}
-    for name, shape in layout:
-      size = int(np.prod(shape))
+
+@functools.cache
+def _read(layout: str) -> tuple:
+  """(name, shape, size) of every array behind the state, as `Native.step` wrote them."""
+  return tuple((name, tuple(shape), int(np.prod(shape))) for name, shape in json.loads(layout))
+
+
+class Host:
+  """What stands behind a `Native` outside JAX: steps batches of its model, one call after another.
+
+  Attributes:
+    template: uint32, the row of the model's initial state.
+    shapes: {output: shape}.
+    seconds: spent in calls since the start, for a run's wall_share.
+  """
+
+  def __init__(self, mj_model: mujoco.MjModel, substeps: int, outputs: tuple[str, ...], law):
+    import mjbatch
+    self._mjbatch = mjbatch
+    self.mj_model, self.substeps, self.outputs, self.law = mj_model, substeps, outputs, law
+    self._forward = any(o not in ("qpos", "qvel") for o in outputs)
+    data = mujoco.MjData(mj_model)
+    spec = mujoco.mjtState.mjSTATE_INTEGRATION
+    row = np.empty(mujoco.mj_stateSize(mj_model, spec))
+    mujoco.mj_getState(mj_model, data, row, spec)
+    self.template = row.view(np.uint32).copy()
+    self.shapes = {o: np.shape(getattr(data, o)) for o in outputs}
+    if law is not None:
+      self.shapes |= {"ctrl": (mj_model.nu,), "qvel_before": (mj_model.nv,)}
+    self._batches: dict[int, object] = {}
+    self._lock = threading.Lock()
+    self.seconds = 0.0
+
+  def __call__(self, layout: str, packed: np.ndarray) -> np.ndarray:
+    """`step` on one array of bits, (..., state + everything in `layout`) -> (..., state + outputs)."""
+    lead, at, given = packed.shape[:-1], self.template.shape[0], {}
+    for name, shape, size in _read(layout):
       given[name] = packed[..., at:at + size].view(np.float32).reshape(lead + shape)
       at += size
     part = lambda kind: {k[len(kind) + 1:]: v for k, v in given.items() if k.startswith(kind + " ")}
-    rows, out = self._host_step(part("field"), packed[..., :self._template.shape[0]], given["ctrl"], part("task"), given.get("force"))
-    return np.concatenate([rows] + [out[o].reshape(lead + (-1,)).view(np.uint32) for o in self._shapes], -1)
+    rows, out = self.step(part("field"), packed[..., :self.template.shape[0]], given["ctrl"], part("task"), given.get("force"))
+    return np.concatenate([rows] + [out[o].reshape(lead + (-1,)).view(np.uint32) for o in self.shapes], -1)
 
-  def _host_step(self, fields, state, ctrl, task=None, force=None):
+  def step(self, fields, state, ctrl, task=None, force=None):
     begin = time.perf_counter()
     state = np.asarray(state)
     lead, width = state.shape[:-1], state.shape[-1]
@@ -131,7 +193,7 @@ class Native:
             extra = {"ctrl": np.array(views["ctrl"], np.float32), "qvel_before": np.array(qvel, np.float32)}
           batch.step(nstep=1)
         extra = {k: v.reshape(lead + v.shape[1:]) for k, v in extra.items()}
-      out = {o: np.array(views["out " + o], np.float32).reshape(lead + self._shapes[o]) for o in self.outputs}
+      out = {o: np.array(views["out " + o], np.float32).reshape(lead + self.shapes[o]) for o in self.outputs}
       rows = np.array(views["state"]).view(np.uint32).reshape(lead + (width,))
       self.seconds += time.perf_counter() - begin
       return rows, out | extra
