@@ -23,10 +23,10 @@ def report() -> dict:
     keys = jax.random.split(jax.random.key(0), num)
     state, _ = jax.vmap(lambda k: env.init(env.model, k))(keys)
     rows_, ctrl = np.asarray(state.physics), np.zeros((num, 6), np.float32)
-    env.physics._host_step({}, rows_, ctrl)
+    env.physics.host.step({}, rows_, ctrl)
     steps, begin = 0, time.perf_counter()
     while time.perf_counter() - begin < 1.0:
-      rows_, _ = env.physics._host_step({}, rows_, ctrl)
+      rows_, _ = env.physics.host.step({}, rows_, ctrl)
       steps += num
     rows["walker_control_steps_s"] = round(steps / (time.perf_counter() - begin))
   return rows

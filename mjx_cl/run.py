@@ -187,8 +187,8 @@ class Runner:
                     digest.phase, digest.signals[:, 2], self._alarms, digest.updates)
 
   def _physics_seconds(self) -> float:
-    hosts = {id(host): host for host in (getattr(envs.physics_of(robot), "host", None) for robot in self.robots)}  # robots of one model share theirs
-    return sum(getattr(host, "seconds", 0.0) for host in hosts.values())
+    clocks = {id(getattr(p, "host", p)): p for p in map(envs.physics_of, self.robots)}  # robots of one model share a host
+    return sum(getattr(p, "seconds", 0.0) for p in clocks.values())
 
   def _acceptance(self, streams, now: int):
     """Level (groups,) of the robot that each stream has after `now` control steps; None where robots stay what they are."""

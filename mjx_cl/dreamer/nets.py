@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 
+import flax
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -37,6 +38,16 @@ def kernel_init(fan_in: int, outscale: float = 1.0):
   return init
 
 
+def parameter(module: nn.Module, name: str, init, shape: tuple[int, ...]) -> jax.Array:
+  """`module.param(name, init, shape)`. Flax traces the initialiser at every use, to compare shapes: an eighth of an update's tracing. Here they are compared as they are."""
+  if not module.has_variable("params", name):
+    return module.param(name, init, shape)
+  value = module.get_variable("params", name)
+  if value.shape != shape:
+    raise flax.errors.ScopeParamShapeError(name, module.scope.path_text, shape, value.shape)
+  return value
+
+
 class Linear(nn.Module):
   """y = x W + b over the last axis. `split` inputs, given as a tuple, are multiplied one by one and added: the product of their
   concatenation, without building it."""
@@ -46,8 +57,8 @@ class Linear(nn.Module):
   @nn.compact
   def __call__(self, *xs):
     fan_in = sum(x.shape[-1] for x in xs)
-    kernel = self.param("kernel", kernel_init(fan_in, self.outscale), (fan_in, self.units))
-    bias = self.param("bias", nn.initializers.zeros, (self.units,))
+    kernel = parameter(self, "kernel", kernel_init(fan_in, self.outscale), (fan_in, self.units))
+    bias = parameter(self, "bias", nn.initializers.zeros, (self.units,))
     start, y = 0, bias
     for x in xs:
       y = y + x @ kernel[start:start + x.shape[-1]]
@@ -66,7 +77,7 @@ class Norm(nn.Module):
 
   @nn.compact
   def __call__(self, x):
-    gain = self.param("gain", nn.initializers.ones, (x.shape[-1],))
+    gain = parameter(self, "gain", nn.initializers.ones, (x.shape[-1],))
     return x * jax.lax.rsqrt(mean_square(x) + 1e-4) * gain
 
 

@@ -8,7 +8,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from mjx_cl.dreamer.nets import Hidden, Linear, MLP, kernel_init, mean_square
+from mjx_cl.dreamer.nets import Hidden, Linear, MLP, kernel_init, mean_square, parameter
 from mjx_cl.dreamer.sizes import Size
 
 UNIMIX = 0.01
@@ -37,8 +37,8 @@ class BlockLinear(nn.Module):
   def __call__(self, x, shared=None):
     blocks, rows, own = x.shape
     extra = 0 if shared is None else shared.shape[-1]
-    kernel = self.param("kernel", kernel_init(blocks * (own + extra)), (blocks, own + extra, self.units))
-    bias = self.param("bias", nn.initializers.zeros, (blocks * self.units,))
+    kernel = parameter(self, "kernel", kernel_init(blocks * (own + extra)), (blocks, own + extra, self.units))
+    bias = parameter(self, "bias", nn.initializers.zeros, (blocks * self.units,))
     y = jnp.einsum("gni,gio->gno", x, kernel[:, :own]) + bias.reshape(blocks, 1, self.units)
     if shared is not None:
       dense = self.get_variable("hoisted", "dense") if self.has_variable("hoisted", "dense") else dense_part(kernel, own)
@@ -52,7 +52,7 @@ class BlockNorm(nn.Module):
   @nn.compact
   def __call__(self, x):
     blocks, _, width = x.shape
-    gain = self.param("gain", nn.initializers.ones, (blocks * width,)).reshape(blocks, 1, width)
+    gain = parameter(self, "gain", nn.initializers.ones, (blocks * width,)).reshape(blocks, 1, width)
     return x * jax.lax.rsqrt(jnp.mean(mean_square(x), 0, keepdims=True) + 1e-4) * gain
 
 

@@ -99,6 +99,11 @@ class Native:
     self._name = name
     self._qpos_at = mujoco.mj_stateSize(mj_model, mujoco.mjtState.mjSTATE_TIME)
 
+  @property
+  def seconds(self) -> float:
+    """Spent in calls to the host since its start, for a run's wall_share."""
+    return self.host.seconds
+
   def init(self, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
     """Row (uint32, opaque) of the model's initial state with qpos (nq,) and qvel (nv,). Makes no callback."""
     at = 2 * self._qpos_at
@@ -138,7 +143,7 @@ class Host:
   Attributes:
     template: uint32, the row of the model's initial state.
     shapes: {output: shape}.
-    seconds: spent in calls since the start, for a run's wall_share.
+    seconds: spent in calls.
   """
 
   def __init__(self, mj_model: mujoco.MjModel, substeps: int, outputs: tuple[str, ...], law):
@@ -169,6 +174,7 @@ class Host:
     return np.concatenate([rows] + [out[o].reshape(lead + (-1,)).view(np.uint32) for o in self.shapes], -1)
 
   def step(self, fields, state, ctrl, task=None, force=None):
+    """`Native.step` on NumPy arrays with any leading axes: (rows, {output: float32})."""
     begin = time.perf_counter()
     state = np.asarray(state)
     lead, width = state.shape[:-1], state.shape[-1]
