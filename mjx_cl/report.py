@@ -306,10 +306,10 @@ def dreamer(results: pathlib.Path) -> str:
       ("acting, 40 streams of one agent / with an agent each, per control step", f"{v(acting[0], 2)} / {v(acting[1], 1)} ms", goals(*acting)),
       ("monitor, 40 streams of one agent / with an agent each, share", f"{v(watching[0], 2)} / {v(watching[1], 2)}", goals(*watching)),
   ]
-  for name, note in (("update", ""), ("monitor", ""), ("rollout", " (holds a callback, never cached)")):
+  for name in ("update", "monitor", "rollout"):
     cold, cached = f"compile {name}, cold", f"compile {name}, cached"
     digits = 0 if (bench.row(cold)["value"] or 0) >= 10 else 1
-    rows.append((f"compile {name}, cold / cached{note}", f"{v(cold, digits)} / {v(cached, 1)} s", goals(cold, cached)))
+    rows.append((f"compile {name}, cold / cached", f"{v(cold, digits)} / {v(cached, 1)} s", goals(cold, cached)))
   text = fill(f"""
       **Speed and memory** (`{bench.about['command']}`, [results/dreamer_update.json](results/dreamer_update.json); {bench.about['machine']};
       medians). The share is floating-point operations / time / the rate of a 2,048 x 2,048 float32 product in the same process, the figure that

@@ -73,8 +73,8 @@ def give_back() -> bool:
 def setup() -> None:
   """Sets XLA flags, the compile cache, the allocator and synchronous CPU dispatch. Call before the first JAX computation.
 
-  Synchronous dispatch: a callback into the physics converts its arguments on a thread of the CPU client, and with
-  asynchronous dispatch that conversion can wait for itself (jax issues 24255 and 25861).
+  Synchronous dispatch: a jax.pure_callback converts its arguments on a thread of the CPU client, and with asynchronous dispatch that conversion can wait for itself
+  (jax issues 24255 and 25861). Physics calls the host by name, without a conversion, but falls back to pure_callback where a jaxlib does not take that.
   """
   global _done
   if _done:

@@ -64,7 +64,9 @@ def _run(frame) -> None:
   """One call: the function named by the only attribute, on the only operand."""
   span = frame.attributes.at[0].contents
   name, _, word = ctypes.string_at(span.data, span.size).decode().partition(_BETWEEN)
-  _array(frame.results.at[0].contents)[...] = _look_up(name, word)(_array(frame.args.at[0].contents))
+  operand = _array(frame.args.at[0].contents)
+  operand.flags.writeable = False
+  _array(frame.results.at[0].contents)[...] = _look_up(name, word)(operand)
 
 
 @ctypes.CFUNCTYPE(_P, ctypes.POINTER(_Frame))
