@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import statistics
 import subprocess
 import sys
 import tempfile
@@ -47,19 +46,14 @@ def chunk():
 def measure(make, rounds: int) -> dict[str, float]:
   """Median seconds of each form, which take turns."""
   from mjx_cl.physics import by_name
+  from physics import race  # the script beside this one
   asked, programs = by_name.registered, {}
   for form in FORMS:
     use(form)
     programs[form] = make()
     programs[form]()
     by_name.registered = asked
-  times = {form: [] for form in FORMS}
-  for _ in range(rounds):
-    for form, program in programs.items():
-      begin = time.perf_counter()
-      program()
-      times[form].append(time.perf_counter() - begin)
-  return {form: statistics.median(t) for form, t in times.items()}
+  return race(programs, rounds)
 
 
 def first(form: str) -> float:

@@ -242,3 +242,20 @@ def test_the_thresholds_that_ship_are_those_of_the_board(tmp_path):
   (folder / "leaderboard.parquet").write_text("no table")
   with pytest.raises(FileError, match="not a leaderboard's table"):
     thresholds.collect(folder)
+
+
+def test_host_call_measures_both_forms(monkeypatch):
+  """Each form's program is made and traced in that form, and the next one finds things as they were."""
+  from mjx_cl.physics import by_name
+  monkeypatch.syspath_prepend(FOLDER)
+  bench, asked, ways = load("host_call"), by_name.registered, []
+
+  def make():
+    x, program = np.zeros(2, np.uint32), lambda x: by_name.call("nothing", "", 2, x)
+    ways.append("pure_callback" in str(jax.make_jaxpr(program)(x)))
+    compiled = quick.jit(program)
+    return lambda: compiled(x).block_until_ready()
+  nothing = by_name.shared("nothing", lambda: lambda word, x: x)
+  times = bench.measure(make, 1)
+  assert ways == [False, True] and list(times) == list(bench.FORMS) and min(times.values()) > 0 and by_name.registered is asked
+  del nothing

@@ -1,10 +1,10 @@
 """Host functions that compiled programs call by name.
 
 A program with jax.pure_callback holds the address of its Python function, so that JAX cannot keep it in the compile cache: it is compiled anew in every process and for
-every instance of a robot (4 to 10 s each). A call through XLA's foreign function interface names its target instead. `call` gives every program the one target
+every instance of a robot, some 4 s for the walker's rollout. A call through XLA's foreign function interface names its target instead. `call` gives every program the one target
 `mjx_cl_host`, a C function pointer that ctypes makes of a Python function, and the name of the host function as an attribute. Names must say all that the function's
-results depend on: a program from the cache calls whatever this process has registered under the name that it was compiled with. A call also costs a tenth of a
-pure_callback's (benchmarks/README.md, "What a call to the host costs").
+results depend on: a program from the cache calls whatever this process has registered under the name that it was compiled with. A call also costs a fifth of a
+pure_callback's (results/host_call.json).
 
 Struct layouts: xla/ffi/api/c_api.h (API 0.3), which jaxlib ships; XLA only appends to them, and asks for the version when the target is registered. Where that
 fails (another jaxlib), `call` is a pure_callback as before.

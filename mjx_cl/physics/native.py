@@ -114,7 +114,7 @@ class Native:
   def step(self, fields: dict[str, jax.Array], state: jax.Array, ctrl: jax.Array, task=None, force=None):
     """`substeps` x mj_step of one robot; a vmap of it steps all robots in one call on all threads.
 
-    Everything crosses to the host and back as one array of bits each way: an operand of its own would cost a copy each way and a kernel.
+    Everything crosses to the host and back as one array of bits each way: one operand, whatever the fields.
     """
     given = {"ctrl": ctrl} | ({} if force is None else {"force": force}) | {f"field {k}": v for k, v in fields.items()}
     given |= {f"task {k}": v for k, v in (task or {}).items()} if self.law is not None else {}
