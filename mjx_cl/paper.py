@@ -56,6 +56,7 @@ EXPERIMENTS: dict[str, Experiment] = {
         "quadruped", 0, 9000, "right hind leg's velocity limits to a third", "9 runs and a failed one", "MuJoCo in place of Isaac Lab", (
         Statement("alarm after onset", "\"quickly\"", "IV-B", "latency"),
         Statement("reward back after onset", "walking stable after 5,000 steps on average", "IV-B", "recovery", 5000),
+        Statement("no fall for 2,000 steps and reward back", "as above, 9 runs of 10", "IV-B", "stable", 5000),
         Statement("last finetuning stops at step", "26,000", "IV-B", "last_stop", 26_000),
         Statement("how finetuning ends", "9 runs stop by themselves, a failed one is aborted", "IV-B", "outcomes", 0.9),
     )),
@@ -122,6 +123,14 @@ def recovery(rows: list[dict]) -> Measured:
   return times([np.inf if r["recovery_step"] is None else r["recovery_step"] - r["onset"] for r in rows if r["affected"]], "affected streams")
 
 
+def stable(rows: list[dict]) -> Measured:
+  """Steps from the onset until a stream neither falls nor earns less than 90 % for 2,000 steps, of all streams (scoring.recovery.stable_step)."""
+  met = [r for r in rows if r["onset"] is not None]
+  if any("stable_step" not in r for r in met):
+    return Measured(None, "not measured: runs.parquet is older than this figure")
+  return times([np.inf if r["stable_step"] is None else r["stable_step"] - r["onset"] for r in met], "streams")
+
+
 def stop(rows: list[dict]) -> Measured:
   """Steps from the change to the end of the first finetuning that converged after it; a stream without one is censored. Says how many alarmed again."""
   met = [r for r in rows if r["onset"] is not None]
@@ -155,7 +164,7 @@ def drop(rows: list[dict]) -> Measured:
   return shares([r["reward_drop"] for r in rows if r["reward_drop"] is not None], "streams")
 
 
-MEASURES = {"latency": latency, "recovery": recovery, "stop": stop, "last_stop": last_stop, "outcomes": outcomes, "kept": kept, "drop": drop}
+MEASURES = {"latency": latency, "recovery": recovery, "stop": stop, "last_stop": last_stop, "outcomes": outcomes, "kept": kept, "drop": drop, "stable": stable}
 
 
 def difference(paper: float | None, own: Measured) -> str:

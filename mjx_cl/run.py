@@ -471,6 +471,7 @@ class Runner:
           lost = recovery.reward_drop(reward, onset, before)
         affected = None if lost is None else bool(lost >= 0.1)
         back = recovery.recovery_step(reward, onset, before)
+        stable = None if never else recovery.stable_step(reward, trace["terminated"][:end, g], onset, before)
         last = (self._updates[g] if end == c.steps else trace["updates"][end, g]) - (trace["updates"][begin, g] if change else 0)
         rows.append({
             "stream": g, "arm": arm, "seed": seed, "fault": names[g], "change": change, "kind": happens[g][onset], "onset": None if never else onset,
@@ -478,7 +479,7 @@ class Runner:
             "latency_s": None if score.latency_steps is None else score.latency_steps * control_s, "false_alarms": None if change else score.false_alarms,
             "adapt_start": starts[0] if starts else None, "adapt_stop": ends[-1]["step"] if ends else None, "outcome": outcome,
             "reason": ends[-1]["reason"] if ends else None, "affected": affected, "recovery_step": back if affected else None,
-            "reward_pre": before, "reward_drop": lost, "reward_final": float(np.mean(reward[-recovery.FINAL:])),
+            "stable_step": stable, "reward_pre": before, "reward_drop": lost, "reward_final": float(np.mean(reward[-recovery.FINAL:])),
             "return_lost": None if never else recovery.return_lost(reward, onset, before),
             "return_lost_healthy": None if change else recovery.return_lost_healthy(reward, onset, before, begun[g]),
             "terminations": int(trace["terminated"][begin:end, g].sum()),

@@ -424,7 +424,7 @@ def test_missed_goals_are_said(results):
 
 def run_row(seed, **other):
   return {"stream": seed, "arm": "detector", "seed": seed, "change": 0, "onset": 5000, "latency_steps": 100, "adapt_start": 5110,
-          "adapt_stop": 12_000, "outcome": "converged", "affected": True, "recovery_step": 9000,
+          "adapt_stop": 12_000, "outcome": "converged", "affected": True, "recovery_step": 9000, "stable_step": 9500,
           "reward_pre": 1.0, "reward_drop": 0.3, "reward_final": 0.9, "first_stop": 12_000, "restarts": 0} | other
 
 
@@ -447,7 +447,8 @@ def test_each_measure_by_hand():
   rows = [run_row(0), calm, lost, run_row(3, reward_final=1.0, restarts=2)]
   measured = {name: f(rows) for name, f in paper.MEASURES.items()}
   assert {name: m.value for name, m in measured.items()} == {
-      "latency": 100, "recovery": 4000, "stop": 7000, "last_stop": 20_000, "outcomes": 0.5, "kept": pytest.approx(0.8), "drop": pytest.approx(0.3)}
+      "latency": 100, "recovery": 4000, "stop": 7000, "last_stop": 20_000, "outcomes": 0.5, "kept": pytest.approx(0.8), "drop": pytest.approx(0.3), "stable": 4500}
+  assert paper.stable([{k: v for k, v in run_row(0).items() if k != "stable_step"}]).value is None
   assert measured["stop"].text.endswith("2 of 4 streams, 1 of them alarmed again later")
   assert measured["recovery"].text.endswith("2 of 3 affected streams") and measured["latency"].text.endswith("3 of 4 streams")
   assert measured["outcomes"].text == "converged 2 of 4 [0.6, 3.4], aborted 1, still adapting 0, never alarmed 1"

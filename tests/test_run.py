@@ -99,7 +99,7 @@ def test_all_files_are_there_with_their_columns(whole):
       "stream", "arm", "seed", "fault", "step", "episode", "phase", "fault_active", "severity", "reward", "opr", "rpr", "score", "alarm",
       "terminated", "truncated", "valid", *(f"residual_{name}" for name, _ in envs.make("walker").spec.watched), "dyn_loss", "adv_mag", "value_loss", "updates"]
   assert {"stream", "step", "kind", "reason", "fault"} <= set(table(out, "events"))
-  assert {"arm", "onset", "alarm_step", "latency_steps", "latency_s", "false_alarms", "adapt_start", "adapt_stop", "outcome", "recovery_step",
+  assert {"arm", "onset", "alarm_step", "latency_steps", "latency_s", "false_alarms", "adapt_start", "adapt_stop", "outcome", "recovery_step", "stable_step",
           "reward_pre", "reward_drop", "reward_final", "return_lost", "terminations", "updates", "wall_s"} <= set(table(out, "runs"))
 
 

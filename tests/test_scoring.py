@@ -117,6 +117,20 @@ def test_recovery_of_a_reward_below_0():
   assert recovery.recovery_step(trace((1000, -1.0), (2000, -3.0), (4000, -1.0)), 1000, -1.0) == 3000 + 949
 
 
+def test_stable_asks_for_no_fall_besides():
+  """A fall during the hold puts it off; one before it, or before the onset, does not; without falls it is the recovery."""
+  reward, calm = trace((1000, 1.0), (2000, 0.0), (6000, 1.0)), np.zeros(9000, bool)
+  back = recovery.recovery_step(reward, 1000, 1.0)
+  assert recovery.stable_step(reward, calm, 1000, 1.0) == back
+  falls = lambda *steps: np.isin(np.arange(9000), steps)
+  assert recovery.stable_step(reward, falls(500, 1500, back - 1), 1000, 1.0) == back
+  assert recovery.stable_step(reward, falls(back + 1999), 1000, 1.0) == back + 2000 and recovery.stable_step(reward, falls(back + 2000), 1000, 1.0) == back
+  assert recovery.stable_step(reward, falls(back + 1900, back + 3500, back + 5000), 1000, 1.0) is None
+  flat = np.ones(9000)
+  assert recovery.stable_step(flat, calm, 1000, 1.0) == 1000 and recovery.stable_step(flat, falls(1200), 1000, 1.0) == 1201  # a fall is a fall, whatever it costs
+  assert recovery.stable_step(flat, calm, 1000, None) is None
+
+
 # ---- aggregates ----------------------------------------------------------------------------------------------------------------------
 
 @pytest.mark.parametrize("n", [1, 2, 3, 4, 5, 8, 10, 20, 33])

@@ -32,18 +32,33 @@ def recovery_step(reward: np.ndarray, onset: int, pre: float | None) -> int | No
   The mean lags by up to 1,000 steps. A stream whose mean never falls below after onset was never down: its recovery step is the onset.
   None: censored, or the run ends before the hold does.
   """
-  if not pre:
-    return None
+  return _held(_good(reward, pre), onset) if pre else None
+
+
+def stable_step(reward: np.ndarray, terminated: np.ndarray, onset: int, pre: float | None) -> int | None:
+  """As `recovery_step`, with one demand more: not one of the 2,000 steps ends an episode early (a fall, a crash), `terminated` bool (steps,).
+
+  A stream that neither falls nor loses a tenth after the onset was stable throughout: the onset. Source: "stable gait" of the paper's quadruped.
+  """
+  return _held(_good(reward, pre) & ~np.asarray(terminated, bool), onset) if pre else None
+
+
+def _good(reward: np.ndarray, pre: float) -> np.ndarray:
+  """Steps whose trailing mean is at or above 90 % of `pre`, bool."""
   sums = np.concatenate([[0.0], np.cumsum(reward, dtype=float)])
   steps = np.arange(len(reward))
   begin = np.maximum(0, steps + 1 - TRAIL)
   trailing = (sums[steps + 1] - sums[begin]) / (steps + 1 - begin)
-  good = trailing >= (SHARE if pre > 0 else 2 - SHARE) * pre
-  fallen = np.flatnonzero(~good[onset:])
-  if not len(fallen):
+  return trailing >= (SHARE if pre > 0 else 2 - SHARE) * pre
+
+
+def _held(good: np.ndarray, onset: int) -> int | None:
+  """First step of HOLD good ones in a row after the first bad one from `onset` on; `onset` where none is bad, None where there are none."""
+  bad = np.flatnonzero(~good[onset:])
+  if not len(bad):
     return onset
   run = 0
-  for k in range(onset + int(fallen[0]), len(reward)):
+  for k in range(onset + int(bad[0]), len(good)):
     run = run + 1 if good[k] else 0
     if run == HOLD:
       return k - HOLD + 1
