@@ -19,6 +19,7 @@ import json
 import os
 import pathlib
 import shutil
+import sys
 import time
 from typing import NamedTuple
 
@@ -33,6 +34,7 @@ from mjx_cl.adapt.convergence import SIGNALS
 from mjx_cl.adapt.crew import Crew
 from mjx_cl.adapt.loop import Choices, Loop, LoopState, choices
 from mjx_cl.config import CHUNK, AdaptConfig, RunConfig, becomes, changes
+from mjx_cl.dreamer.agent import CAUSES, EXPLODED
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.interrupt import Interruptible
 from mjx_cl.monitor import Monitor, watched
@@ -42,7 +44,7 @@ from mjx_cl.snapshots import Snapshots
 from mjx_cl.transfer import Moving, Transfer
 
 # by decision: what a stream has come to
-OUTCOMES = ("nominal", "adapting", "converged", "aborted_by_rule", "aborted_by_rule", "aborted_by_budget", "ended")
+OUTCOMES = ("nominal", "adapting", "converged", "aborted_by_rule", "aborted_by_rule", "aborted_by_budget", "ended", "failed")
 
 
 class State(NamedTuple):
@@ -164,10 +166,7 @@ class Runner:
     updates = digest.updates - self._updates
     self._updates = digest.updates
     self.done_chunks += 1
-    broken = ~np.isfinite(digest.signals[:, 2:]).all(1) | (digest.skipped > 0)
-    if broken.any():
-      bad = [self.labels[g] for g in np.flatnonzero(broken)]
-      raise FileError(f"numeric failure at step {now} in stream {bad[0]}: a loss is not finite; the last checkpoint is intact")
+    self._notice_failures(digest, now)
     if self.snapshots:
       self.snapshots.take(self.acting, before, digest, now, self.chunk_steps)
     if self.compiled:
@@ -185,6 +184,18 @@ class Runner:
     self._alarms = self._alarms + digest.fired.sum(0)
     return Progress(min(now, self.config.steps), self.config.steps, sum(self.seconds.values()), [a for a, _ in self.labels], [s for _, s in self.labels],
                     digest.phase, digest.signals[:, 2], self._alarms, digest.updates)
+
+  def _notice_failures(self, digest, now: int) -> None:
+    """Says which streams are given up for a loss at fault; they live on without learning. A reward that is no number would spoil every figure: that ends the run."""
+    lost = np.flatnonzero(~np.isfinite(digest.signals[:, SIGNALS.index("reward")]))
+    if len(lost):
+      raise FileError(f"numeric failure at step {now} in stream {self.labels[lost[0]]}: its reward is not finite; the last checkpoint is intact")
+    for g in np.flatnonzero(digest.decision == phase_lib.ABORT_NUMERIC):
+      bad = int(digest.failed[g])
+      term = CAUSES[bad] if bad >= 0 else next(name for name, x in zip(SIGNALS[3:], digest.signals[g, 3:]) if not np.isfinite(x))
+      arm, seed = self.labels[g]
+      print(f"mjx-cl: numeric failure at step {now} of arm {arm}, seed {seed}: {term} is not finite, or above {EXPLODED:g}; it learns no more, the others go on",
+            file=sys.stderr, flush=True)
 
   def _physics_seconds(self) -> float:
     clocks = {id(getattr(p, "host", p)): p for p in map(envs.physics_of, self.robots)}  # robots of one model share a host

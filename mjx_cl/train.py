@@ -17,7 +17,7 @@ import numpy as np
 
 from mjx_cl import checkpoint, demonstrator, fault_presets, faults, memory, replay as replay_lib
 from mjx_cl.config import CHUNK, DreamerConfig, TrainConfig
-from mjx_cl.dreamer.agent import Agent, TrainState, Weights
+from mjx_cl.dreamer.agent import CAUSES, EXPLODED, Agent, TrainState, Weights, culprit
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.interrupt import Interruptible
 from mjx_cl.rollout import Rollout, Stream, nest, records, start
@@ -35,25 +35,35 @@ class Learner(NamedTuple):
 
 
 def make_learn(agent: Agent, batch: int, length: int, mesh=None):
-  """(train, replay, key, weights, active (seeds,), updates) -> (train, replay, metrics (seeds,), means over the updates), seeds leading, jitted.
+  """(train, replay, key, weights, active (seeds,), updates) -> (train, replay, metrics (seeds,), means over the updates, culprit (seeds,)), seeds leading, jitted.
+
+  `culprit` is the index into agent.CAUSES of the term at fault, -1 for none: with the update at fault, which changes no weights, the seed's updates end.
 
   Seeds run one after another inside the program (`lax.map`): on a CPU that is as fast as vmap or faster, and needs the memory of one. A seed
   that is not active is passed over. With a `mesh` each of its devices does its own share of the seeds.
   """
   def one_seed(train, replay, key, weights, updates):
-    def step(state, key):
-      train, replay = state
+    keys = jax.random.split(key, updates)
+
+    def step(train, replay, key):
       key_sample, key_update = jax.random.split(key)
       replay, data, address = replay_lib.sample(replay, key_sample, batch, length + 1)
       train, metrics, latents = agent.update(train, data, key_update, weights)
-      return (train, replay_lib.refresh(replay, address, latents)), metrics
-    (train, replay), metrics = jax.lax.scan(step, (train, replay), jax.random.split(key, updates))
-    return train, replay, jax.tree.map(jnp.mean, metrics)
+      return train, replay_lib.refresh(replay, address, latents), metrics
+
+    def body(state):
+      i, train, replay, sums, _ = state
+      train, replay, metrics = step(train, replay, keys[i])
+      return i + 1, train, replay, jax.tree.map(jnp.add, sums, metrics), culprit(metrics)
+    zero = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(step, train, replay, key)[2])
+    more = lambda state: (state[0] < updates) & (state[-1] < 0)
+    i, train, replay, sums, bad = jax.lax.while_loop(more, body, (jnp.int32(0), train, replay, zero, jnp.int32(-1)))
+    return train, replay, jax.tree.map(lambda x: x / i, sums), bad
 
   def every(train, replay, keys, weights, active, updates):
     run = lambda train, replay, key: one_seed(train, replay, key, weights, updates)
     shapes = jax.eval_shape(run, *jax.tree.map(lambda x: x[0], (train, replay, keys)))[2]
-    rest = lambda train, replay, key: (train, replay, jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes))
+    rest = lambda train, replay, key: (train, replay, jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes), jnp.int32(-1))
     return jax.lax.map(lambda x: jax.lax.cond(x[3], run, rest, *x[:3]), (train, replay, keys, active))
 
   @functools.partial(jax.jit, static_argnames=("updates",), donate_argnums=(0, 1))
@@ -341,10 +351,10 @@ class Trainer:
       if count:
         key, key_learn = jax.random.split(self.state.key)
         active = np.array([g not in self.failed for g in range(self.seeds)])
-        train, replay, metrics = self.learn[self.phase](self.state.train, self.state.replay, key_learn, self._weights(), active, count)
+        train, replay, metrics, bad = self.learn[self.phase](self.state.train, self.state.replay, key_learn, self._weights(), active, count)
         self.state = self.state._replace(train=train, replay=replay, key=key)
         metrics = {k: np.asarray(v) for k, v in metrics.items()}
-        self._notice_failures(metrics, active)
+        self._notice_failures(np.asarray(bad))
         alive = [g for g in range(self.seeds) if g not in self.failed]
         row |= {k: float(np.mean(v[alive])) for k, v in metrics.items()} | {"failed_seeds": len(self.failed)}
     end = time.monotonic()
@@ -355,13 +365,11 @@ class Trainer:
     self._advance_phase()
     return row
 
-  def _notice_failures(self, metrics: dict[str, np.ndarray], active: np.ndarray) -> None:
-    """Stops every seed that has a metric which is not finite: its weights are those before the update at fault, and stay."""
-    for g in np.flatnonzero(active):
-      bad = [k for k in sorted(metrics, key=lambda k: (not k.startswith("loss/"), k)) if not np.isfinite(metrics[k][g])]
-      if bad:
-        self.failed[int(g)] = f"{bad[0]} is not finite after update {int(np.asarray(self.state.train.updates)[g])}"
-        print(f"mjx-cl: numeric failure of seed {g}: {self.failed[int(g)]}; it stops here, its last sound weights are kept", file=sys.stderr, flush=True)
+  def _notice_failures(self, culprits: np.ndarray) -> None:
+    """Stops every seed with a term at fault (agent.culprit): its weights are those before that update, and stay."""
+    for g in np.flatnonzero(culprits >= 0):
+      self.failed[int(g)] = f"{CAUSES[culprits[g]]} is not finite, or above {EXPLODED:g}, in update {int(np.asarray(self.state.train.updates)[g]) + 1}"
+      print(f"mjx-cl: numeric failure of seed {g}: {self.failed[int(g)]}; it stops here, its last sound weights are kept", file=sys.stderr, flush=True)
     if len(self.failed) == self.seeds:
       raise FileError(f"numeric failure of every seed: {self.failed[self.seeds - 1]}; the last checkpoint is intact, --resume goes on from it")
 

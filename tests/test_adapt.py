@@ -356,7 +356,7 @@ def test_blocks_of_streams_live_as_each_alone(story):
   again, blocks = tell(Agent, block=2)
   jax.tree.map(np.testing.assert_array_equal, begin, again)
   for one, other in zip(told, blocks, strict=True):
-    for name in ("fired", "settled", "phase", "decision", "since", "updates", "skipped"):
+    for name in ("fired", "settled", "phase", "decision", "since", "updates", "failed"):
       np.testing.assert_array_equal(getattr(one.digest, name), getattr(other.digest, name), err_msg=name)
     same = lambda a, b: np.testing.assert_allclose(np.asarray(a, float), np.asarray(b, float), rtol=1e-3, atol=1e-3)
     jax.tree.map(same, (one.digest.signals, one.digest.residual, one.digest.score, one.state.history, one.state.past, one.state.detector, one.state.phase, one.state.owed),

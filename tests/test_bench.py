@@ -4,6 +4,8 @@ import dataclasses
 import json
 import pathlib
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pyarrow.parquet
 import pytest
@@ -258,6 +260,13 @@ def test_replays_of_about_one_length_have_one_shape(steps, capacity):
   assert capacity <= max(1024, 1.25 * (steps + steps // 1000 + 3 * run.CHUNK))
 
 
+@pytest.mark.parametrize("steps, capacity", [(192, 1024), (640, 1024), (14_000, 14_336), (25_000, 28_672), (64_000, 65_536)])
+def test_replays_of_about_one_length_have_one_shape(steps, capacity):
+  """Room for every record, a quarter more at most."""
+  assert run.capacity(steps, 1000) == capacity >= steps + steps // 1000 + 2 * run.CHUNK or steps < 1024
+  assert capacity <= max(1024, 1.25 * (steps + steps // 1000 + 3 * run.CHUNK))
+
+
 @pytest.mark.parametrize("spoil", [
     lambda d: d._replace(skipped=np.asarray(d.skipped) + [0, 1]), lambda d: d._replace(signals=np.asarray(d.signals) * [[1.0], [np.nan]])], ids=["skipped", "nan"])
 def test_a_loss_that_is_not_finite_ends_a_run_in_one_line(mini, tmp_path, spoil):  # noqa: F811
@@ -282,6 +291,62 @@ def test_a_loss_that_is_not_finite_ends_a_run_in_one_line(mini, tmp_path, spoil)
   assert again.done_chunks == 1
   again.step()
   again.checkpoints.close()
+
+
+def test_a_reward_that_is_no_number_ends_a_run_in_one_line(mini, tmp_path):  # noqa: F811
+  """The stream is named, and what was saved before stays."""
+  (part,) = bench.pick(bench.suite(str(mini)).parts, ("healthy",))
+  runner = run.Runner(part.config, tmp_path / "out")
+  runner.open()
+  runner.step()
+  runner.save()
+  digest = runner.crew.digest
+
+  def broken(*given):
+    state, value = digest(*given)
+    return state, value._replace(signals=np.asarray(value.signals) * [[1.0], [np.nan]])
+  runner.crew.digest = broken
+  with pytest.raises(FileError, match=r"^numeric failure at step 128 in stream \('none', 1\): its reward is not finite; the last checkpoint is intact$"):
+    runner.step()
+  runner.checkpoints.close()
+  again = run.Runner(part.config, tmp_path / "out")
+  again.open()
+  again.resume()
+  assert again.done_chunks == 1
+  again.step()
+  again.checkpoints.close()
+
+
+def test_a_stream_whose_loss_fails_is_given_up_alone_and_named(mini, tmp_path, same, capfd):  # noqa: F811
+  """Seed 1's replay gets a reward that is no number: its weights stay as they were, it lives on, the other stream lives as if nothing had been."""
+  (part,) = bench.pick(bench.suite(str(mini)).parts, ("healthy",))
+  config = dataclasses.replace(part.config, steps=448, arms=("always",), adapt=dataclasses.replace(part.config.adapt, start_windows=1, ratio=64.0))
+  sound, hurt = (run.Runner(config, tmp_path / name) for name in ("sound", "hurt"))
+  chunks = config.steps // run.CHUNK
+  for runner in (sound, hurt):
+    runner.open()
+    for i in range(chunks):
+      if runner is hurt and i == 3:
+        assert (runner._updates > 0).all()
+        (block,) = [k for k, b in enumerate(runner.crew.blocks) if b.start == 1]
+        loop = runner.state.loop[block]
+        data = loop.replay.data
+        at = jax.tree.map(np.array, loop.train)
+        runner.state.loop[block] = loop._replace(replay=loop.replay._replace(data=data._replace(reward=data.reward * jnp.nan)))
+        taken = runner._updates.copy()
+      runner.step()
+  said = capfd.readouterr().err.splitlines()
+  assert [line for line in said if "numeric" in line] == ["mjx-cl: numeric failure at step 256 of arm always, seed 1: loss/rew is not finite, or above 1e+06; it learns no more, the others go on"]
+  assert hurt._updates[1] == taken[1] and hurt._updates[0] == sound._updates[0] > taken[0] and sound._updates[1] > taken[1]
+  assert same(hurt.state.loop[0], sound.state.loop[0])
+  end = hurt.state.loop[block].train
+  assert same(end.slow, at.slow) and same(end.opt, at.opt)  # params became what acts, as at every end
+  assert all(np.isfinite(x).all() for x in jax.tree.leaves(end.params))
+  store.write_json(tmp_path / "hurt" / "config.json", hurt.config_dict())
+  summary = hurt.finish()["arms"]["always"]
+  rows = {r["seed"]: r for r in store.read_rows(tmp_path / "hurt" / "runs.parquet")}
+  assert (rows[1]["outcome"], rows[1]["reason"], rows[1]["adapt_stop"]) == ("failed", "numeric failure", 255) and rows[0]["outcome"] != "failed" and summary["failed"] == 1
+  assert [(e["step"], e["reason"]) for e in store.read_rows(tmp_path / "hurt" / "events.parquet") if e["kind"] == "abort" and e["seed"] == 1] == [(255, "numeric failure")]
 
 
 def test_a_table_of_unlike_parts_has_nulls(tmp_path):

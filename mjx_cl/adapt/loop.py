@@ -12,8 +12,9 @@ import jax.numpy as jnp
 
 from mjx_cl import replay as replay_lib
 from mjx_cl.adapt import arms as arms_lib, phase as phase_lib
+from mjx_cl.adapt.convergence import SIGNALS
 from mjx_cl.config import AdaptConfig
-from mjx_cl.dreamer.agent import Agent, Batch, TrainState
+from mjx_cl.dreamer.agent import Agent, Batch, TrainState, culprit
 from mjx_cl.errors import choose
 from mjx_cl.monitor import History, Monitor, unknown
 from mjx_cl.rollout import records
@@ -49,8 +50,8 @@ class LoopState(NamedTuple):
 
 
 class Digest(NamedTuple):
-  """What the host logs of a chunk: rows (T, groups) and values (groups,). `skipped`: updates of the chunk that changed nothing, because a
-  loss or its gradient was not finite."""
+  """What the host logs of a chunk: rows (T, groups) and values (groups,). `failed`: index into agent.CAUSES of what was at fault in an update, which changed
+  nothing and was the stream's last; -1: nothing."""
   residual: Residual
   score: jax.Array
   fired: jax.Array
@@ -60,7 +61,7 @@ class Digest(NamedTuple):
   decision: jax.Array
   since: jax.Array
   updates: jax.Array
-  skipped: jax.Array
+  failed: jax.Array
 
 
 WIDTH = 8  # Choices.at is padded to a multiple of it: arms with up to eight starts share a program, `periodic` too
@@ -217,8 +218,13 @@ class Loop:
       reset = lambda new, old: jnp.where(begins.reshape((-1,) + (1,) * (old.ndim - 1)), new, old)
       train = train._replace(opt=jax.lax.cond(jnp.any(begins), lambda o: jax.tree.map(reset, fresh, o), lambda o: o, train.opt))
     counted = train.updates
-    train, replay = self._learn(train, replay, key_update, number, choices.world_only)
+    train, replay, failed = self._learn(train, replay, key_update, number, choices.world_only)
     taken = train.updates - counted
+
+    # a stream whose numbers fail is given up, whatever its phase, and acts on by what it had learnt
+    broken = (failed >= 0) | ~jnp.all(jnp.isfinite(signals[:, SIGNALS.index("dyn_loss"):]), 1)
+    decision = jnp.where(broken & (was != phase_lib.ABORTED), phase_lib.ABORT_NUMERIC, decision)
+    phase = phase._replace(phase=jnp.where(broken, phase_lib.ABORTED, phase.phase))
 
     # the robot acts by a moving average of what it learns, and keeps it when it is done
     rate = jnp.where(number > 0, config.average, 0.0)
@@ -231,7 +237,7 @@ class Loop:
     over = (decision == phase_lib.STOP) | (decision == phase_lib.END)
     detector = jax.lax.cond(jnp.any(over), self._refit, lambda d, p, s: d, detector, past, over)
     state = LoopState(train, acting, replay, history, detector, phase, past, owed - number, state.executed + taken)
-    return state, Digest(residual, alarms.score, alarms.fired, signals, ok, phase.phase, decision, phase.since, state.executed, number - taken)
+    return state, Digest(residual, alarms.score, alarms.fired, signals, ok, phase.phase, decision, phase.since, state.executed, failed)
 
   @staticmethod
   def _counts(replay):
@@ -275,16 +281,19 @@ class Loop:
     together = jax.tree.map(lambda x: x.reshape((-1,) + x.shape[2:]), replay)  # (groups, 1, ..) -> (groups, ..)
 
     def stream(g, state):
-      def update(i, state):
-        train, replay = state
+      def update(state):
+        i, train, replay, _ = state
         key_sample, key_update = jax.random.split(jax.random.fold_in(keys[g], i))
         replay, data, address = replay_lib.sample(replay, key_sample, c.batch, c.length + 1, only=g)
         before = take(train, g)
-        learnt, _, latents = self.agent.update(before, data, key_update)
-        return put(train, g, keep_behaviour(world_only[g], before, learnt)), replay_lib.refresh(replay, address, latents)
-      return jax.lax.fori_loop(0, number[g], update, state)
-    train, together = jax.lax.fori_loop(0, number.shape[0], stream, (train, together))
-    return train, jax.tree.map(lambda x, shape: x.reshape(shape), together, shapes, is_leaf=lambda x: isinstance(x, jax.Array))
+        learnt, metrics, latents = self.agent.update(before, data, key_update)
+        return i + 1, put(train, g, keep_behaviour(world_only[g], before, learnt)), replay_lib.refresh(replay, address, latents), culprit(metrics)
+      train, replay, failed = state
+      more = lambda state: (state[0] < number[g]) & (state[-1] < 0)
+      _, train, replay, bad = jax.lax.while_loop(more, update, (jnp.int32(0), train, replay, jnp.int32(-1)))
+      return train, replay, failed.at[g].set(bad)
+    train, together, failed = jax.lax.fori_loop(0, number.shape[0], stream, (train, together, jnp.full(number.shape, -1, jnp.int32)))
+    return train, jax.tree.map(lambda x, shape: x.reshape(shape), together, shapes, is_leaf=lambda x: isinstance(x, jax.Array)), failed
 
   def _refit(self, detector, past, stop):
     fresh = jax.tree.map(lambda x: jnp.broadcast_to(x, (stop.shape[0],) + x.shape), self.detector.init())

@@ -18,9 +18,9 @@ from mjx_cl.config import AdaptConfig
 NOMINAL, ADAPTING, CONVERGED, ABORTED, ENDED = range(5)
 PHASES = ("nominal", "adapting", "converged", "aborted", "ended")
 # decisions of a chunk
-NOTHING, START, STOP, ABORT_BELOW, ABORT_HOPELESS, ABORT_BUDGET, END = range(7)
+NOTHING, START, STOP, ABORT_BELOW, ABORT_HOPELESS, ABORT_BUDGET, END, ABORT_NUMERIC = range(8)  # the last is Loop's own: a loss at fault
 REASONS = ("", "alarm", "all six signals settled, task acceptable", "settled below acceptance", "no settling in sight", "budget spent",
-           "fixed number of steps over")
+           "fixed number of steps over", "numeric failure")
 
 STATIC = ("patience", "refit", "fresh_moments")
 

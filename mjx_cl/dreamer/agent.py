@@ -84,6 +84,21 @@ class Weights(NamedTuple):
   lr: jax.Array | float = 1.0
 
 
+CAUSES = ("loss/dyn", "loss/rep", "loss/rec", "loss/rew", "loss/con", "loss/value", "loss/repval", "loss/policy", "loss/clone", "loss/anchor", "opt/loss", "opt/grad_norm")
+EXPLODED = 1e6  # of a loss; a healthy one is below 1e3 from its first update on
+
+
+def culprit(metrics: dict[str, jax.Array]) -> jax.Array:
+  """Which of CAUSES is at fault in the metrics of an update, int32 (); -1: none.
+
+  A loss is at fault where it is not finite or beyond EXPLODED, the gradient's norm where it is not finite. The world model's losses come first, then the critic's
+  and the actor's, which are made of its dreams: the first one names the origin.
+  """
+  bad = [~(jnp.abs(metrics[k]) <= (EXPLODED if k.startswith("loss") or k == "opt/loss" else jnp.finfo(jnp.float32).max)) if k in metrics else jnp.bool_(False) for k in CAUSES]
+  bad = jnp.stack(bad)
+  return jnp.where(jnp.any(bad), jnp.argmax(bad), -1).astype(jnp.int32)
+
+
 class Agent:
   """DreamerV3 for `obs_size` observations and `act_size` actions.
 
@@ -301,7 +316,7 @@ class Agent:
     return -jnp.sum(logp * taken) / jnp.maximum(1.0, jnp.sum(taken))
 
   def update(self, state: TrainState, batch: Batch, key: jax.Array, weights: Weights = Weights()):
-    """One gradient step. Where a loss or the gradient is not finite nothing changes, the counter included; the metrics tell.
+    """One gradient step. Where a loss or the gradient is at fault (`culprit`) nothing changes, the counter included.
 
     Returns:
       (state', metrics, (deter (B, T, D), stoch indices (B, T, stoch)) for the latent refresh).
@@ -315,7 +330,7 @@ class Agent:
     params = optax.apply_updates(state.params, steps)
     slow = jax.tree.map(lambda s, p: (1.0 - self.config.slow_rate) * s + self.config.slow_rate * p, state.slow, params["val"])
     metrics["opt/grad_norm"] = optax.global_norm(grads)
-    sound = jnp.isfinite(metrics["opt/loss"]) & jnp.isfinite(metrics["opt/grad_norm"])
+    sound = culprit(metrics) < 0
     new = TrainState(params, slow, opt, range_, state.updates + 1)
     return jax.tree.map(lambda a, b: jnp.where(sound, a, b), new, state), metrics, (deter, stoch)
 
