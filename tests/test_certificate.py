@@ -43,7 +43,7 @@ def test_what_a_robot_cannot_have_says_why(robot):
   lacking = LACKING.get(robot.spec.name)
   if lacking is None:
     pytest.skip("a robot of another package")
-  assert set(faults.FAULTS) - set(faults.available(robot)) == set(lacking)
+  assert set(faults.FAULTS.own) - set(faults.available(robot)) == set(lacking)
   for name, word in lacking.items():
     with pytest.raises(UserError, match=word):
       faults.make(name, robot)
@@ -58,9 +58,11 @@ def test_every_channel_has_a_typical_deviation_of_its_own_kind(robot):
 
 
 def test_targets_name_their_parts(robot):
-  """A group is the union of what its name says, and every target of a fault changes something of its own."""
+  """Names are unique, groups lie within the robot, and no two targets of a fault stand for the same."""
   for name, f in faults.available(robot).items():
     assert len(set(f.targets)) == len(f.targets), name
+    rows = {b"".join(np.asarray(x).tobytes() for x in jax.tree.leaves(f.init(jax.random.key(0), i).row)) for i in range(len(f.targets))}
+    assert len(rows) == len(f.targets) or name == "none", name
   size = len(robot.spec.act)
   for _, index in robot.spec.act_groups:
     assert set(index) <= set(range(size))

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_cl import faults
+from mjx_cl import envs, faults
 from mjx_cl.errors import UserError
 from mjx_cl.faults import FAULTS, schedule
 from mjx_cl.rollout import Rollout, start
@@ -41,7 +41,10 @@ class Runs:
     return jax.tree.map(lambda x: np.asarray(x[:, 0, i]), self.rows if rows is None else rows)
 
 
-ON_WALKER = sorted(set(FAULTS) - {"velocity_limit", "lidar_loss", "gap"})  # these three have nothing to act on there
+PLUGGED = set(FAULTS) - set(FAULTS.own)
+ON_WALKER = sorted(set(FAULTS.own) - {"velocity_limit", "lidar_loss", "gap"})  # these three have nothing to act on there
+if PLUGGED:  # faults of other packages, as far as a walker can have them
+  ON_WALKER += sorted(PLUGGED & set(faults.available(envs.make("walker", "native"))))
 
 
 @pytest.fixture(scope="module", params=["none", "gear", "freeze"])  # a model leaf; a sensor with memory
@@ -157,6 +160,24 @@ def test_only_owned_leaves_change(fault, short_walker, severity):
 def test_the_least_severity_acts(name, short_walker):
   fault = faults.make(name, short_walker)
   assert live(fault, fault.init(jax.random.key(0), 0), short_walker, 1e-3)[0] == set(fault.owns)
+
+
+@pytest.mark.parametrize("leaf", ["task.mass", "mj.body_mass", "force", "ctrl"])
+def test_a_fault_that_writes_what_it_does_not_own_is_refused(short_walker, leaf):
+  """A Fault that was put together by hand, not by `faults.fault`: it ends where it is traced, in a rollout as in a certificate."""
+  def apply(state, severity, key, ports):
+    value = jnp.where(severity > 0, -ports.ctrl, ports.ctrl)
+    ports = faults.base.write(ports, "ctrl", value)
+    return state, faults.base.write(ports, leaf, 2.0 * faults.base.read(ports, leaf))
+  owns = ("ctrl",) if leaf != "ctrl" else ()
+  env = short_walker
+  if leaf not in leaves(ports_of(env, False)):
+    leaf = next(k for k in leaves(ports_of(env, False)) if k.startswith(leaf[:2]))
+  rogue = faults.Fault("rogue", owns, ("all",), 1, lambda key, target=-1: faults.State(jnp.int32(0), (), ()), apply, False)
+  plan = faults.plan(0.5)
+  drive = lambda t: faults.drive(rogue, faults.begin(rogue, jax.random.key(0), plan), t, jax.random.key(1), ports_of(env, False))
+  with pytest.raises(UserError, match=f"^fault 'rogue' writes {leaf}, which it does not own; it owns {owns[0] if owns else 'nothing'}$"):
+    jax.eval_shape(drive, jnp.int32(0))
 
 
 def test_owned_names_are_leaves(fault, short_walker):

@@ -201,8 +201,20 @@ def _apply(faults, injection, t, key, ports, severity, senses):
   for i, f in enumerate(faults):
     if f.senses == senses:
       ports = ports._replace(since=t - injection.plan.onset[i])
-      states[i], ports = f.apply(states[i], severity[i], jax.random.fold_in(key, i), ports)
+      states[i], after = f.apply(states[i], severity[i], jax.random.fold_in(key, i), ports)
+      _check_owned(f, ports, after)
+      ports = after
   return injection._replace(states=tuple(states)), ports
+
+
+def _check_owned(fault: Fault, before: Ports, after: Ports) -> None:
+  """Raises UserError, while the program is traced, where a Fault that was not built by `fault` has written a leaf that it does not own."""
+  leaves = lambda ports: {f"{kind}.{k}": v for kind in ("mj", "task") for k, v in getattr(ports.model, kind).items()} | {
+      "force": ports.model.force, "ctrl": ports.ctrl, "obs": ports.obs}
+  old, new = leaves(before), leaves(after)
+  touched = sorted(k for k in old.keys() | new.keys() if old.get(k) is not new.get(k) and k not in fault.owns)
+  if touched:
+    raise UserError(f"fault {fault.name!r} writes {', '.join(touched)}, which it does not own; it owns {', '.join(fault.owns) or 'nothing'}")
 
 
 def none(env) -> Fault:
