@@ -242,7 +242,8 @@ def record(suite_: Suite, out, robots=(), physics: str = "auto", agent: str | No
   old = beside(suite_, out, robots) if robots else None
   table = store.read_rows(out / "streams.parquet") if old else []
   kept = {r: None for r in old["suite"]["robots"] if r not in robots} if old else {}
-  rows, free = [row for row in table if row["robot"] in kept], 1 + max((row["stream"] for row in table), default=-1)
+  kind_of = {row["stream"]: row["kind"] for row in table}
+  rows, free = [row for row in table if row["robot"] in kept and kind_of.get(row["prefix"]) != "nominal"], 1 + max((row["stream"] for row in table), default=-1)
   steps_of, speed, details = {}, {}, {}
   for robot, (env, trained) in ready.items():
     weights = _digest(trained.train.params)
@@ -275,7 +276,7 @@ def record(suite_: Suite, out, robots=(), physics: str = "auto", agent: str | No
     rows, free = rows + fresh, max(free, number + len(fresh))
     steps_of[robot] = int(sum(x[2]["opr"].size for x in parts.values()))
     speed[robot] = lived / seconds if seconds else None
-  write_meta(staged, rows)
+  write_meta(staged, rows + healthy_probes(rows))
   if old:
     made = {k: old[k] for k in MADE}
     kept = {r: old.get("kept", {}).get(r, made) for r in kept}
@@ -286,6 +287,27 @@ def record(suite_: Suite, out, robots=(), physics: str = "auto", agent: str | No
   _publish(staged, out)
   size = sum(p.stat().st_size for p in out.glob("*.parquet"))
   return {"stream_steps_per_s": speed, "stream_steps": steps_of, "bytes": size}
+
+
+HEALTHY_PROBES = 2  # of each split of each robot
+
+
+def healthy_probes(rows: list[dict]) -> list[dict]:
+  """Rows of META for streams that are healthy ones cut off: a threshold rests on these streams alone, so a score may not look ahead in them either.
+
+  They hold no rows of their own, and are numbered behind all others; which streams, and how long, follows from the robot's name.
+  """
+  out, number = [], 1 + max((row["stream"] for row in rows), default=-1)
+  for robot in dict.fromkeys(row["robot"] for row in sorted(rows, key=lambda row: row["stream"])):
+    for split in ("score", "tune"):
+      whole = sorted((row for row in rows if (row["robot"], row["split"], row["kind"]) == (robot, split, "nominal")), key=lambda row: row["stream"])
+      rng = np.random.default_rng(zlib.crc32(f"{robot} {split}".encode()))
+      for at in rng.choice(len(whole), min(HEALTHY_PROBES, len(whole)), replace=False):
+        source = whole[int(at)]
+        cut = int(rng.integers(source["steps"] // 4, source["steps"]))
+        out.append(source | {"stream": number, "kind": "probe", "steps": cut, "prefix": source["stream"]})
+        number += 1
+  return out
 
 
 def write_meta(out, rows: list[dict]) -> None:

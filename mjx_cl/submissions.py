@@ -16,7 +16,7 @@ from mjx_cl.streams import COLUMNS, Streams, StreamSet
 
 HIGHEST = 1e9  # threshold of a plain class above which its alarms must have ceased
 FINE = 1.01    # a plain class's threshold is found to this factor
-TRIED = 2      # streams on which a plain class must give the same answers when they are cut off
+TRIED = 2      # streams of each kind on which a plain class must give the same answers when they are cut off
 
 
 def crossings(score: np.ndarray, threshold: float) -> np.ndarray:
@@ -138,7 +138,8 @@ def from_host(host, threshold_name: str | None = None) -> Callable[[Data], Found
   def get(data: Data) -> Found:
     detector = host(1.0) if threshold_name else host
     tune, score, fault = (host_lib.samples(detector, x.residual) for x in (data.tune, data.score, data.fault))
-    host_lib.check_causal(detector.factory, tune[:, :TRIED], host_name=detector.host_name)
+    for x in (tune, score, fault):
+      host_lib.check_causal(detector.factory, x[:, :TRIED], host_name=detector.host_name)
     value = None
     if threshold_name:
       target = tune.shape[1] * (len(tune) - data.count_from) / data.arl0

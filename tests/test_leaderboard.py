@@ -57,7 +57,7 @@ def make_set(folder, suite=SUITE, robots=("walker",)):
       parts[split, "fault"] = (who, onsets, part(who, onsets, int(onsets.max()) + suite.after(CONTROL_S), 2))
     details[robot], fresh = recording._write(suite, folder, robot, parts, len(rows), CONTROL_S, ",".join(f"g{k}" for k in range(8)))
     rows += fresh
-  recording.write_meta(folder, rows)
+  recording.write_meta(folder, rows + recording.healthy_probes(rows))
   store.write_json(folder / "config.json", {"version": streams.VERSION, "suite": dataclasses.asdict(suite), "details": details})
   return parts
 
@@ -109,7 +109,8 @@ def test_pandas_alone_can_read_it(small):
 def test_a_probe_is_another_stream_cut_off(small):
   held, _, _ = small
   probes = held.find("walker", "probe")
-  assert len(probes) == 5
+  of = lambda n: held.meta["kind"][held.meta["stream"] == held.meta["prefix"][held.meta["stream"] == n][0]][0]
+  assert sorted(map(of, probes)) == ["fault"] * 5 + ["nominal"] * 4  # two healthy ones of each split
   for n in probes:
     at = int(np.flatnonzero(held.meta["stream"] == n)[0])
     whole, cut = held.get("walker", [int(held.meta["prefix"][at])]), held.get("walker", [n])
@@ -387,6 +388,24 @@ def test_a_score_that_looks_ahead_is_found_out(small, tmp_path):
   store.write_table(tmp_path / "s.parquet", submission(small[0], ahead))
   with pytest.raises(FileError, match="looks ahead"):
     submissions.read_submission(tmp_path / "s.parquet", small[0])
+
+
+@pytest.mark.parametrize("split", ["score", "tune"])
+def test_a_score_that_looks_ahead_in_healthy_streams_alone_is_found_out(small, tmp_path, split):
+  """Clipped at a level of the whole healthy stream, scores give a lower threshold or fewer false alarms, and are those of a causal score under every fault."""
+  held = small[0]
+  table = submission(held, trailing)
+  m = held.meta
+  source = {int(n): int(p) if k == "probe" else int(n) for n, k, p in zip(m["stream"], m["kind"], np.nan_to_num(m["prefix"].astype(float)))}
+  healthy = set(held.find("walker", "nominal", split).tolist())
+  score = np.array(table["score"], float)
+  for n in np.unique(table["stream"]):
+    if source[int(n)] in healthy:
+      own = table["stream"] == n
+      score[own] = np.minimum(score[own], np.nanquantile(score[own], 0.9))
+  store.write_table(tmp_path / "s.parquet", table | {"score": score})
+  with pytest.raises(FileError, match="looks ahead"):
+    submissions.read_submission(tmp_path / "s.parquet", held)
 
 
 class Above:
