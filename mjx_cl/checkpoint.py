@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import logging
 import pathlib
+import sys
 
 import jax
 import numpy as np
@@ -63,18 +64,31 @@ class Checkpoints:
       raise FileError(f"cannot write checkpoint {number} in {self.folder}: {e}; the earlier ones are intact") from e
 
   def load(self, like):
-    """Newest checkpoint that fits `like`: (tree, meta)."""
-    number = self.latest()
-    if number is None:
+    """Newest checkpoint that can be read, (tree, meta), for a tree like `like`; it is the `latest` from then on.
+
+    Where the newest is broken and an earlier one is whole, that is said in a line on stderr, and the broken one is removed.
+
+    Raises:
+      FileError where none can be read, or it is of another size; nothing is removed then.
+    """
+    packed, numbers, first = pack(like), sorted(self._manager.all_steps(), reverse=True), None
+    if not numbers:
       raise FileError(f"no checkpoint in {self.folder}")
-    packed = pack(like)
-    try:
-      out = self._manager.restore(number, args=ocp.args.Composite(tree=ocp.args.StandardRestore(packed), meta=ocp.args.JsonRestore()))
-    except Exception as e:  # orbax raises many kinds for a broken or foreign folder
-      why = (str(e).splitlines() or [type(e).__name__])[0]
-      if "truth value" in why:  # orbax fails to print how two trees differ
-        why = "its contents are not those that are asked for"
-      raise FileError(f"cannot read checkpoint {number} in {self.folder}: {why}; it is broken, of another version or of another kind of device: --overwrite begins anew") from None
+    for number in numbers:
+      try:
+        out = self._manager.restore(number, args=ocp.args.Composite(tree=ocp.args.StandardRestore(packed), meta=ocp.args.JsonRestore()))
+        break
+      except Exception as e:  # orbax raises many kinds for a broken or foreign folder
+        why = (str(e).splitlines() or [type(e).__name__])[0]
+        if "truth value" in why:  # orbax fails to print how two trees differ
+          why = "its contents are not those that are asked for"
+        first = first or f"cannot read checkpoint {number} in {self.folder}: {why}"
+    else:
+      raise FileError(f"{first}; it is broken, of another version or of another kind of device: --overwrite begins anew") from None
+    for broken in numbers[:numbers.index(number)]:
+      self._manager.delete(broken)
+    if first:
+      print(f"mjx-cl: {first}; it is broken, going on from checkpoint {number}", file=sys.stderr, flush=True)
     same = jax.tree.map(lambda a, b: a.shape == b.shape, out["tree"], packed)
     if not all(jax.tree.leaves(same)):
       raise FileError(f"checkpoint {number} in {self.folder} belongs to another size or robot")

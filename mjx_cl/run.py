@@ -288,16 +288,15 @@ class Runner:
 
   def resume(self) -> None:
     """Goes on from the newest checkpoint; without one, from the start."""
-    number = self.checkpoints.latest()
-    if number is None:
+    if self.checkpoints.latest() is None:
       return
     like = State(self.state.streams, self.crew.shapes(self.state.loop))
     self.state = self.acting = None  # what the run began with need not lie beside what it goes on with
     (streams, loop), meta = self.checkpoints.load(like)
+    number = self.checkpoints.latest()
     self.state = State(streams, self.crew.split(loop))
     self.acting = self.crew.acting(self.state.loop)
-    with np.load(self.work / f"trace-{number:06d}.npz", allow_pickle=False) as z:
-      self.parts = [{k: z[k] for k in z.files}]
+    self.parts = [store.read_arrays(self.work / f"trace-{number:06d}.npz")]
     self.done_chunks = number
     self.seconds, self.quiet, self.stream_seconds = meta["seconds"], meta["quiet"], np.asarray(meta["stream_seconds"])
     self._updates, self._alarms, self._phase = (np.asarray(meta[k]) for k in ("updates", "alarms", "phase"))

@@ -17,6 +17,7 @@ import pytest
 
 from mjx_cl import agents, checkpoint, cli, demonstrator, envs, replay as replay_lib, train
 from mjx_cl.config import PRESETS, TrainConfig, replace
+from mjx_cl.dreamer.agent import CAUSES
 from mjx_cl.errors import FileError, UserError
 
 ENVS, BATCH, LENGTH = 4, 4, 8
@@ -41,7 +42,8 @@ class Counted:
 
   def __call__(self, state, replay, key, weights, active, updates):
     self.calls.append((updates, weights))
-    return state._replace(updates=state.updates + updates), replay, {"loss/rew": np.full(1, self.metric)}
+    bad = CAUSES.index("loss/rew") if np.isnan(self.metric) else -1
+    return state._replace(updates=state.updates + updates), replay, {"loss/rew": np.full(1, self.metric)}, np.full(1, bad)
 
 
 def counted(trainer, **kwargs):
@@ -58,6 +60,20 @@ def expert_path(tmp_path_factory):
   path = tmp_path_factory.mktemp("demo") / "policy.npz"
   demonstrator.save(path, demonstrator.Policy(np.zeros(24, np.float32), np.ones(24, np.float32), (layer(24, 8), layer(8, 12))))
   return str(path)
+
+
+def test_an_update_refreshes_the_latents_that_it_was_taken_on(short_walker, tmp_path):
+  """Stored latents are put to nought: after updates the sampled windows hold new ones, other records none."""
+  trainer = make_trainer(short_walker, tmp_path, ratio=0.25)
+  while not trainer.updates:
+    trainer.step()
+  data = trainer.state.replay.data
+  blank = data._replace(deter=jnp.zeros_like(data.deter), stoch=jnp.zeros_like(data.stoch))
+  state = trainer.state
+  updates = trainer.updates
+  _, replay, _, _ = trainer.learn["pure"](*jax.tree.map(jnp.copy, (state.train, state.replay._replace(data=blank))), jax.random.key(5), trainer._weights(), np.ones(1, bool), updates)
+  fresh = np.asarray(replay.data.deter)[0].any(-1)
+  assert LENGTH < fresh.sum() <= updates * BATCH * LENGTH and not fresh.all()
 
 
 # ---- resume ----------------------------------------------------------------------------------------------------------------------
@@ -499,29 +515,41 @@ DAMAGE = {
 
 
 @pytest.mark.parametrize("kind", DAMAGE)
-def test_damaged_checkpoint_is_one_clear_line(saved, kind):
-  for file in sorted((saved / "2").rglob("*")):
-    if file.is_file():
-      DAMAGE[kind](file)
+def test_damaged_checkpoint_is_one_clear_line(saved, same, kind, capfd):
+  """The newest broken: said, and the one before it is taken; both broken: an error, and nothing is removed."""
+  def damage(number):
+    for file in sorted((saved / number).rglob("*")):
+      if file.is_file():
+        DAMAGE[kind](file)
+  both = saved.parent / "both"
+  damage("2")
+  shutil.copytree(saved, both)
+  store = checkpoint.Checkpoints(saved)
+  tree, meta = store.load(like(TREE))
+  assert same(tree, TREE | {"n": jnp.int32(1)}) and meta == {"number": 1} and store.latest() == 1
+  (line,) = [x for x in capfd.readouterr().err.splitlines() if x.startswith("mjx-cl:")]
+  assert line.startswith(f"mjx-cl: cannot read checkpoint 2 in {saved}: ") and line.endswith("; it is broken, going on from checkpoint 1")
+  store.save(2, TREE, {"number": 2})  # the number is free again
+  assert same(store.load(like(TREE))[0], TREE)
+  saved = both
+  damage("1")
+  before = sorted(p for p in both.rglob("*"))
   with pytest.raises(FileError) as e:
-    checkpoint.Checkpoints(saved).load(like(TREE))
-  assert "\n" not in str(e.value) and "checkpoint 2" in str(e.value) and str(saved) in str(e.value)
+    checkpoint.Checkpoints(both).load(like(TREE))
+  assert "\n" not in str(e.value) and "checkpoint 2" in str(e.value) and str(both) in str(e.value) and sorted(p for p in both.rglob("*")) == before
 
 
 def test_any_one_damaged_file_is_noticed_or_harmless(saved, same):
-  files = [f for f in sorted((saved / "2").rglob("*")) if f.is_file()]
+  files = [f.relative_to(saved) for f in sorted((saved / "2").rglob("*")) if f.is_file()]
   noticed = 0
-  for file in files:
-    whole = file.read_bytes()
+  for i, file in enumerate(files):
     for kind in ("truncated", "removed"):
-      DAMAGE[kind](file)
-      try:
-        tree, meta = checkpoint.Checkpoints(saved).load(like(TREE))
-        assert same(tree, TREE | {"n": jnp.int32(2)}) and meta == {"number": 2}, file.name
-      except FileError as e:
-        noticed += 1
-        assert "\n" not in str(e)
-      file.write_bytes(whole)
+      copy = saved.parent / f"{i}-{kind}"
+      shutil.copytree(saved, copy)
+      DAMAGE[kind](copy / file)
+      tree, meta = checkpoint.Checkpoints(copy).load(like(TREE))
+      assert meta["number"] in (1, 2) and same(tree, TREE | {"n": jnp.int32(meta["number"])}), file
+      noticed += meta["number"] == 1
   assert noticed >= 2 and len(files) > 2
 
 
