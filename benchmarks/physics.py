@@ -1,6 +1,7 @@
 """Speed of physics and fault layer: python benchmarks/physics.py [--json] [--quick]
 
-All in one process, programs interleaved, medians; without compile time. Ratios carry over between machines, steps per second do not.
+All in one process, programs interleaved, medians; without compile time. A rollout here is the certificate's (`certificate.live`): faults, physics, observation and reward in one jitted scan,
+without an agent, resets or the rows of a run. Ratios carry over between machines, steps per second do not.
 """
 from __future__ import annotations
 

@@ -374,10 +374,11 @@ def scores(folder) -> dict:
       continue
     time_, seen = survival.of_runs([r for r in own if not r["change"]] + [dict(r, affected=False) for r in own if r["change"]], config["steps"])
     median, median_ci = survival.quantile(survival.kaplan_meier(time_, seen))
+    enough = len(seen) > 3  # three streams or fewer give no interval
     horizon = min(HORIZON, config["steps"] - max(r["onset"] for r in first if r["onset"] is not None) - recovery.HOLD)
     mean, mean_ci = survival.restricted_mean(time_, seen, horizon) if horizon > 0 else (None, None)
-    out["recovery"][arm] = {"n": len(seen), "recovered": int(seen.sum()), "median_steps": median, "median_steps_ci": median_ci,
-                            "restricted_mean_steps": mean, "restricted_mean_steps_ci": mean_ci, "horizon": horizon}
+    out["recovery"][arm] = {"n": len(seen), "recovered": int(seen.sum()), "median_steps": median, "median_steps_ci": median_ci if enough else None,
+                            "restricted_mean_steps": mean, "restricted_mean_steps_ci": mean_ci if enough else None, "horizon": horizon}
   return out
 
 

@@ -366,7 +366,7 @@ PRESETS = {
     "tiny": Preset(
         DreamerConfig(size="tiny", batch=8, length=16, imagine=8, lr=1e-3, warmup=20, bins=63),
         TrainConfig(envs=8, updates=200, ratio=16.0, capacity=512),
-        "for tests: a few thousand parameters, seconds per run"),
+        "for tests: some 100,000 parameters, seconds per run"),
 }
 
 

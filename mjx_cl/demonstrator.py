@@ -96,6 +96,7 @@ class Shaped:
 PPO = {"discounting": 0.995, "entropy_cost": 1e-2, "reward_scaling": 10.0}
 
 
+SIZES = {"num_envs": 256, "unroll_length": 30, "num_minibatches": 16, "batch_size": 256, "num_updates_per_batch": 6, "learning_rate": 1e-3, "normalize_observations": True}
 HIDDEN = (128,) * 3  # policy and value
 
 
@@ -125,14 +126,14 @@ def latest(out: pathlib.Path, env) -> tuple[list[dict], tuple]:
   return [row for row in rows if row["step"] <= done], params
 
 
-def train(env, out: str | os.PathLike, steps: int, seed: int = 0, evals: int = 12, progress=lambda row: None, resume: bool = False) -> list[dict]:
+def train(env, out: str | os.PathLike, steps: int, seed: int = 0, evals: int = 12, progress=lambda row: None, resume: bool = False, **settings) -> list[dict]:
   """Trains PPO and keeps one policy per evaluation as OUT/policy_NN.npz, with OUT/curve.json.
 
   `resume` goes on from the last evaluation in `out` up to `steps` in all: networks and observation statistics are those of then, the optimiser's
   moments and the environments start fresh (brax keeps neither), so the result is not bit for bit that of one run.
 
   Settings: 256 environments, unroll 30, 16 minibatches of 256 x 30, 6 epochs, lr 1e-3, observations normalised, policy and value 3 x 128, and `PPO`
-  unless the robot has its own in `env.demonstration` (`ppo`, and `weights` and `bonus` of Shaped).
+  unless the robot has its own in `env.demonstration` (`ppo`, and `weights` and `bonus` of Shaped), or `settings` say otherwise (arguments of brax's `ppo.train`).
 
   Returns:
     Rows {step, return, seconds}, return = mean over 128 episodes of the stochastic policy, of the shaped reward where there is one.
@@ -165,11 +166,10 @@ def train(env, out: str | os.PathLike, steps: int, seed: int = 0, evals: int = 1
     os.replace(tmp, out / "latest.msgpack")
 
   ppo.train(
-      environment=adapter, num_timesteps=steps - done, episode_length=env.spec.episode_steps, num_envs=256, unroll_length=30, num_minibatches=16,
-      batch_size=256, num_updates_per_batch=6, learning_rate=1e-3, normalize_observations=True, seed=seed + done, num_evals=evals, restore_params=params,
+      environment=adapter, num_timesteps=steps - done, episode_length=env.spec.episode_steps, seed=seed + done, num_evals=evals, restore_params=params,
       progress_fn=on_progress, policy_params_fn=on_params,
       network_factory=functools.partial(networks.make_ppo_networks, policy_hidden_layer_sizes=HIDDEN, value_hidden_layer_sizes=HIDDEN),
-      **PPO | own.get("ppo", {}))
+      **SIZES | PPO | own.get("ppo", {}) | settings)
   return rows
 
 

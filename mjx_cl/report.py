@@ -228,7 +228,7 @@ def leaderboard(results: pathlib.Path) -> str:
       {high - low + 1} scoring seeds each; thresholds at ARL0 = {number(meta['arl0_target'])} control steps, calibrated on other seeds' healthy
       streams ({alarms} alarms for most{', so every rate is an order of magnitude and marked so' if alarms < 50 else ''}): asked for are
       {joined([f"{number(asked[r], 1)} ({r})" for r in robots])} false alarms an hour, what came on the scoring seeds stands in the table. Score: 0 for never
-      alarming, 100 for alarming at the onset and at no other time, a mean over robots; intervals over seeds. Best on each robot:
+      alarming, 100 for alarming at the onset and at no other time, a mean over all faults of all robots; intervals over seeds. Best on each robot:
       {best(rows)}. {lead(rows, overall)} Mean ranks closer than {number(meta['critical_difference'], 1)} are not
       told apart (Nemenyi; references take no rank). `mjx-cl leaderboard` ({len(overall)} detectors;
       {number(meta['stream_steps'] / 1e6, 1)} million stream-steps, {number(minutes, 1)} minutes on {meta["machine"]["cores"]} core{'s' if meta['machine']['cores'] > 1 else ''}; goal 3

@@ -64,3 +64,15 @@ def test_shaped_reward_is_the_demonstrators_alone():
   np.testing.assert_allclose(other.reward, plain.reward + own["bonus"], rtol=1e-6)
   np.testing.assert_array_equal(other.final_obs, plain.final_obs)
   assert shaped.spec is env.spec and demonstrator.brax_env(shaped).observation_size == 48
+
+
+def test_ppo_trains_the_walker_through_the_adapter(short_walker, tmp_path):
+  """A short run of brax's PPO: every layer of the policy moves, its statistics are those of what the robots saw."""
+  small = dict(num_envs=8, unroll_length=6, num_minibatches=2, batch_size=8, num_updates_per_batch=2, num_eval_envs=4)
+  rows = demonstrator.train(short_walker, tmp_path, steps=384, evals=2, **small)
+  assert [r["step"] for r in rows] == [0, 384] and all(0 <= r["return"] <= 12 for r in rows)  # episodes of 12 steps, at most 1 a step
+  first, last = (demonstrator.load(p) for p in sorted(tmp_path.glob("policy_*.npz")))
+  assert all(np.abs(a - b).max() > 1e-4 for (a, _), (b, _) in zip(first.layers, last.layers))
+  assert not np.asarray(first.mean).any() and np.asarray(last.mean).any()
+  height = short_walker.spec.obs.index(next(v for v in short_walker.spec.obs if "height" in v.name))
+  assert 0.5 < last.mean[height] < 1.6  # a walker's torso, at 1.3 m at most

@@ -92,7 +92,7 @@ def test_what_was_recorded_comes_back_but_for_the_rounding(small):
   assert np.isnan(got.residual.latent[onsets[faulty[0]] + 20 + 1, 0]).all()  # kept for 10 s
 
 
-def test_pandas_alone_can_read_it(small):
+def test_plain_parquet_readers_can_read_it(small):
   """The join of the module's text, on plain Parquet columns."""
   held, _, folder = small
   rows = pyarrow.parquet.read_table(folder / "walker.parquet").to_pydict()

@@ -144,12 +144,16 @@ def test_a_longer_fault_stream_changes_nothing():
   assert row(longer, healthy, scores) == before
 
 
-def test_more_faults_change_no_row_and_no_mean_over_the_rest():
+def test_more_faults_change_a_mean_by_their_share_alone():
+  """Of four faults of equal weight the fourth moves each mean by a quarter of its distance (that it changes no row of the others: test_leaderboard.py)."""
   rows = [random_row(k) | {"detector": d, "robot": "walker", "fault": f"f{k}", "severity": 0.5} for d in ("a", "b") for k in range(3)]
-  before = metrics.overall(rows)
-  again = metrics.overall([r for r in rows + [random_row(7) | {"detector": d, "robot": "walker", "fault": "new", "severity": 1.0} for d in "ab"]
-                           if r["fault"] != "new"])
-  assert again == before
+  new = random_row(7) | {"robot": "walker", "fault": "new", "severity": 1.0}
+  before, after = (metrics.overall(x).rows for x in (rows, rows + [new | {"detector": d} for d in "ab"]))
+  for old in before:
+    own = next(r for r in after if r["detector"] == old["detector"])
+    assert (old["blocks"], own["blocks"]) == (3, 4)
+    for key in ("cost_standard", "detected_within_5s", "false_alarms_per_hour"):
+      assert own[key] == pytest.approx((3 * old[key] + new[key]) / 4), key
   # another fault of the suite leaves the false alarms alone, which come from healthy streams
   assert row(np.ones_like(NEVER), QUIET)["false_alarms_per_hour"] == 0.0
 

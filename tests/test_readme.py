@@ -41,3 +41,22 @@ def test_the_detector_of_the_example(tmp_path):
     detector = host.load(f"{tmp_path / 'mine.py'}:Mine", {"level": level}).factory()
     alarms[level] = [t for t, sample in enumerate(x) if detector.update(sample)]
   assert alarms[2.0] == [1500] and alarms[20.0] == [] and len(alarms[1.2]) > 100 and min(alarms[1.2]) >= 500
+
+
+def test_the_track_of_the_example(tmp_path, monkeypatch):
+  """The class drives the file's track and no other; what is wrong with the file is one line, of the command as of the class."""
+  from mjx_cl import cli, envs
+  from mjx_cl.errors import FileError
+  monkeypatch.chdir(tmp_path)
+  (block,) = [b for b in BLOCKS if "OnMine" in b]
+  pathlib.Path("tracks.py").write_text(block)
+  angle = np.linspace(0, 2 * np.pi, 60, endpoint=False)
+  points = np.stack([8 * np.cos(angle), 5 * np.sin(angle), np.full(60, 1.1), np.full(60, 1.1)], 1)
+  np.savetxt("my_track.csv", points, delimiter=", ")
+  env = envs.make("tracks.py:OnMine")
+  (track,) = env.course.tracks
+  assert env.spec.name == "car" and track.name == "my_track" and 38 < track.length < 42  # Ramanujan's perimeter of the ellipse: 41.4 m
+  np.savetxt("my_track.csv", points[:40], delimiter=", ")
+  with pytest.raises(FileError, match="not closed"):
+    envs.make("tracks.py:OnMine")
+  assert cli.main(["eval", "tracks.py:OnMine", "--agent", "car", "--episodes", "1"]) == 1

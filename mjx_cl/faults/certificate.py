@@ -218,7 +218,8 @@ def compare(env, faults, chosen, rows, plain, onset) -> list[Certificate]:
 
 
 def monotone(chosen: list[Lane], differs: np.ndarray, size: np.ndarray, i: int) -> bool | None:
-  """Whether the differences do not fall with severity at the step at which the greatest severity of this fault and target first differs."""
+  """Whether the differences do not fall with severity at the step at which the greatest severity of this fault and target first differs: none by more than a
+  tenth from one severity to the next (SLACK), and the greatest severity's is no smaller than that of the least above 0."""
   same = sorted((lane.severity, k) for k, lane in enumerate(chosen) if (lane.fault, lane.target) == (chosen[i].fault, chosen[i].target))
   if len(same) < 2:
     return None
@@ -227,7 +228,8 @@ def monotone(chosen: list[Lane], differs: np.ndarray, size: np.ndarray, i: int) 
     return False
   at = int(np.argmax(differs[last]))
   values = [size[k, at] for _, k in same]
-  return bool(all(b >= SLACK * a for a, b in zip(values, values[1:])))
+  acting = [x for (severity, _), x in zip(same, values) if severity > 0]
+  return bool(all(b >= SLACK * a for a, b in zip(values, values[1:])) and acting[-1] >= acting[0])
 
 
 def faulty(rows: list[Certificate]) -> list[str]:
