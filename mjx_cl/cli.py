@@ -303,7 +303,7 @@ class Detect:
   column: tuple[str, ...] = ()
   """Columns to watch; default: all columns of numbers that both files have, less clocks and constant ones."""
   detector: tuple[str, ...] = ()
-  """Detectors of one number per sample, default: all; or module:Class, file.py:Class, a Python class with update(x) and a threshold of its own."""
+  """Detectors of one number per sample, one for each column, or of several channels, one for all columns together; default: all; or module:Class, file.py:Class, a Python class with update(x) and a threshold of its own."""
   set: tuple[str, ...] = ()
   """Settings of such a class, name=value ..."""
   arl0: float = 10_000

@@ -2,7 +2,7 @@
 
 The nominal log is the past of the log that is judged: every detector lives through all of it, warms up on its first third (1,000 samples at
 most), and goes on from there into the log with all that it has learnt. Each column is watched by a detector of its own, and the alarm of any
-counts. Samples are handed on in nominal deviations, (x - mean) / std of the nominal log, so that no unit matters to a detector.
+counts; detectors of several channels watch all columns together. Samples are handed on in nominal deviations, (x - mean) / std of the nominal log, so that no unit matters to a detector.
 """
 from __future__ import annotations
 
@@ -18,11 +18,13 @@ from mjx_cl import store
 from mjx_cl.detectors import DETECTORS, Alarm, Detector, host, rolling_sigma
 from mjx_cl.errors import FileError, UserError, choose
 from mjx_cl.logs import Log, choose_columns, read
+from mjx_cl.monitor import unknown
 
 EXPECTED = 3    # nominal alarms below which the wanted ARL0 cannot be read off the nominal log
 FEW = 50        # alarms below which a measured run length is marked
 MARGIN = 0.25   # of the way from the median to the highest nominal score, added to the latter where nothing can be calibrated
 LEVELS = 8      # thresholds tried side by side
+SMOOTH = 100    # rows of the trailing mean of a detector over all columns, a quarter of the warm-up at most
 CHUNK = 2048    # rows of one call of a program
 FARTHEST = 1e6  # nominal deviations at which a sample is cut, so that no sum of squares overflows float32
 
@@ -35,10 +37,24 @@ def _rolling(threshold, warmup: int) -> Detector:
 
 
 def table() -> dict[str, Callable[..., Detector]]:
-  """Detectors of one number per sample: those of DETECTORS that are marked so, and the paper's rule."""
+  """Detectors of one number per sample, those of DETECTORS that are marked so, and the paper's rule; and those of several channels, which watch all columns together."""
   found = {name: build for name, build in DETECTORS.items() if getattr(build, "takes", "") == "scalar" and not getattr(build, "reference", False)
            and "threshold" in inspect.signature(build).parameters}
-  return {"rolling_sigma_plain": _rolling} | found
+  return {"rolling_sigma_plain": _rolling} | found | {name: build for name, build in DETECTORS.items() if _joint(build)}
+
+
+def _joint(factory) -> bool:
+  """Whether a factory is told its channels: then one detector watches all columns."""
+  return getattr(factory, "takes", "") == "residual" and {"channels", "log", "threshold", "warmup"} <= set(inspect.signature(factory).parameters)
+
+
+def _together(factory, threshold, warmup: int, columns: int) -> Detector:
+  """A detector of several channels on a row of `columns` numbers; a row with a missing one is passed over."""
+  names = tuple(f"variable_{k}" for k in range(columns))
+  smooth = {"smooth": max(1, min(SMOOTH, warmup // 4))} if "smooth" in inspect.signature(factory).parameters else {}
+  inner = factory(threshold=threshold, warmup=warmup, channels=names, log=False, **smooth)
+  residual = jax.tree.map(lambda x: x[0], unknown((1,), columns))
+  return Detector(inner.init, lambda state, x: inner.update(state, residual._replace(variables=x, valid=jnp.bool_(True))))
 
 
 class Program:
@@ -49,20 +65,24 @@ class Program:
     parameters = inspect.signature(factory).parameters
     settings = {"warmup": warmup} if "warmup" in parameters else {}
     some = 1.0 if parameters["threshold"].default is inspect.Parameter.empty else parameters["threshold"].default
-    one = factory(threshold=some, **settings).init()
-    self.start = jax.tree.map(lambda x: jnp.broadcast_to(x, (LEVELS, columns) + jnp.shape(x)), one)
+    joint = _joint(factory)
+    build = (lambda threshold: _together(factory, threshold, warmup, columns)) if joint else lambda threshold: factory(threshold=threshold, **settings)
+    self.columns = 1 if joint else columns  # of its alarms
+    self.start = jax.tree.map(lambda x: jnp.broadcast_to(x, (LEVELS, self.columns) + jnp.shape(x)), build(some).init())
     self.chunk = chunk
 
     def single(threshold, state, x):
       known = jnp.isfinite(x)
-      new, alarm = factory(threshold=threshold, **settings).update(state, jnp.where(known, x, 0.0))
+      if joint:
+        known = jnp.all(known)
+      new, alarm = build(threshold).update(state, jnp.where(known, x, 0.0))
       return jax.tree.map(lambda a, b: jnp.where(known, a, b), new, state), Alarm(alarm.fired & known, jnp.where(known, alarm.score, jnp.nan))
 
     def run(thresholds, states, xs):
       every = jax.vmap(jax.vmap(single, (None, 0, 0)), (0, 0, None))
 
       def step(states, x):
-        states, alarm = every(thresholds, states, x)
+        states, alarm = every(thresholds, states, x[None] if joint else x)
         return states, (alarm.fired.any(-1), alarm.fired[0], alarm.score[0])
       return jax.lax.scan(step, states, xs)
     self.run = jax.jit(run)
@@ -71,7 +91,7 @@ class Program:
     """Over xs (T, C), in calls of equal shape; rows that fill up the last are missing samples, which change nothing.
 
     Returns:
-      (states', alarms of any column bool (T, LEVELS), alarms bool (T, C) and scores (T, C) at the first threshold).
+      (states', alarms of any column bool (T, LEVELS), alarms bool (T, C) and scores (T, C) at the first threshold); C is 1 where one detector watches all.
     """
     thresholds, parts = jnp.asarray(thresholds, jnp.float32), []
     for begin in range(0, len(xs), self.chunk):
@@ -124,7 +144,9 @@ def _counted(nominal: np.ndarray, begin: int) -> int:
 # ---- detection -----------------------------------------------------------------------------------------------------------------------
 
 class Detection(NamedTuple):
-  """Attributes:
+  """C is 1 in what a detector gives that watches all columns together.
+
+  Attributes:
     summary: what detect.json holds. xs: float64 (T, C) the log, past: float64 (N, C) the nominal log, as read. fired: detector -> bool (T, C),
     scores: detector -> (T, C), before: detector -> nominal alarms of any column, bool (N,). seconds: float64 (T,) since the first sample, or None.
   """
@@ -155,7 +177,7 @@ def detect(path, nominal_path, columns: tuple[str, ...] = (), detectors: tuple[s
     raise UserError(f"arl0 must be a finite number above 1 sample; got {arl0}")
   if rate is not None and not (rate > 0 and np.isfinite(rate)):
     raise UserError(f"rate must be above 0 samples a second; got {rate}")
-  names = list(dict.fromkeys(detectors)) or list(table())
+  names, every = list(dict.fromkeys(detectors)) or list(table()), not detectors
   if settings and not any(":" in name for name in names):
     raise UserError("settings are for host detectors (module:Class, file.py:Class); the others are calibrated")
   hosts = {name: host.load(name, settings) for name in names if ":" in name}
@@ -172,6 +194,12 @@ def detect(path, nominal_path, columns: tuple[str, ...] = (), detectors: tuple[s
                     + (" once its logarithm is taken" if logarithm else ""))
   standard = [np.clip((x - middle) / spread, -FARTHEST, FARTHEST) for x in (xs, past)]
   warmup = min(1000, len(past) // 3)
+  together = [name for name in names if name not in hosts and _joint(table()[name])]
+  if together and not 2 <= len(found) <= warmup - 2:
+    if not every:
+      raise UserError(f"detector {together[0]!r} watches all columns together: it needs two columns or more, and a nominal log of {3 * (len(found) + 2)} rows; "
+                      f"there are {len(found)} columns and {len(past)} rows")
+    names = [name for name in names if name not in together]
   seconds, rate = _clock(log, rate, len(xs))
   rows, fired, scores, before = [], {}, {}, {}
   for k, name in enumerate(names):
@@ -224,7 +252,7 @@ def _examined(name: str, xs: np.ndarray, past: np.ndarray, warmup: int, arl0: fl
   program = Program(name, warmup, xs.shape[1], min(CHUNK, len(past)))
   threshold, calibrated = calibrate(program, past, warmup, arl0)
   if threshold is None:
-    return None, False, np.zeros(len(past), bool), np.zeros(xs.shape, bool), np.full(xs.shape, np.nan)
+    return None, False, np.zeros(len(past), bool), np.zeros((len(xs), program.columns), bool), np.full((len(xs), program.columns), np.nan)
   levels = np.full(LEVELS, threshold)
   states, _, before, _ = program(levels, program.start, past)
   _, _, fired, scores = program(levels, states, xs)
@@ -243,7 +271,7 @@ def _row(name: str, threshold: float | None, calibrated: bool | None, before: np
   first = int(at[0]) if len(at) else None
   return {"detector": name, "threshold": threshold, "calibrated": calibrated, "nominal_alarms": count, "few": count < FEW, "first_alarm": first,
           "first_alarm_s": None if first is None or seconds is None else float(seconds[first]), "alarms": len(at),
-          "columns": [c for c, some in zip(columns, fired.any(0)) if some]}
+          "columns": [c for c, some in zip(columns if fired.shape[1] == len(columns) else [ALL], fired.any(0)) if some]}
 
 
 def _notes(rows: list[dict], counted: int, arl0: float) -> list[str]:
@@ -263,6 +291,7 @@ def _notes(rows: list[dict], counted: int, arl0: float) -> list[str]:
 
 # ---- results -------------------------------------------------------------------------------------------------------------------------
 
+ALL = "(all)"  # in the place of a column: one detector watches all
 FILES = ("detect.json", "alarms.csv", "detect.png")
 
 
@@ -286,9 +315,10 @@ def write(result: Detection, out) -> None:
   out, names = pathlib.Path(out), result.summary["columns"]
   lines = ["detector,column,sample,seconds,score"]
   for detector, fired in result.fired.items():
+    own = names if fired.shape[1] == len(names) else [ALL]
     for t, c in np.argwhere(fired):
       score = result.scores[detector][t, c]
-      lines.append(",".join((_quoted(detector), _quoted(names[c]), str(t), "" if result.seconds is None else f"{result.seconds[t]:.9g}",
+      lines.append(",".join((_quoted(detector), _quoted(own[c]), str(t), "" if result.seconds is None else f"{result.seconds[t]:.9g}",
                              f"{score:.9g}" if np.isfinite(score) else "")))
   store.atomic(out / "alarms.csv", lambda file: file.write(("\n".join(lines) + "\n").encode()))
   store.atomic(out / "detect.png", lambda file: figure(result, file))

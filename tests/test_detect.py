@@ -454,9 +454,48 @@ def test_seconds_of_time_step_and_rate(tmp_path):
 
 # ---- detectors -------------------------------------------------------------------------------------------------------------------------
 
-def test_the_table_is_every_detector_of_one_number():
+TOGETHER = {"hotelling", "mewma", "max_variables"}
+
+
+def test_the_table_is_every_detector_of_numbers():
   want = {k for k, f in detectors.DETECTORS.items() if getattr(f, "takes", "") == "scalar"}
-  assert want <= set(detect.table()) and set(detect.table()) - want == {"rolling_sigma_plain"}
+  assert want <= set(detect.table()) and set(detect.table()) - want == {"rolling_sigma_plain"} | TOGETHER
+
+
+def test_columns_that_part_are_seen_by_those_that_watch_all(tmp_path):
+  """Two columns that move together, then against each other, each as wide as before: Hotelling's and the MEWMA see it; the log lacks samples, and a line says `(all)`."""
+  def pair(n, seed, since, shift=0.8):
+    common, own = noise(n, seed), [0.1 * noise(n, seed + k) for k in (10, 20)]
+    late = np.arange(n) >= since
+    x, y = common + own[0], common + own[1]
+    return np.round(x + shift * late, 6), np.round(y - shift * late, 6)
+  (x, y), (u, v) = pair(3000, 0, 3000), pair(1500, 5, 700)
+  text = [f"{a},{b}" for a, b in zip(u, v)]
+  text[300] = f"{u[300]},"
+  (tmp_path / "t.csv").write_text("x,y\n" + "\n".join(text) + "\n")
+  nominal = save(tmp_path / "n.csv", x=x, y=y)
+  result = detect.detect(tmp_path / "t.csv", nominal, arl0=500)
+  rows = {r["detector"]: r for r in result.summary["detectors"]}
+  assert TOGETHER <= set(rows) and result.fired["hotelling"].shape == (1500, 1) and result.fired["cusum"].shape == (1500, 2)
+  assert np.isnan(result.scores["hotelling"][300, 0])
+  for name in ("hotelling", "mewma"):
+    first = np.flatnonzero(result.fired[name][700:])
+    assert len(first) and first[0] < 60 and rows[name]["columns"] == ["(all)"], name
+  detect.write(result, tmp_path)
+  assert "hotelling,(all)," in (tmp_path / "alarms.csv").read_text()
+  # the very detector, on the residual of a run
+  inner = detect._together(detectors.DETECTORS["hotelling"], rows["hotelling"]["threshold"], 1000, 2)
+  middle, spread = np.mean(result.past, 0), np.std(result.past, 0)
+  both = jnp.asarray(np.concatenate([(result.past - middle) / spread, ((result.xs - middle) / spread)[:300]]), jnp.float32)
+  want = jax.lax.scan(inner.update, inner.init(), both)[1]
+  np.testing.assert_array_equal(np.asarray(want.fired)[3000:], result.fired["hotelling"][:300, 0])
+
+
+def test_one_column_has_nothing_to_be_watched_together(tmp_path):
+  nominal, log = save(tmp_path / "n.csv", x=noise(900)), save(tmp_path / "t.csv", x=noise(300, 1))
+  assert not TOGETHER & set(detect.detect(log, nominal, arl0=150, detectors=()).fired)
+  with pytest.raises(UserError, match="'hotelling' watches all columns together: it needs two columns or more"):
+    detect.detect(log, nominal, detectors=("hotelling",))
 
 
 def test_all_detectors_find_a_jump(tmp_path):
@@ -464,7 +503,7 @@ def test_all_detectors_find_a_jump(tmp_path):
   nominal, log = save(tmp_path / "n.csv", x=noise(900)), save(tmp_path / "t.csv", x=noise(500, 1) + 12.0 * (np.arange(500) >= 200))
   result = detect.detect(log, nominal, arl0=150)
   rows = {r["detector"]: r for r in result.summary["detectors"]}
-  assert list(rows) == list(detect.table())
+  assert list(rows) == [name for name in detect.table() if name not in TOGETHER]  # there is one column
   for name, row in rows.items():
     if row["threshold"] is not None:
       assert result.fired[name][200:].any(), name

@@ -3,6 +3,7 @@ import importlib
 import json
 import pathlib
 import pkgutil
+import re
 
 import chex
 import jax
@@ -55,6 +56,14 @@ def test_table_and_files_are_found():
   assert "rolling_sigma" in SCALAR and {"rolling_sigma", "rolling_sigma_plain"} <= set(detectors.DETECTORS)
   marked = {name for name, f in SCALAR.items() if getattr(f, "takes", None) == "scalar"}
   assert marked <= set(detectors.DETECTORS)  # a file with a scalar detector has its line in the table
+
+
+def test_every_detector_states_its_direction_and_blind_spots():
+  unsaid = {"hotelling"}  # a quadratic form, whose docstring does not say that both directions count
+  for name, factory in {**{k: detectors.DETECTORS[k] for k in detectors.DETECTORS.own}, **SCALAR}.items():
+    assert "Blind to: " in factory.__doc__, name
+    if name not in unsaid and not getattr(factory, "reference", False):
+      assert re.search(r"(?i)\b(one|two)[-_]sided\b|\ba (rise|fall) of\b|`up` or `down`", factory.__doc__), name
 
 
 def test_update_keeps_structure_shapes_and_dtypes(case):

@@ -1,4 +1,6 @@
 """Contract suite over every fault of the table, on the walker, and the figures of single faults."""
+import re
+
 import chex
 import jax
 import jax.numpy as jnp
@@ -221,10 +223,14 @@ def test_a_fault_that_writes_what_it_does_not_own_is_refused(short_walker):
     faults.fault("two", short_walker, ("ctrl", "obs"), ("all",), None)
 
 
-def test_every_documented_fault_states_severity_target_and_leaves():
-  for name, build in FAULTS.items():
-    if name != "none":
-      assert "Severity:" in build.__doc__ and "Owns" in build.__doc__, name
+def test_every_documented_fault_states_severity_target_and_leaves(short_walker):
+  """Severity with its unit in brackets, target, leaves and source in the docstring; `about` repeats the first three, and the leaves are the true ones."""
+  for name in sorted(set(FAULTS.own) - {"none"}):
+    said = dict(re.findall(r"; (severity|target|owns): (.*?)(?=; (?:target|owns): |$)", faults.about(name)))
+    assert set(said) == {"severity", "target", "owns"}, name
+    assert re.search(r"\[[^]]+\]", said["severity"]) and re.search(r"Source: \w", FAULTS[name].__doc__), name
+    if name in ON_WALKER:
+      assert all(leaf in said["owns"] for leaf in faults.make(name, short_walker).owns), name
 
 
 def test_stuck_holds_the_last_command_before_the_onset(short_walker):

@@ -38,7 +38,12 @@ from mjx_cl.plugins import Registry
 
 def paper_rule(threshold: float = 3.0, threshold_rpr: float | None = None, unit_rpr: float = 1.0, **settings) -> Detector:
   """The paper's rule as written: `rolling_sigma` on OPR and on RPR, beyond three deviations of the mean, either one. `threshold_rpr`: another
-  threshold for RPR, None: the same. `unit_rpr`: deviations of RPR that count as one."""
+  threshold for RPR, None: the same. `unit_rpr`: deviations of RPR that count as one.
+
+  Two-sided, unless two_sided=False, a rise alone.
+  Blind to: a change that moves neither OPR nor RPR; one slower than window + lag, which the rolling reference absorbs; with `patience` or `smooth`, one
+    much shorter than these.
+  """
   other = threshold if threshold_rpr is None else threshold_rpr
   return any_of(on("opr", rolling_sigma(threshold=threshold, **settings)), on("rpr", rolling_sigma(threshold=other, unit=unit_rpr, **settings)))
 
@@ -49,6 +54,10 @@ def calibrated_rule(**settings) -> Detector:
 
   How the figures were found: benchmarks/calibrate.py; its table: results/arl0.json. Runs of single samples in a row do for the car, not for what
   walks: a gait makes residuals swing, and at this ARL0 they find almost nothing within 500 steps.
+
+  One-sided: a rise of OPR or RPR alone.
+  Blind to: a fall of a residual; a change that moves neither; one slower than window + lag (4,000 or 4,500 control steps), which the reference absorbs; one
+    much shorter than the trailing mean (walker 400, quadruped 200), on the car one of fewer than 20 samples in a row.
   """
   return paper_rule(**(CALIBRATED["walker"] | settings))
 

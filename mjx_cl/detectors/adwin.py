@@ -87,7 +87,7 @@ def strongest_cut(window: Buckets, shortest: int) -> jax.Array:
 @scalar
 def adwin(threshold: float = 6.2146, clock: int = 32, grace_period: int = 10, max_buckets: int = 5, min_window_length: int = 5, rows: int = 16,
           keep: bool = False, warmup: int = 1000) -> Detector:
-  """ADWIN: a window as long as its samples agree, kept as O(log n) buckets, tested at every border between two of them.
+  """Two-sided ADWIN: a window as long as its samples agree, kept as O(log n) buckets, tested at every border between two of them.
 
     parts of n0 older and n1 newer samples, W = n0 + n1, means u0, u1, variance s2 of the whole window
     significant at delta where |u0 - u1| > sqrt(2 m s2 L) + 2/3 m L,

@@ -45,6 +45,7 @@ def bocpd(threshold: float = 1.0, hazard: float = 1e-3, recent: int = 50, max_ru
     score = ln P(1 <= r <= recent) - ln P(r > recent), the log odds that the run in force began within the last `recent` samples
     fired = score > threshold; then all mass goes to r = 0 and the levels seen are forgotten, while the scale z is kept
 
+  Two-sided: a rise, a fall and another variance are new levels alike.
   The restart is no change: until `recent` samples have passed it stands in for r > recent.
   Run lengths from max_run - 1 on share one cell. What enters it is merged by weighted mean of the natural parameters, so the cell holds the longest
   level, and one that joins it from below replaces it in proportion to its probability. The score is exact until max_run - 1 samples after a

@@ -11,12 +11,24 @@ from mjx_cl.detectors.base import Alarm, Detector, Warm, cold, demand, standardi
 from mjx_cl.errors import UserError
 
 CHANNELS = ("opr", "rpr", "reward", "surprise") + tuple(f"group_{k}" for k in range(8))
+NAMES = f"{', '.join(CHANNELS)}, variable_0 and so on"
+
+
+def is_channel(name: str) -> bool:
+  """Whether `read` knows the name; how many variables there are only the residual tells."""
+  return name in CHANNELS or name.startswith("variable_") and name[9:].isdigit()
 
 
 def read(channel: str, residual) -> jax.Array:
-  """One number of a monitor.Residual: `opr`, `rpr`, `reward`, `surprise`, or `group_0` .. `group_7`. Unknown values are nan."""
+  """One number of a monitor.Residual: `opr`, `rpr`, `reward`, `surprise`, `group_0` .. `group_7`, or `variable_0` and so on, the residual of a single
+  observation variable. Unknown values are nan. UserError for a variable that the residual does not hold."""
   if channel.startswith("group_"):
     return residual.groups[int(channel[6:])]
+  if channel.startswith("variable_"):
+    index, size = int(channel[9:]), residual.variables.shape[-1]
+    if index >= size:
+      raise UserError(f"no channel {channel}: the residual holds {size} variables" + ("" if size else ", since recorded streams keep groups of them alone"))
+    return residual.variables[index]
   return getattr(residual, channel)
 
 
@@ -27,8 +39,8 @@ def on(channel: str, detector: Detector, log: bool = False) -> Detector:
   Args:
     log: ln max(x, 1e-9) in place of x; residuals are positive and skewed.
   """
-  if channel not in CHANNELS:
-    raise UserError(f"unknown channel {channel!r}; choose from: {', '.join(CHANNELS)}")
+  if not is_channel(channel):
+    raise UserError(f"unknown channel {channel!r}; choose from: {NAMES}")
 
   def update(state, residual):
     x = read(channel, residual)

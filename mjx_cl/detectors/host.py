@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_cl.detectors.base import Alarm, Detector
-from mjx_cl.detectors.combine import CHANNELS, on
+from mjx_cl.detectors.combine import NAMES, is_channel, on
 from mjx_cl.errors import UserError
 from mjx_cl.plugins import find, line
 
@@ -40,8 +40,8 @@ def load(source: str, settings: dict | None = None, host_name: str | None = None
     UserError, one line: no such module, file, class or channel, refused settings, an object without `update`.
   Example: load("river.drift:PageHinkley", {"threshold": 20.0, "mode": "up"})
   """
-  if channel not in CHANNELS:
-    raise UserError(f"unknown channel {channel!r}; choose from: {', '.join(CHANNELS)}")
+  if not is_channel(channel):
+    raise UserError(f"unknown channel {channel!r}; choose from: {NAMES}")
   build, name = find(source, "host detector"), source.rpartition(":")[2]
   settings = dict(settings or {})
   host = HostDetector(lambda: build(**settings), host_name or name, channel, log)

@@ -55,7 +55,7 @@ def distance(a: jax.Array, b: jax.Array) -> jax.Array:
 
 @scalar
 def kswin(threshold: float = 7.0, window: int = 300, stat_size: int = 40, every: int = 10, keep: bool = False, seed: int = 0) -> Detector:
-  """Kolmogorov-Smirnov windowing: is the newest part of a sliding window distributed as the rest of it?
+  """Two-sided Kolmogorov-Smirnov windowing: is the newest part of a sliding window distributed as the rest of it?
 
     a = newest `stat_size` samples,  b = as many drawn without replacement from the `window` - `stat_size` older ones
     D = max_x |F_a(x) - F_b(x)|,  score = -ln P(D or more), exact for two samples without ties

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from mjx_cl.detectors.base import Warm, standardise
-from mjx_cl.detectors.combine import CHANNELS, read
+from mjx_cl.detectors.combine import NAMES, is_channel, read
 from mjx_cl.errors import UserError
 from mjx_cl.monitor import GROUPS
 
@@ -18,8 +18,8 @@ def split(name: str, channels: str | tuple[str, ...]) -> tuple[str, ...]:
   """Names of channels out of `a+b+c` or a sequence; `groups` is all eight. Unknown, repeated or no names are refused for detector `name`."""
   channels = tuple(channels.split("+") if isinstance(channels, str) else channels)
   channels = tuple(c for group in channels for c in ([f"group_{k}" for k in range(GROUPS)] if group == "groups" else [group]))
-  if not channels or len(set(channels)) < len(channels) or set(channels) - set(CHANNELS):
-    raise UserError(f"detector {name!r}: channels must be one or several of groups, {', '.join(CHANNELS)}, each once; got {'+'.join(channels)}")
+  if not channels or len(set(channels)) < len(channels) or not all(map(is_channel, channels)):
+    raise UserError(f"detector {name!r}: channels must be one or several of groups, {NAMES}, each once; got {'+'.join(channels)}")
   return channels
 
 

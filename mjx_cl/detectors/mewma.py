@@ -27,6 +27,7 @@ def mewma(rate: float = 0.02, threshold: float = 37.0, warmup: int = 1000, shrin
     V = rate / (2 - rate) S, the asymptotic variance; exact: times 1 - (1 - rate)^(2 t), t samples since the warm-up or the last alarm
     fired = score > threshold; then z = 0 and t = 0, while mean and S (see hotelling) are kept
 
+  Two-sided: the score is a squared distance, so a rise and a fall of any channel, the reward too, count alike.
   With the asymptotic variance and independent Gaussian samples of known covariance, p = 4, rate = 0.1, threshold 12.73 the published ARL0 is 200
   and a shift of one deviation is found after 12.2 samples. The exact variance finds a change at the start sooner, for a shorter ARL0.
   Samples of a robot are correlated in time: calibrate. The default threshold has an ARL0 of about 10,000 on independent Gaussian samples.

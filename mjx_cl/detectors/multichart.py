@@ -19,6 +19,7 @@ def multichart(threshold: float = 1.0, charts: str = CHARTS, robot: str | None =
 
   No one chart is good on every robot: what a fault disturbs differs. In units of h_i all charts share one threshold and, near 1, one rate of false
   alarms; k charts alarm at most k times as often as one of them, so that at threshold 1 the ARL0 is 100,000 / k or longer. Calibrate.
+  Each chart looks in its own direction: of the default ones cusum and ewma are two-sided, e_detector is one-sided, a rise alone.
 
   Args:
     threshold: decision level [thresholds h_i].

@@ -31,12 +31,11 @@ def family(name: str) -> str:
 
 
 def about(name: str) -> str:
-  """One line on fault `name` from its docstring: family, what happens, what severity means, what it owns."""
+  """One line on fault `name` from its docstring: family, what happens, what severity means, what a target is, what it owns."""
   text = inspect.getdoc(FAULTS[name]) or ""
-  part = lambda word: next(iter(re.findall(rf"{word}:? (.*?)\.(?: [A-Z]|\n|$)", " ".join(text.split("\n\n")[-1].split()))), "")
-  lines = [f"{family(name)}: {text.split(chr(10))[0]}"]
-  lines += [f"severity: {part('Severity')}"] * bool(part("Severity")) + [f"target: {part('Target')}"] * bool(part("Target"))
-  return "; ".join(lines)
+  last = " ".join(text.split("\n\n")[-1].split()).replace("`", "")
+  said = {word: re.search(rf"\b{word}:? (.*?)\.(?: [A-Z]|$)", last) for word in ("Severity", "Target", "Owns")}
+  return "; ".join([f"{family(name)}: {text.split(chr(10))[0]}"] + [f"{word.lower()}: {found[1]}" for word, found in said.items() if found])
 
 
 def make(name: str, env) -> Fault:

@@ -45,8 +45,8 @@ def torque_loss(env) -> Fault:
 
     torque_j' = torque_j (1 - severity)
 
-  Severity: lost share [1], 0 to 1 (no torque). Target: a joint, a leg or all. Owns `task.strength` [1], (A,), or `mj.actuator_gear` where
-  the motor has no law of its own (the walker). Source: torque factors 0.9 to 1.1 in training and 0 for a crippled leg, facts 4.2.
+  Severity: lost share [1], 0 to 1 (no torque). Target: a joint (drawn), a leg or all. Owns `task.strength` [1], (A,), or `mj.actuator_gear`
+  where the motor has no law of its own (the walker). Source: torque factors 0.9 to 1.1 in training and 0 for a crippled leg, facts 4.2.
   """
   names, mask, single = actuator_targets(env)
   leaf = "task.strength" if "strength" in env.model.task else "mj.actuator_gear"
@@ -63,8 +63,8 @@ def velocity_limit(env) -> Fault:
 
     v_j' = v_j (1 - 0.95 severity)
 
-  Severity: 1 leaves 5 % of the limit [rad/s; the car: m/s]; the paper's third is severity 0.7018. Target: a joint, a leg or all. Owns
-  `task.velocity_limit`, (A,). Not visible to: a gait below the lower limit. Source: the paper's quadruped experiment.
+  Severity: 1 leaves 5 % of the limit [rad/s; the car: m/s]; the paper's third is severity 0.7018. Target: a joint (drawn), a leg or all.
+  Owns `task.velocity_limit`, (A,). Not visible to: a gait below the lower limit. Source: the paper's quadruped experiment.
   """
   names, mask, single = actuator_targets(env)
 
@@ -79,10 +79,10 @@ def joint_lock(env) -> Fault:
 
     armature_j' = armature_j + 10 severity^2 [kg m^2],   damping_j' = damping_j + 1,000 severity^2 [N m s/rad]
 
-  Severity: 1 holds the joint: it stops within 10 ms and creeps at 0.1 rad/s under 100 N m; 0.5 is a quarter of that. Target: a joint, a leg or all. Owns
-  `mj.dof_armature`, `mj.dof_damping`, (nv,). Damping alone would do in the air, but MuJoCo's contact solver does not know of implicit damping:
-  beyond hD = M (h the physics step) a leg on the ground gains speed from it; with the armature hD / M stays at 0.5. Source: locked and crippled
-  joints, facts 4.2.
+  Severity: square root of the share of what holds a joint [1]; 1 holds it: it stops within 10 ms and creeps at 0.1 rad/s under 100 N m; 0.5 is a
+  quarter of that. Target: a joint (drawn), a leg or all. Owns `mj.dof_armature`, `mj.dof_damping`, (nv,). Damping alone would do in the air, but
+  MuJoCo's contact solver does not know of implicit damping: beyond hD = M (h the physics step) a leg on the ground gains speed from it; with the
+  armature hD / M stays at 0.5. Source: locked and crippled joints, facts 4.2.
   """
   names, mask, single = actuator_targets(env)
   hits = mask.astype(jnp.float32) @ dofs(env, "joint_lock")
@@ -109,8 +109,9 @@ def stuck(env) -> Fault:
 
     u_j' = (1 - severity) u_j + severity u_j(onset - 1)
 
-  Severity: share of the held value [1]; 1 is stuck altogether. Target: an actuator, a group or all. Owns `ctrl`. Memory: the held command;
-  an episode that starts later holds its own first command. Not visible to: a constant command. Source: stuck actuators of realworldrl_suite, facts 4.5.
+  Severity: share of the held value [1]; 1 is stuck altogether. Target: an actuator (drawn), a group or all. Owns `ctrl`. Memory: the held
+  command; an episode that starts later holds its own first command. Not visible to: a constant command. Source: stuck actions of realworldrl_suite,
+  peers A2, which stick now and then for some steps; here for good.
   """
   def change(hit, held, severity, key, ports):
     held = jnp.where((severity > 0) & ~ports.first, held, ports.ctrl)
@@ -123,8 +124,8 @@ def offset(env) -> Fault:
 
     u_j' = clip(u_j + 0.5 severity, -1, 1)
 
-  Severity: 1 adds half of the half-range [1]. Target: an actuator, a group or all. Owns `ctrl`. Not visible to: a command at its upper
-  bound. Source: motor offsets, facts 4.2.
+  Severity: 1 adds half of the half-range [half-ranges]. Target: an actuator (drawn), a group or all. Owns `ctrl`. Not visible to: a command at
+  its upper bound. Source: motor offsets, facts 4.2.
   """
   return _command("offset", env, lambda hit, m, severity, key, ports: (m, jnp.clip(ports.ctrl + 0.5 * severity, -1.0, 1.0)))
 
@@ -134,7 +135,8 @@ def dead_band(env) -> Fault:
 
     u_j' = sign(u_j) max(|u_j| - 0.5 severity, 0)
 
-  Severity: 1 is a band of half the half-range [1]. Target: an actuator, a group or all. Owns `ctrl`.
+  Severity: 1 is a band of half the half-range [half-ranges]. Target: an actuator (drawn), a group or all. Owns `ctrl`. Source: none; fault and range
+  are this project's own choice.
   """
   def change(hit, m, severity, key, ports):
     return m, jnp.sign(ports.ctrl) * jnp.maximum(jnp.abs(ports.ctrl) - 0.5 * severity, 0.0)
@@ -146,7 +148,7 @@ def command_dropout(env) -> Fault:
 
     P(u_j' = 0) = 0.5 severity, each actuator and step alone
 
-  Severity: 1 loses every other command [probability]. Target: an actuator, a group or all. Owns `ctrl`. Source: dropped commands;
+  Severity: 1 loses every other command [probability]. Target: an actuator (drawn), a group or all. Owns `ctrl`. Source: dropped commands;
   realworldrl_suite drops observations with 0.01 to 0.1, facts 4.5.
   """
   def change(hit, m, severity, key, ports):
@@ -159,8 +161,8 @@ def command_delay(env) -> Fault:
 
     u_j'(t) = u_j(t - d),   d = ceil(9 severity) control steps
 
-  Severity: 1/3, 2/3, 1 are the 3, 6, 9 steps of realworldrl_suite's easy, medium, hard. Target: an actuator, a group or all. Owns `ctrl`.
-  Memory: the last 9 commands; an episode's start fills it with its first command. Source: facts 4.5.
+  Severity: 1/3, 2/3, 1 are delays of 3, 6, 9 [control steps], realworldrl_suite's easy, medium, hard. Target: an actuator (drawn), a group or all. Owns
+  `ctrl`. Memory: the last 9 commands; an episode's start fills it with its first command. Source: facts 4.5.
   """
   def change(hit, line, severity, key, ports):
     line = jnp.where(ports.first, jnp.broadcast_to(ports.ctrl, line.shape), jnp.concatenate([ports.ctrl[None], line[:-1]]))
@@ -173,8 +175,8 @@ def command_noise(env) -> Fault:
 
     u_j' = clip(u_j + n, -1, 1),   n ~ N(0, severity^2)
 
-  Severity: standard deviation [half-ranges]; 0.1, 0.3, 1.0 are realworldrl_suite's levels. Target: an actuator, a group or all. Owns
-  `ctrl`. Source: facts 4.5.
+  Severity: standard deviation [half-ranges]; 0.1, 0.3, 1.0 are realworldrl_suite's levels. Target: an actuator (drawn), a group or all.
+  Owns `ctrl`. Source: facts 4.5.
   """
   def change(hit, m, severity, key, ports):
     return m, jnp.clip(ports.ctrl + severity * jax.random.normal(key, hit.shape), -1.0, 1.0)

@@ -23,7 +23,7 @@ def payload(env) -> Fault:
     m' = m (1 + 0.4 severity M / m),  I' = I m' / m                       M whole mass, m the trunk's
 
   Severity: 1 is a load of 40 % of the whole robot [kg]: quadruped 20.9 kg (Isaac Lab randomises by +-5 kg, severity 0.24), walker
-  11.4, car 1.5. Target: trunk. Owns `mj.body_mass`, `mj.body_inertia`, or `task.mass`, `task.inertia` where there is no MuJoCo model.
+  11.4, car 1.5. Target: trunk, the only one. Owns `mj.body_mass`, `mj.body_inertia`, or `task.mass`, `task.inertia` where there is no MuJoCo model.
   Source: payloads, facts 4.2.
   """
   if "mass" in env.model.task:
@@ -47,8 +47,9 @@ def com(env) -> Fault:
 
     r' = r + 0.5 severity g e,   g = sqrt(trace(I) / (2 m)) radius of gyration, e the direction
 
-  Severity: 1 moves it by half the radius of gyration [m]: quadruped 0.13 (VCMS trains with 0.1), walker 0.10. Target: forward, backward, left,
-  right, up, down as far as the robot can move there. Owns `mj.body_ipos`. Source: facts 4.2.
+  Severity: 1 moves it by half the radius of gyration [m]: quadruped 0.13 (VCMS trains with 0.1), walker 0.10. Target: a direction (drawn),
+  forward, backward, left, right, up, down as far as the robot can move there. Owns `mj.body_ipos`. Source: shifts of the trunk's centre of mass,
+  facts 4.2.
   """
   _bodies(env, "com")
   model, trunk = env.mj_model, int(env.spec.bodies[0][1][0])
@@ -64,8 +65,8 @@ def com(env) -> Fault:
 def limb_mass(env) -> Fault:
   """A limb grows heavier (mud, ice), its inertia with it.   m_b' = m_b (1 + 2 severity)
 
-  Severity: 1 triples the mass [kg], the upper end of Nagabandi et al.'s arm, facts 4.2. Target: a body other than the trunk. Owns
-  `mj.body_mass`, `mj.body_inertia`.
+  Severity: 1 triples the mass [kg], the upper end of Nagabandi et al.'s arm. Target: a body other than the trunk (drawn). Owns
+  `mj.body_mass`, `mj.body_inertia`. Source: limb masses, facts 4.2.
   """
   names, mask = _bodies(env, "limb_mass")
   names, mask = names[1:], mask[1:]
@@ -79,8 +80,8 @@ def limb_mass(env) -> Fault:
 def joint_damping(env) -> Fault:
   """A joint grows stiff in motion.   damping_j' = damping_j + 10 severity [N m s/rad]
 
-  Severity: 1 adds 10, the upper end of realworldrl_suite's walker (nominal 0.1). Target: a joint, a leg or all. Owns `mj.dof_damping`.
-  Source: facts 4.5.
+  Severity: 1 adds 10 [N m s/rad], the upper end of realworldrl_suite's walker (nominal 0.1). Target: a joint (drawn), a leg or all. Owns
+  `mj.dof_damping`. Source: facts 4.5.
   """
   names, mask, single = actuator_targets(env)
   hits = mask.astype(jnp.float32) @ dofs(env, "joint_damping")
@@ -93,8 +94,9 @@ def joint_damping(env) -> Fault:
 def joint_friction(env) -> Fault:
   """Dry friction in a joint.   frictionloss_j' = frictionloss_j + 0.25 severity tau_j [N m]
 
-  Severity: 1 adds a quarter of the motor's greatest torque tau_j. Target: a joint, a leg or all. Owns `mj.dof_frictionloss`. MJX builds no
-  friction constraint for a model that has none and refuses it there; C MuJoCo (physics native) does.
+  Severity: 1 adds a quarter of the motor's greatest torque tau_j [N m]. Target: a joint (drawn), a leg or all. Owns `mj.dof_frictionloss`. MJX builds
+  no friction constraint for a model that has none and refuses it there; C MuJoCo (physics native) does. Source: MuJoCo Playground varies the Go1's by
+  a tenth, facts 1.7; the range is this project's own choice.
   """
   names, mask, single = actuator_targets(env)
   which = dofs(env, "joint_friction")
@@ -114,8 +116,8 @@ def joint_friction(env) -> Fault:
 def range_loss(env) -> Fault:
   """A joint's range shrinks towards the angle at which the robot stands.   low' = low + 0.95 severity (q0 - low), high alike
 
-  Severity: 1 leaves 5 % of the range [rad]. Target: a joint, a leg or all, of those that have limits. Owns `mj.jnt_range`. Not visible to: a
-  gait that does not come near the limits.
+  Severity: 1 leaves 5 % of the range [rad]. Target: a joint (drawn), a leg or all, of those that have limits. Owns `mj.jnt_range`. Not visible to: a
+  gait that does not come near the limits. Source: none; fault and range are this project's own choice.
   """
   names, mask, single = actuator_targets(env)
   dofs(env, "range_loss")

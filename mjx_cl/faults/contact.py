@@ -18,9 +18,9 @@ def friction(env) -> Fault:
 
     mu_i' = mu_i (1 - 0.95 severity)
 
-  Severity: 1 leaves 5 % of the friction coefficient [1]. Target: all, or a foot, wheel or axle. Owns `mj.geom_friction` (n, 3) of the touching
-  geoms, which must have priority over the floor (MuJoCo takes the greater of two equal ones otherwise, and the fault would do nothing), or
-  `task.friction`, one per axle. Source: friction figures, facts 4.3 and 4.5.
+  Severity: 1 leaves 5 % of the friction coefficient [1]. Target: all, or a foot, wheel or axle (any of them drawn). Owns `mj.geom_friction` (n, 3) of
+  the touching geoms, or `task.friction`, one per axle. The geoms must have priority over the floor: MuJoCo takes the greater of two equal ones
+  otherwise, and the fault would do nothing. Source: friction figures, facts 4.3 and 4.5.
   """
   feet = list(env.spec.feet)
   if not feet:
@@ -57,8 +57,8 @@ def slope(env) -> Fault:
 
     g' = |g| (sin(a) e - cos(a) z),   a = 20 degrees severity, e the direction downhill
 
-  Severity: 1 is a slope of 20 degrees. Target: forward (downhill ahead), backward, left, right. Owns `mj.gravity` (3,) [m/s^2], or
-  `task.gravity`.
+  Severity: 1 is a slope of 20 [degrees]. Target: where downhill is (drawn), forward, backward, left, right as far as the robot can move there. Owns
+  `mj.gravity` (3,) [m/s^2], or `task.gravity`. Source: slopes of Nagabandi et al. (learning_to_adapt), peers E; the range is this project's own choice.
   """
   names, directions = heading_targets(env, ("forward", "backward", "left", "right"))
   leaf = "task.gravity" if "gravity" in env.model.task else "mj.gravity"
@@ -79,7 +79,8 @@ def whole_mass(env) -> float:
 def wind(env) -> Fault:
   """A steady force on the trunk.   F = 0.3 severity M g e [N]
 
-  Severity: 1 is 30 % of the weight. Target: the direction of the wind in the world: forward (+x), backward, left, right. Owns `force` (nv,).
+  Severity: 1 is 30 % of the weight [N]. Target: the direction of the wind in the world (drawn), forward (+x), backward, left, right as far as the robot
+  can move there. Owns `force` (nv,). Source: force faults of PEDM, Haider et al. 2023, peers B3; direction and range are this project's own choice.
   """
   names, directions = heading_targets(env, ("forward", "backward", "left", "right"))
   blows = 0.3 * 9.81 * whole_mass(env) * directions @ force_map(env)
@@ -94,8 +95,8 @@ def push(env) -> Fault:
 
     F = severity M dv / (4 dt) e [N],   dv = 1.5 m/s, e = forward or backward (and sideways where the robot can move there)
 
-  Severity: 1 is a change of speed of 1.5 m/s per blow (Isaac Lab trains with 0.5, severity 1/3). Target: trunk. Owns `force` (nv,). Memory: the
-  direction of the latest blow. Source: pushes, facts 1.6 and 4.2.
+  Severity: 1 changes the speed by 1.5 per blow [m/s] (Isaac Lab trains with 0.5, severity 1/3). Target: trunk, the only one. Owns `force` (nv,).
+  Memory: the direction of the latest blow. Source: pushes, facts 1.6 and 4.2.
   """
   _, directions = heading_targets(env, ("forward", "backward", "left", "right"))
   blows = 1.5 * whole_mass(env) / (PUSH_FOR * env.spec.control_s) * directions @ force_map(env)  # (directions, nv)

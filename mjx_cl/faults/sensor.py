@@ -29,7 +29,8 @@ def _sensor(name, env, change, memory=(), not_monotone=""):
 def bias(env) -> Fault:
   """A constant is added to a reading.   x_i' = x_i + 2 severity scale_i
 
-  Severity: 1 is two typical deviations [unit of the channel]. Owns `obs`.
+  Severity: 1 is two typical deviations [unit of the channel]. Target: a group of channels (drawn), all, or one channel. Owns `obs`. Source: bias
+  drift, which isaac-sim/IsaacLab#7451 asks for, peers 0, here as a step; the range is this project's own choice.
   """
   return _sensor("bias", env, lambda m, severity, key, ports, scale: (m, ports.obs + 2.0 * severity * scale))
 
@@ -37,7 +38,8 @@ def bias(env) -> Fault:
 def drift(env) -> Fault:
   """A reading wanders off in a straight line.   x_i' = x_i + 2 severity scale_i min(1, (since + 1) / 2,000)
 
-  Severity: 1 ends two typical deviations off, 2,000 control steps after the onset. Owns `obs`.
+  Severity: 1 ends two typical deviations off [unit of the channel], 2,000 control steps after the onset. Target: a group of channels
+  (drawn), all, or one channel. Owns `obs`. Source: sensor drift of Danesh and Fern 2021, peers B3; the range is this project's own choice.
   """
   def change(m, severity, key, ports, scale):
     share = jnp.clip((ports.since + 1) / DRIFT_STEPS, 0.0, 1.0)
@@ -48,7 +50,8 @@ def drift(env) -> Fault:
 def scale(env) -> Fault:
   """A sensor's gain falls.   x_i' = x_i (1 - 0.9 severity)
 
-  Severity: 1 leaves a tenth of the reading. Owns `obs`. Not visible to: a channel that reads 0.
+  Severity: 1 leaves a tenth of the gain [1]. Target: a group of channels (drawn), all, or one channel. Owns `obs`. Not visible to: a channel that
+  reads 0. Source: calibration faults (a reading times a constant) of Danesh and Fern 2021, peers B3; the range is this project's own choice.
   """
   return _sensor("scale", env, lambda m, severity, key, ports, _: (m, ports.obs * (1.0 - 0.9 * severity)))
 
@@ -56,7 +59,8 @@ def scale(env) -> Fault:
 def noise(env) -> Fault:
   """Gaussian noise on a reading.   x_i' = x_i + n,  n ~ N(0, (severity scale_i)^2)
 
-  Severity: standard deviation [typical deviations]; realworldrl_suite's levels are 0.1, 0.3, 1.0 in raw units. Owns `obs`. Source: facts 4.5.
+  Severity: standard deviation [typical deviations]; realworldrl_suite's levels are 0.1, 0.3, 1.0 in raw units. Target: a group of
+  channels (drawn), all, or one channel. Owns `obs`. Source: facts 4.5.
   """
   return _sensor("noise", env, lambda m, severity, key, ports, scale: (m, ports.obs + severity * scale * jax.random.normal(key, scale.shape)))
 
@@ -64,8 +68,11 @@ def noise(env) -> Fault:
 def dropout(env) -> Fault:
   """A reading is lost now and then: 0 in its place.   P(x_i' = 0) = 0.5 severity, each channel and step alone
 
-  Severity: 1 loses every other reading [probability]; realworldrl_suite has 0.01, 0.05, 0.1. Owns `obs`. Not visible to: a channel that
-  reads 0. Source: facts 4.5.
+  A loss lasts one control step. realworldrl_suite's lasts 5 at its medium level (probability 0.05) and 10 at its hard one (0.1), so that more is lost
+  there at the same probability.
+
+  Severity: 1 loses every other reading [probability]; realworldrl_suite has 0.01, 0.05, 0.1. Target: a group of channels (drawn), all,
+  or one channel. Owns `obs`. Not visible to: a channel that reads 0. Source: dropped observations of realworldrl_suite, facts 4.5.
   """
   return _sensor("dropout", env, lambda m, severity, key, ports, _: (
       m, jnp.where(jax.random.uniform(key, ports.obs.shape) < 0.5 * severity, 0.0, ports.obs)))
@@ -74,8 +81,12 @@ def dropout(env) -> Fault:
 def freeze(env) -> Fault:
   """A reading stands still: it is not renewed.   P(x_i'(t) = x_i'(t - 1)) = severity, each channel and step alone
 
-  Severity: probability that a reading is held for another step; 1 holds it for ever. Owns `obs`. Memory: the last reading; an episode's
-  start renews it. Not visible to: a channel that does not change. Source: stuck sensors of realworldrl_suite, facts 4.5.
+  A draw holds for one control step; a reading stands for longer only where draws repeat it. realworldrl_suite's stuck sensors stand for 5 at its medium
+  level (probability 0.05) and for 10 at its hard one (0.1).
+
+  Severity: how likely a reading is held for another step [probability]; 1 holds it for ever. Target: a group of channels (drawn), all, or one channel.
+  Owns `obs`. Memory: the last reading; an episode's start renews it. Not visible to: a channel that does not change. Source: stuck sensors of
+  realworldrl_suite, facts 4.5.
   """
   def change(held, severity, key, ports, _):
     hold = (jax.random.uniform(key, ports.obs.shape) < severity) & ~jnp.asarray(ports.first)
@@ -87,8 +98,8 @@ def freeze(env) -> Fault:
 def delay(env) -> Fault:
   """A reading arrives late.   x_i'(t) = x_i(t - d),  d = ceil(9 severity) control steps
 
-  Severity: 1/3, 2/3, 1 are the 3, 6, 9 steps of realworldrl_suite's easy, medium, hard. Owns `obs`. Memory: the last 9 readings; an
-  episode's start fills it with its first reading. Source: facts 4.5.
+  Severity: 1/3, 2/3, 1 are delays of 3, 6, 9 [control steps], realworldrl_suite's easy, medium, hard. Target: a group of channels
+  (drawn), all, or one channel. Owns `obs`. Memory: the last 9 readings; an episode's start fills it with its first reading. Source: facts 4.5.
   """
   def change(line, severity, key, ports, _):
     line = jnp.where(ports.first, jnp.broadcast_to(ports.obs, line.shape), jnp.concatenate([ports.obs[None], line[:-1]]))
@@ -99,7 +110,8 @@ def delay(env) -> Fault:
 def lidar_loss(env) -> Fault:
   """Beams of a sector return nothing: they read the greatest range.   x_i' = high_i for the first ceil(severity n) of the sector's n beams
 
-  Severity: share of the sector that is blind [1]; 1 is all of it. Target: a group of beams. Owns `obs`. Not visible to: beams that see no wall.
+  Severity: share of the sector that is blind [1]; 1 is all of it. Target: a group of beams (drawn). Owns `obs`. Not visible to: beams that see no
+  wall. Source: none; fault and range are this project's own choice.
   """
   beams = [(name, index) for name, index in env.spec.obs_groups if name.startswith("lidar")]
   if not beams:

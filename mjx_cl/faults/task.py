@@ -11,7 +11,8 @@ from mjx_cl.faults.base import Fault, fault
 def reward_weight(env) -> Fault:
   """One term of the reward loses its weight.   w_k' = w_k (1 - severity)
 
-  Severity: lost share [1]. Target: a term of the reward (env.reward_terms). Owns `task.reward_weights`. Not visible to: the observation.
+  Severity: lost share [1]. Target: a term of the reward that counts (drawn; env.reward_terms). Owns `task.reward_weights`. Not visible to: the
+  observation. Source: Greenberg and Mannor 2021 change the cost of actions, peers B3; that a term fades, and the range, are this project's own choice.
   """
   terms = getattr(env, "reward_terms", ())
   weights = np.asarray(env.model.task.get("reward_weights", ()))
@@ -28,7 +29,8 @@ def reward_weight(env) -> Fault:
 def command_range(env) -> Fault:
   """More is asked for: commands (or the speed to reach) leave the range of the training.   range' = range (1 + severity)
 
-  Severity: 1 doubles it [m/s, rad/s]. Target: command. Owns `task.command_range`.
+  Severity: 1 doubles it [m/s, rad/s]. Target: command, the only one. Owns `task.command_range`. Source: none; fault and range are this project's own
+  choice.
   """
   def act(target, memory, severity, key, ports):
     return memory, {"task.command_range": ports.model.task["command_range"] * (1.0 + severity)}

@@ -14,7 +14,7 @@ def gap(env) -> Fault:
     x' = x + severity (x_real - x_simulator),  acceleration, grip and mass:  x' = x (x_real / x_simulator)^severity
 
   Severity: 1 adds the whole difference of the item [its unit, see envs.car_real.GAP]: where the item is switched off it is then there in full, where it
-  is on it is doubled. Target: an item, or all. Owns the leaves of the items. Source: named with each item.
+  is on it is doubled. Target: an item (drawn), or all. Owns the leaves of the items. Source: named with each item.
   """
   items = getattr(env, "gap_items", None)
   if not items:
