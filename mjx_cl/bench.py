@@ -409,11 +409,34 @@ def collect(out: pathlib.Path, plan: Suite, known: dict | None = None) -> dict:
       cells.extend([None] * (before + count - len(cells)))
   if columns:
     store.write_table(out / "bench.parquet", columns)
-    from mjx_cl import plots
-    plots.survival(out, list(value["entries"]))
-    plots.ratios(out, [p for part in plan.parts if part.name in value["entries"] for p in _points(part, value["entries"][part.name]["scores"])])
+    draw(out, plan, value)
   store.write_json(out / "bench.json", value)
   return value
+
+
+def draw(out, plan: Suite, value: dict) -> list[pathlib.Path]:
+  """OUT/recovery.png and OUT/ratio.png, as far as there is something to draw, from the rows of OUT's parts and what bench.json holds, `value`. Returns the files."""
+  from mjx_cl import plots
+  points = [p for part in plan.parts if part.name in value["entries"] for p in _points(part, value["entries"][part.name]["scores"])]
+  return [file for file in (plots.survival(out, list(value["entries"])), plots.ratios(out, points)) if file]
+
+
+def redraw(results) -> list[pathlib.Path]:
+  """The figures of every suite that is published in a subfolder of `results`, drawn anew from its files. Returns them.
+
+  Raises:
+    FileError where a folder with a bench.json is broken or of a suite that this package does not have.
+  """
+  out = []
+  for folder in sorted(p.parent for p in pathlib.Path(results).glob("*/bench.json")):
+    try:
+      value = json.loads((folder / "bench.json").read_text())
+      out += draw(folder, suite(value["suite"]), value)
+    except (OSError, ValueError, KeyError, TypeError) as e:
+      raise FileError(f"cannot draw the figures of {folder}: {type(e).__name__}: {e}") from None
+    except UserError as e:
+      raise FileError(f"cannot draw the figures of {folder}: {e}") from None
+  return out
 
 
 def _points(part: Part, scores_: dict) -> list[dict]:

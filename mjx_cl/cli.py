@@ -342,6 +342,8 @@ class Report:
   """Texts with marked blocks; default: README.md and docs/*.md."""
   check: bool = False
   """Write nothing; exit code 1 and the names of the blocks where text and results disagree."""
+  figures: bool = False
+  """Draw recovery.png and ratio.png of every published suite anew as well. A run's figure.png needs its trace (`mjx-cl plot`), leaderboard.html the streams (`mjx-cl leaderboard`)."""
   json: bool = False
 
 
@@ -903,9 +905,15 @@ def do_report(args: Report) -> None:
   from mjx_cl import report
   pages = args.page or [str(p) for p in report.pages()] or ["README.md"]
   found = {page: report.report(args.results, page, check=True) for page in pages}  # whatever is wrong is said before anything is written
+  if args.figures and args.check:
+    raise UserError("--check writes nothing, --figures draws: give one of the two")
   if not args.check:
     for page in pages:
       report.report(args.results, page)
+  if args.figures:
+    from mjx_cl import bench
+    for file in bench.redraw(args.results):
+      print(f"{file}: drawn anew", file=sys.stderr)
   stale = {page: list(dict.fromkeys(b["name"] for b in blocks if not b["agrees"])) for page, blocks in found.items()}
   stale = {page: names for page, names in stale.items() if names}
   if args.json:

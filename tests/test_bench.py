@@ -395,3 +395,20 @@ def test_recovery_against_the_ratio_is_drawn_where_a_suite_has_several(tmp_path)
   assert bench._points(parts[0], {"recovery": {"none": back, "oracle": None}}) == []
   assert plots.ratios(tmp_path, points[:1] * 2) is None and not list(tmp_path.iterdir())
   assert plots.ratios(tmp_path, points + [points[0] | {"line": "other", "ci": None}]).read_bytes()[:4] == b"\x89PNG" and len(list(tmp_path.iterdir())) == 1
+
+
+def test_published_figures_are_drawn_anew(tmp_path, mjx):  # noqa: F811
+  """From the committed files of a suite alone; what cannot be drawn is one line."""
+  import shutil
+  study = pathlib.Path(__file__).parent.parent / "results/study"
+  shutil.copytree(study, tmp_path / "study", ignore=shutil.ignore_patterns("*.png"))
+  (tmp_path / "page.md").write_text("no block")
+  code, _, err = mjx("report", "--results", tmp_path, "--page", tmp_path / "page.md", "--figures")
+  assert code == 0 and [pathlib.Path(line.split(":")[0]).name for line in err.splitlines() if "drawn anew" in line] == ["recovery.png", "ratio.png"]
+  assert all((tmp_path / "study" / name).stat().st_size > 10_000 for name in ("recovery.png", "ratio.png"))
+  assert mjx("report", "--results", tmp_path, "--page", tmp_path / "page.md", "--figures", "--check")[0] == 2
+  value = json.loads((tmp_path / "study/bench.json").read_text())
+  for text, word in (("{", "JSONDecodeError"), (json.dumps(value | {"suite": "nobody"}), "nobody"), (json.dumps({"suite": "study"}), "KeyError")):
+    (tmp_path / "study/bench.json").write_text(text)
+    with pytest.raises(FileError, match=f"^cannot draw the figures of .*{word}"):
+      bench.redraw(tmp_path)

@@ -25,6 +25,8 @@ def hotelling(smooth: int = 100, threshold: float = 36.0, warmup: int = 1000, sh
     T^2 = n (y_t - mean)' S^-1 (y_t - mean) = score;  S = covariance of single samples, correlations times 1 - shrinkage
     fired = T^2 > threshold; then the trailing mean starts from nothing, while mean and S are kept
 
+  Two-sided: a quadratic form, so a rise and a fall of any channel count alike.
+
   For independent Gaussian samples of p channels, no shrinkage and m = warmup: T^2 / (1 + n / m) is p (m - 1) / (m - p) F(p, m - p), near
   chi-square with p degrees for m >> p, n. Samples of a robot are correlated in time, which makes T^2 larger: calibrate. The default threshold
   has an ARL0 of about 10,000 samples on independent Gaussian samples.
