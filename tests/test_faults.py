@@ -1,6 +1,9 @@
 """Contract suite over every fault of the table, on the walker, and the figures of single faults."""
 import re
 
+import copy
+import types
+
 import chex
 import jax
 import jax.numpy as jnp
@@ -329,3 +332,35 @@ def test_gear_is_halved_exactly_as_in_the_paper(short_walker, target, index, wan
 
 def test_gear_at_severity_one_gives_no_torque(short_walker):
   np.testing.assert_array_equal(gears(short_walker, "left_knee", 1.0)[:, 0], [100, 50, 20, 100, 0, 20])
+
+
+def _floor(model):
+  model.geom_priority[model.geom("floor").id] = model.geom_priority.max() + 1
+
+
+def _unlimited(model):
+  model.jnt_limited[model.joint("left_knee").id] = 0
+
+
+def _no_range(model):
+  model.actuator_ctrlrange[2] = 0.0
+
+
+@pytest.mark.parametrize("name, spoil, words", [
+    ("friction", _floor, "the floor masks the friction of .*; give these geoms a higher priority"), ("range_loss", _unlimited, "needs joints with limits; .*left_knee"),
+    ("joint_friction", _no_range, "needs motors with a greatest torque")])
+def test_what_would_silently_do_nothing_is_refused(short_walker, name, spoil, words):
+  """A model on which MuJoCo would not let the fault act."""
+  env = copy.copy(short_walker)
+  env.mj_model = copy.copy(short_walker.mj_model)
+  faults.make(name, env)
+  spoil(env.mj_model)
+  with pytest.raises(UserError, match=words):
+    faults.make(name, env)
+
+
+def test_joint_friction_needs_a_model_with_some_on_mjx(short_walker):
+  env = copy.copy(short_walker)
+  env.physics = types.SimpleNamespace(name="mjx")
+  with pytest.raises(UserError, match="MJX builds no friction constraint"):
+    faults.make("joint_friction", env)
