@@ -92,6 +92,17 @@ def test_losses_at_init(full):
   assert metrics["ret_scale"] == 1.0 and np.all(np.asarray(range_) == 0.0)
 
 
+def test_half_precision_of_stored_latents_changes_no_loss(full):
+  """A replay keeps the context's deterministic state as float16, half a thousandth of it at most: losses and gradients differ by no more than that."""
+  batch = make_batch(3)
+  half = batch._replace(deter=np.asarray(batch.deter).astype(np.float16).astype(np.float32))
+  (jac, terms, *_), (jac_half, terms_half, *_) = (full(full.params, full.slow, x) for x in (batch, half))
+  assert 1e-5 < np.abs(half.deter - batch.deter).max() < 2 ** -11
+  np.testing.assert_allclose(terms_half, terms, rtol=5e-4)
+  norm = lambda tree: np.sqrt(sum(np.sum(np.square(np.asarray(x, np.float64))) for x in jax.tree.leaves(tree)))
+  assert norm(jax.tree.map(lambda a, b: a - b, jac_half, jac)) < 2e-3 * norm(jac)  # sums of many such differences
+
+
 def test_heads_predict_zero_at_init(full):
   agent = full.agent
   deter, stoch = (np.random.default_rng(i).standard_normal((50, n)).astype(np.float32) for i, n in ((0, 128), (1, 64)))
