@@ -4,6 +4,8 @@ import gzip
 import inspect
 import json
 import os
+import pathlib
+import re
 import sys
 
 import chex
@@ -54,19 +56,42 @@ def one_line(error):
   return text
 
 
-# ---- example of the documentation ------------------------------------------------------------------------------------------------------
+# ---- examples of the documentation -----------------------------------------------------------------------------------------------------
 
-def test_example_csv_log(tmp_path):
-  """A log of motor current at 50 Hz: two minutes healthy, then one in which the current rises after 40 s."""
-  rng = np.random.default_rng(0)
-  save(tmp_path / "healthy.csv", current=2.0 + 0.1 * rng.normal(size=6000))
-  save(tmp_path / "today.csv", current=2.0 + 0.1 * rng.normal(size=3000) + 0.1 * (np.arange(3000) >= 2000))
-  from mjx_cl import detect
-  result = detect.detect(tmp_path / "today.csv", tmp_path / "healthy.csv", detectors=("cusum",), arl0=1000, rate=50)
-  alarms = np.flatnonzero(result.fired["cusum"])
-  assert (alarms >= 2000).sum() >= 10 and (alarms < 2000).sum() <= 8  # an ARL0 of 1,000 means two; Poisson: beyond 8 is one in 4,000
-  first = alarms[alarms >= 2000][0]
-  assert first < 2040 and result.seconds[first] == first / 50
+def example(name):
+  """The Python block of docs/detection.md that begins with `# name`."""
+  text = (pathlib.Path(__file__).parent.parent / "docs/detection.md").read_text()
+  (block,) = [b for b in re.findall(r"^```python\n(.*?)^```", text, re.S | re.M) if b.startswith(f"# {name}\n")]
+  return block
+
+
+def test_the_log_of_the_example(tmp_path, monkeypatch, mjx):
+  monkeypatch.chdir(tmp_path)
+  exec(compile(example("log.py"), "log.py", "exec"), {})
+  code, out, err = mjx("today.csv", "--nominal", "healthy.csv", "--arl0", "1000", "--rate", "50", "--out", "detected", "--detector", "cusum", "hotelling")
+  assert code == 0, err
+  assert "cusum" in out and {p.name for p in pathlib.Path("detected").iterdir()} == set(detect.FILES)
+  with open("detected/alarms.csv") as file:
+    alarms = [(r["detector"], r["column"], int(r["sample"]), float(r["seconds"])) for r in csv.DictReader(file)]
+  for name, column in (("cusum", "current"), ("hotelling", "(all)")):
+    own = [a for a in alarms if a[:2] == (name, column)]
+    late = [a for a in own if a[2] >= 2000]
+    assert len(late) >= 3 and len(own) - len(late) <= 8, name  # an ARL0 of 1,000 means two before the change; Poisson: beyond 8 is one in 4,000
+    assert late[0][2] < 2060 and late[0][3] == late[0][2] / 50
+
+
+def test_the_pair_of_the_example(tmp_path, monkeypatch):
+  """As the board and a run take it: from its file, on both residuals, and in one trace whatever the threshold."""
+  monkeypatch.chdir(tmp_path)
+  pathlib.Path("level.py").write_text(example("level.py"))
+  x = np.exp(np.where(np.arange(1500) == 1200, 4.0, 0.1 * noise(1500))).astype(np.float32)
+  from mjx_cl.monitor import unknown
+  rows = unknown((1500,), 1)._replace(opr=jnp.asarray(x), rpr=jnp.ones(1500), valid=jnp.ones(1500, bool))
+  det = detectors.make("level.py:level", threshold=2.0)
+  fired = jax.lax.scan(det.update, det.init(), rows)[1].fired
+  assert np.flatnonzero(fired).tolist() == [1200]
+  traced = jax.jit(lambda limit: jax.lax.scan((d := detectors.make("level.py:level", threshold=limit)).update, d.init(), rows)[1].fired.sum())
+  assert int(traced(2.0)) == 1 and int(traced(5.0)) == 0
 
 
 # ---- files -----------------------------------------------------------------------------------------------------------------------------

@@ -408,6 +408,19 @@ def test_a_score_that_looks_ahead_in_healthy_streams_alone_is_found_out(small, t
     submissions.read_submission(tmp_path / "s.parquet", held)
 
 
+def test_the_scores_of_the_example(small, tmp_path, monkeypatch):
+  """The script of docs/detection.md makes of the exported streams a file that is taken, with the mean of the last hundred in it."""
+  from test_detect import example
+  monkeypatch.chdir(tmp_path)
+  submissions.export(small[0], "streams")
+  exec(compile(example("scores.py"), "scores.py", "exec"), {})
+  scores = submissions.read_submission("scores.parquet", small[0])
+  n = int(small[0].find("walker", "fault", "score")[0])
+  x = np.nan_to_num(np.log(small[0].get("walker", [n]).residual.opr[:, 0].astype(float)))
+  np.testing.assert_allclose(scores[n][150], x[51:151].mean(), rtol=1e-6)
+  assert np.isnan(scores[n][:99]).all() and np.isfinite(scores[n][99:]).all()
+
+
 class Above:
   """A detector as a newcomer writes it."""
 
