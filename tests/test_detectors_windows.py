@@ -409,6 +409,14 @@ def test_conformal_fails_on_an_autocorrelated_stream():
   assert arl(conformal(threshold=math.log(200), warmup=50), xs[:2000])[0] < 100
 
 
+def test_conformal_holds_on_the_whitened_form_of_the_same_stream():
+  """Its innovations are nearly independent: the mean time to an alarm keeps the bound, which the raw stream breaks twofold."""
+  from mjx_cl.detectors import combine
+  xs = autoregression(np.random.default_rng(14), (SHAPE[0] + 550, SHAPE[1]), 0.9)
+  mean, error = arl(combine.whitened(conformal(threshold=math.log(200), warmup=50), order=1, warmup=500), xs)
+  assert mean * (1 - 501 / len(xs)) > 200 - 3 * error  # the samples of the fit, once for each stream, are no run
+
+
 def test_conformal_ranks_take_in_a_lasting_change_unless_frozen():
   rng = np.random.default_rng(15)
   xs = rng.normal(size=(3500, 20)) + 1.5 * (np.arange(3500) >= 500)[:, None]
