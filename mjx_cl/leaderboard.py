@@ -82,7 +82,7 @@ def variants() -> dict[str, dict]:
   """Settings by name on the board: every registered detector at its defaults, and the usual other channels and a whitened form."""
   own = {name: {"use": name} for name in detectors_lib.DETECTORS}
   scalar = lambda n: getattr(detectors_lib.DETECTORS.get(n), "takes", "") == "scalar"
-  for name in ("cusum", "ewma", "glr"):
+  for name in ("cusum", "ewma", "glr", "conformal"):
     if scalar(name):
       own[f"{name} white"] = {"use": name, "whiten": oracles.ORDER}
   if scalar("cusum"):
