@@ -81,6 +81,8 @@ class Run:
   """Write what each stream has learnt as an agent, OUT/agents/ARM-SEED, for --agent of another run."""
   parts: bool = False
   """Also write the residual of each part of the observation into trace.parquet, columns residual_NAME."""
+  residuals: bool = False
+  """Also write residuals.parquet: the residual of every single variable of the observation, in its own unit, for each stream and control step."""
   adapt: AdaptConfig = AdaptConfig()
   json: bool = False
   """One JSON value on standard output, nothing else there."""
@@ -474,7 +476,7 @@ def do_run(args: Run) -> None:
       env=args.env, fault=args.fault, target=None if args.target == "random" else args.target, severity=args.severity, onset=args.onset,
       duration=args.duration, schedule=args.schedule, period=args.period, share=args.share, steps=args.steps, seeds=args.seeds, first_seed=args.first_seed, detector=args.detector, settings=settings(args.set),
       arms=args.arm, agent=args.agent, physics=args.physics, form=args.form, actions=args.actions, deterministic=args.deterministic, adapt=args.adapt,
-      snapshots=args.snapshots, keep=args.keep, parts=args.parts)
+      snapshots=args.snapshots, keep=args.keep, parts=args.parts, residuals=args.residuals)
   from mjx_cl import run
   with RunDisplay() as display:
     summary = run.execute(config, args.out, args.resume, args.overwrite, display, tell=say)

@@ -280,6 +280,7 @@ class RunConfig:
       Each is evaluated on the broken robot once the run is over, see snapshots.py.
     keep: what each stream has learnt is written as an agent, see run.Runner.keep.
     parts: trace.parquet also holds the residual of each part of the observation (monitor.watched), columns residual_NAME.
+    residuals: residuals.parquet holds the residual of every observation variable, in its own unit.
   """
   env: str
   fault: str = "gear"
@@ -305,6 +306,7 @@ class RunConfig:
   snapshots: int = 0
   keep: bool = False
   parts: bool = False
+  residuals: bool = False
 
   def __post_init__(self):
     last = self.steps

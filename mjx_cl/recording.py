@@ -241,9 +241,10 @@ def record(suite_: Suite, out, robots=(), physics: str = "auto", agent: str | No
   ready = prepare(suite_, robots, physics, agent)
   old = beside(suite_, out, robots) if robots else None
   table = store.read_rows(out / "streams.parquet") if old else []
-  kept = {r: None for r in old["suite"]["robots"] if r not in robots} if old else {}
   kind_of = {row["stream"]: row["kind"] for row in table}
-  rows, free = [row for row in table if row["robot"] in kept and kind_of.get(row["prefix"]) != "nominal"], 1 + max((row["stream"] for row in table), default=-1)
+  table = [row for row in table if kind_of.get(row["prefix"]) != "nominal"]  # probes of healthy streams are numbered anew, behind all others
+  kept = {r: None for r in old["suite"]["robots"] if r not in robots} if old else {}
+  rows, free = [row for row in table if row["robot"] in kept], 1 + max((row["stream"] for row in table), default=-1)
   steps_of, speed, details = {}, {}, {}
   for robot, (env, trained) in ready.items():
     weights = _digest(trained.train.params)

@@ -250,6 +250,7 @@ class Runner:
         "phase": np.broadcast_to(self._phase.astype(np.int8), rewards.shape).copy(),
         "updates": np.broadcast_to(self._updates.astype(np.int32), rewards.shape).copy(),
         **({"parts": at_end(digest.residual.groups)} if self.config.parts else {}),
+        **({"variables": at_end(digest.residual.variables)} if self.config.residuals else {}),
         "signals": digest.signals[None], "decision": digest.decision[None], "since": digest.since[None], "settled": digest.settled[None]}
     if self.endless:  # what the stop rule reads besides the signals
       now = (self.done_chunks + 1) * self.chunk_steps
@@ -338,6 +339,9 @@ class Runner:
     store.write_table(self.out / "trace.parquet", table)
     store.write_table(self.out / "events.parquet", {k: [e[k] for e in events] for k in ("stream", "arm", "seed", "step", "kind", "reason", "fault")})
     store.write_table(self.out / "runs.parquet", {k: [r[k] for r in runs] for k in runs[0]})
+    if self.config.residuals:
+      store.write_table(self.out / "residuals.parquet", {k: table[k] for k in ("stream", "arm", "seed", "step")} | {
+          v.name: np.ascontiguousarray(trace["variables"][:, :, k].T).reshape(-1) for k, v in enumerate(self.env.spec.obs)})
     plots.figure(self.out)
     if self.endless and "posture" in trace:
       store.write_table(self.out / "signals.parquet", self._signals(trace))
@@ -581,7 +585,9 @@ def summarise(rows: list[dict], config: RunConfig, control_s: float) -> dict:
   hit = [r["latency_steps"] is not None and r["latency_steps"] <= 500 for r in affected]
   count("affected_alarmed_within_500", sum(hit), len(affected))
   for outcome in dict.fromkeys((*OUTCOMES[phase_lib.STOP:], "adapting")):
-    count(outcome, sum(r["outcome"] == outcome for r in rows), len(rows))
+    hits = sum(r["outcome"] == outcome for r in rows)
+    if hits or outcome != "failed":  # numeric failures are named where there are any
+      count(outcome, hits, len(rows))
   count("recovered", sum(np.isfinite(x) for x in back), len(affected))
   count("recovered_within_10000", sum(x <= 10_000 for x in back), len(affected))
   put("recovery_median_steps", median(back), bootstrap.interval(back, bootstrap.censored_median) if len(back) > 1 else None)

@@ -30,7 +30,7 @@ ENDS = [min(STEPS, (i + 1) * run.CHUNK) - 1 for i in range(-(-STEPS // run.CHUNK
 # nominal levels from step 100, an alarm at any sample beyond three deviations of the last 100, settled four chunks after it
 ARGS = ["run", "walker", "--steps", str(STEPS), "--onset", str(ONSET), "--seeds", "2", "--first-seed", "3", "--detector", "rolling_sigma_plain",
         "--set", "window=100", "warmup=30", "--adapt.warmup", "100", "--adapt.start-windows", "40", "--adapt.patience", "4", "--adapt.least", "64",
-        "--adapt.trend", "1e9", "--adapt.fluctuation", "1e9", "--adapt.refit", "100", "--keep", "--parts", "--json"]
+        "--adapt.trend", "1e9", "--adapt.fluctuation", "1e9", "--adapt.refit", "100", "--keep", "--parts", "--residuals", "--json"]
 
 
 class Easy(Walker):
@@ -94,7 +94,7 @@ def of_stream(folder, stream, *kinds):
 
 def test_all_files_are_there_with_their_columns(whole):
   out, _, _ = whole
-  assert sorted(os.listdir(out)) == ["agents", "config.json", "events.parquet", "figure.png", "runs.parquet", "summary.json", "trace.parquet"]
+  assert sorted(os.listdir(out)) == ["agents", "config.json", "events.parquet", "figure.png", "residuals.parquet", "runs.parquet", "summary.json", "trace.parquet"]
   assert list(table(out, "trace")) == [
       "stream", "arm", "seed", "fault", "step", "episode", "phase", "fault_active", "severity", "reward", "opr", "rpr", "score", "alarm",
       "terminated", "truncated", "valid", *(f"residual_{name}" for name, _ in envs.make("walker").spec.watched), "dyn_loss", "adv_mag", "value_loss", "updates"]
@@ -113,6 +113,16 @@ def test_residuals_of_the_parts_are_known_where_opr_is(whole):
     np.testing.assert_array_equal(np.isfinite(part), known)
     least = min(spec.obs[i].scale for i in at)
     assert (part[known] >= 0).all() and (part[known] * least * len(at) / len(spec.obs) <= rows["opr"][known] * (1 + 1e-4)).all()  # float32 sums
+
+
+def test_residuals_of_the_variables_have_opr_for_their_mean(whole):
+  rows, spec = by_stream(whole[0]), envs.make("walker").spec
+  table = store.read_table(whole[0] / "residuals.parquet")
+  names = [v.name for v in spec.obs]
+  assert list(table) == ["stream", "arm", "seed", "step", *names] and np.array_equal(table["step"], np.tile(np.arange(STEPS), 4))
+  values = np.stack([table[name].reshape(4, STEPS) for name in names], -1)
+  np.testing.assert_array_equal(np.isfinite(values).all(-1), rows["valid"])
+  np.testing.assert_allclose(values.mean(-1)[rows["valid"]], rows["opr"][rows["valid"]], rtol=1e-5)  # float32 sums
 
 
 def test_each_part_has_its_own_column(saved, tmp_path):
