@@ -1,5 +1,6 @@
 """Contract suite: every fault of every robot acts, from its onset on, on nothing else, in one compiled program; and the suite finds those that do not."""
 import json
+import pathlib
 
 import chex
 import jax
@@ -7,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_cl import certify, envs, fault_presets, faults
+from mjx_cl import certify, envs, fault_presets, faults, store
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.faults import certificate
 from mjx_cl.faults.certificate import Lane
@@ -185,3 +186,16 @@ def test_what_is_in_the_way_is_said_before_anything_is_measured(tmp_path):
 def test_unknown_robot_names_the_choices():
   with pytest.raises(UserError, match="'crawler'.*car, car_real, quadruped, walker"):
     certify.check(("crawler",))
+
+
+def test_the_certificates_that_are_published_are_of_every_fault_target_severity_and_preset(robot):
+  """No lane of today's catalogue is missing in results/certificates.parquet, and none is of yesterday's."""
+  if robot.spec.name not in LACKING:
+    pytest.skip("a robot of another package")
+  path = pathlib.Path(__file__).parent.parent / "results/certificates.parquet"
+  rows = [r for r in store.read_rows(path) if r["robot"] == robot.spec.name]
+  have = {k: f for k, f in faults.available(robot).items() if k in faults.FAULTS.own and k != "none"}
+  key = lambda fault, target, severity: (fault, target, round(severity, 6))
+  want = {key(lane.fault, lane.target, lane.severity) for lane in certificate.lanes(have, certificate.SEVERITIES) + certificate.preset_lanes(robot, have)}
+  assert {key(r["fault"], r["target"], r["severity"]) for r in rows if r["fault"] != "none"} == want
+  assert certificate.faulty([certificate.Certificate(**{k: r[k] for k in certificate.Certificate._fields}) for r in rows]) == []
