@@ -71,6 +71,7 @@ def live(patch, tmp_path_factory):
       shutil.copytree(whole, cut)
     runner.step()
   runner.finish()
+  assert runner.crew.loop._program._cache_size() == runner.rollout.chunk._cache_size() == 1  # arrays that MJX binds to a device would be a second compilation of each
   step, later = run.Runner.step, []
   patch.setattr(run.Runner, "step", lambda self: (later.append(self.done_chunks), step(self))[1])
   assert run.execute(config, cut, resume=True)["arms"]["oracle"]["updates_mean"] > 0

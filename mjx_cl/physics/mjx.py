@@ -7,6 +7,7 @@ import io
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 
 from mjx_cl.errors import UserError
 from mjx_cl.physics import DERIVING
@@ -22,8 +23,8 @@ class Mjx:
   def __init__(self, mj_model: mujoco.MjModel, substeps: int, outputs: tuple[str, ...] = ("qpos", "qvel"), law=None):
     self.mj_model, self.substeps, self.outputs, self.law = mj_model, substeps, tuple(outputs), law
     self._forward = any(o not in ("qpos", "qvel") for o in outputs)
-    self._model = mjx.put_model(mj_model, impl="jax")
-    self._data = mjx.make_data(mj_model, impl="jax")
+    self._model = _anywhere(mjx.put_model(mj_model, impl="jax"))
+    self._data = _anywhere(mjx.make_data(mj_model, impl="jax"))
 
   def init(self, qpos: jax.Array, qvel: jax.Array):
     """mjx.Data at qpos (nq,), qvel (nv,)."""
@@ -90,6 +91,12 @@ class Mjx:
     if self._forward:
       state = mjx.forward(model, state)
     return state, {o: getattr(state, o) for o in self.outputs} | extra
+
+
+def _anywhere(tree):
+  """The same arrays, bound to no device. MJX binds its own, which binds all that a step returns: a program called with what it returned itself would be compiled
+  a second time, for bound arguments, and robots could not be sharded."""
+  return jax.tree.map(lambda x: jnp.asarray(np.asarray(x)), tree)
 
 
 def _below(model, body: int, root: int) -> bool:
