@@ -8,11 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_cl import agents, envs, fault_presets, faults as faults_lib, store
+from mjx_cl.config import PRESETS
+from mjx_cl.dreamer.agent import Agent
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.faults import certificate
 from mjx_cl.monitor import Monitor
-from mjx_cl.rollout import Rollout, start
+from mjx_cl.rollout import Rollout, nest, start
 from mjx_cl.scoring import bootstrap
+from mjx_cl.transfer import Transfer
 
 CHUNK = 50     # decisions
 WARM = 30      # decisions at an episode's start whose residuals are not compared
@@ -81,46 +84,100 @@ def divergence(faulted: np.ndarray, nominal: np.ndarray) -> float | None:
   return float((np.trace(inverse @ s1) + (m0 - m1) @ inverse @ (m0 - m1) - 2 + np.log(np.linalg.det(s0) / np.linalg.det(s1))) / 2)
 
 
+def changes(robot: str) -> list[str]:
+  """Presets that turn this robot into another one and do no more; what others add later is certified as a preset of that one."""
+  return [name for name, preset in fault_presets.PRESETS.items() if preset.robot == robot and preset.becomes and not preset.then]
+
+
+def become(env, other, preset: str, onset: int = 25, seed: int = 0) -> certificate.Certificate:
+  """Certificate of a change of robots.
+
+  diff_1, diff_10 and diff_100 are of the episode that begins with it: `other` against `env` from the same key and under the same signal, as in certificate.certify.
+  When it begins to act is seen in a stream that becomes `other` at its first end from `onset` on (transfer.Transfer, a policy that has learnt nothing) beside the
+  same stream that does not: `early` where a row before that end differs, `first_step` counted from the end.
+  """
+  agent, key = Agent(PRESETS["tiny"].dreamer, len(env.spec.obs), len(env.spec.act)), jax.random.key(seed)
+  params = jax.tree.map(lambda x: x[None], jax.jit(agent.init)(key).params)
+  none, others = faults_lib.none(env), faults_lib.none(other)
+  moves, stays = Transfer(env, other, agent, (others,)), Rollout(env, agent, (none,))
+  moving, staying = (nest(begin, 0, 0)(key[None, None]) for begin in (lambda k: moves.start(k, -1, faults_lib.plan(), onset), lambda k: start(env, agent, (none,), k)))
+  lives = [], []
+  while int(moving.after.enter[0, 0]) == faults_lib.FOREVER or len(lives[0]) * CHUNK < int(moving.after.enter[0, 0]) + max(certificate.AFTER):
+    moving, a = moves.chunk(params, moving, CHUNK)
+    staying, b = stays.chunk(params, staying, CHUNK)
+    for life, rows in zip(lives, (a, b)):
+      life.append(np.concatenate([np.asarray(x, np.float32).reshape(CHUNK, -1) for x in (rows.final_obs, rows.reward, rows.terminated)], 1))
+  moved, stayed = (np.concatenate(life).view(np.uint32) for life in lives)
+  at = np.flatnonzero((moved != stayed).any(-1))
+  first = int(at[0]) - int(moving.after.enter[0, 0]) if at.size else None
+  signal, robots = jnp.asarray(certificate.actions(env, max(certificate.AFTER), seed)), []
+  for robot, fault in ((env, none), (other, others)):
+    alone = jax.jit(lambda model, robot=robot, fault=fault: certificate.live(robot, (fault,), model, key, faults_lib.begin(fault, key, faults_lib.plan()), signal)[0])
+    robots.append(np.asarray(alone(faults_lib.owned_model((fault,), robot.model))))
+  size = np.sqrt(np.mean(((robots[1] - robots[0]) / np.asarray([v.scale for v in env.spec.obs])) ** 2, -1))
+  return certificate.Certificate(env.spec.name, preset, "preset", "preset", 1.0, not at.size, first is not None and first < 0, first,
+                                 *(float(size[k - 1]) for k in certificate.AFTER), None, "", bool(np.isfinite(robots).all()))
+
+
 def certify(name: str, physics: str = "auto", episodes: int = 20, agent: str | None = None, only: tuple[str, ...] = (),
             progress=lambda text: None) -> list[dict]:
   """Certificates of one robot as rows of results/certificates.parquet.
 
   Args:
     episodes: per lane for the cost; 0, or a robot without a shipped agent: no cost is measured (null).
-    only: names of faults, () for all.
+    only: names of faults, or of presets that turn the robot into another one; () for all.
   """
   env = envs.make(name, physics)
+  moves = [preset for preset in changes(env.spec.name) if not only or preset in only]
+  named = tuple(fault for fault in only if fault not in moves)
   faults = {k: f for k, f in faults_lib.available(env).items() if k != "none"}
-  for fault in only:
+  for fault in named:
     if not faults_lib.make(fault, env).owns:
       raise UserError(f"fault {fault!r} changes nothing by design; choose from: {', '.join(faults)}")
-  faults = {k: faults_lib.make(k, env) for k in only} or faults
+  faults = {k: faults_lib.make(k, env) for k in named} if only else faults
   trained = agents.of(env, agent) if episodes and (agent or agents.is_shipped(env)) else None
-  progress(f"{name}: {len(faults)} faults, acting under the same commands")
-  rows = [c._asdict() | {"physics": envs.physics_of(env).name, "agent": None, "episodes": 0, "return_nominal": None, "return_mean": None, "return_lost": None,
-                         "return_lost_low": None, "return_lost_high": None, "kl_nats": None} for c in certificate.certify(env, faults)]
-  if trained is None:
-    return rows
-  cost = Cost(env, trained, faults, episodes)
-  first = next(iter(faults))
+  unknown = {"physics": envs.physics_of(env).name, "agent": None, "episodes": 0, "return_nominal": None, "return_mean": None, "return_lost": None,
+             "return_lost_low": None, "return_lost_high": None, "kl_nats": None}
+  rows = []
+  if faults:
+    progress(f"{name}: {len(faults)} faults, acting under the same commands")
+    rows = [c._asdict() | unknown for c in certificate.certify(env, faults)]
+    found = costs(env, trained, faults, episodes, progress) if trained else {}
+    for row in rows:
+      row |= found.get(certificate.Lane(row["fault"], row["target"], row["severity"]), {})
+  for preset in moves:
+    progress(f"{name}: {preset}")
+    other = envs.make(fault_presets.PRESETS[preset].becomes, physics)
+    row = become(env, other, preset)._asdict() | unknown
+    if trained:
+      whole = [Cost(robot, trained, {"none": faults_lib.none(robot)}, episodes).live([certificate.Lane("none", "all", 0.0)]) for robot in (env, other)]
+      row |= price(trained, *((returns[0], logs[0]) for returns, logs in whole))
+    rows.append(row)
+  return rows
+
+
+def price(trained, nominal: tuple, own: tuple) -> dict:
+  """Columns of what a lane costs; of each life the returns (episodes,) and the residuals (samples, 2). Lost: nominal minus own, paired by episode."""
+  lost = nominal[0] - own[0]
+  low, high = bootstrap.interval(lost, lambda x, axis: np.mean(x, axis)) or (None, None)
+  return {"agent": pathlib.Path(trained.path).name, "episodes": len(lost), "return_nominal": float(nominal[0].mean()), "return_mean": float(own[0].mean()),
+          "return_lost": float(lost.mean()), "return_lost_low": low, "return_lost_high": high, "kl_nats": divergence(own[1], nominal[1])}
+
+
+def costs(env, trained, faults: dict, episodes: int, progress) -> dict[certificate.Lane, dict]:
+  """Columns of `price` for every lane above severity 0."""
+  cost, first = Cost(env, trained, faults, episodes), next(iter(faults))
   chosen = [certificate.Lane(first, faults[first].targets[0], 0.0)]  # the nominal robot
   chosen += [lane for lane in certificate.lanes(faults, targets=False) if lane.severity > 0] + certificate.preset_lanes(env, faults)
   at_once, found = max(2, AT_ONCE // episodes), {}
   nominal = None
   for i in range(0, len(chosen), at_once):
     part = chosen[i:i + at_once]
-    padded = part + [chosen[0]] * (at_once - len(part))
-    returns, logs = cost.live(padded)
+    returns, logs = cost.live(part + [chosen[0]] * (at_once - len(part)))
     nominal = (returns[0], logs[0]) if nominal is None else nominal
-    for lane, own, log in zip(part, returns, logs):
-      lost = nominal[0] - own
-      low, high = bootstrap.interval(lost, lambda x, axis: np.mean(x, axis)) or (None, None)
-      found[lane] = {"agent": pathlib.Path(trained.path).name, "episodes": episodes, "return_nominal": float(nominal[0].mean()), "return_mean": float(own.mean()),
-                     "return_lost": float(lost.mean()), "return_lost_low": low, "return_lost_high": high, "kl_nats": divergence(log, nominal[1])}
-    progress(f"{name}: cost of {min(i + at_once, len(chosen))}/{len(chosen)} settings")
-  for row in rows:
-    row |= found.get(certificate.Lane(row["fault"], row["target"], row["severity"]), {})
-  return rows
+    found |= {lane: price(trained, nominal, life) for lane, *life in zip(part, returns, logs)}
+    progress(f"{env.spec.name}: cost of {min(i + at_once, len(chosen))}/{len(chosen)} settings")
+  return found
 
 
 def old_rows(folder) -> list[dict]:

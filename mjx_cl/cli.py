@@ -141,7 +141,7 @@ class Certify:
   out: str = "results"
   """Result folder; rows of other robots in it are kept."""
   fault: tuple[str, ...] = ()
-  """Only these faults."""
+  """Only these faults, or presets that turn the robot into another one."""
   episodes: int = 20
   """Episodes per fault and severity for the return lost without adaptation; 0: none."""
   agent: str | None = None

@@ -197,5 +197,6 @@ def test_the_certificates_that_are_published_are_of_every_fault_target_severity_
   have = {k: f for k, f in faults.available(robot).items() if k in faults.FAULTS.own and k != "none"}
   key = lambda fault, target, severity: (fault, target, round(severity, 6))
   want = {key(lane.fault, lane.target, lane.severity) for lane in certificate.lanes(have, certificate.SEVERITIES) + certificate.preset_lanes(robot, have)}
+  want |= {key(name, "preset", 1.0) for name in certify.changes(robot.spec.name)}
   assert {key(r["fault"], r["target"], r["severity"]) for r in rows if r["fault"] != "none"} == want
   assert certificate.faulty([certificate.Certificate(**{k: r[k] for k in certificate.Certificate._fields}) for r in rows]) == []

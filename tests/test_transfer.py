@@ -9,12 +9,13 @@ import numpy as np
 import pyarrow.parquet
 import pytest
 
-from mjx_cl import agents, config, envs, fault_presets, faults, run, store
+from mjx_cl import agents, certify, config, envs, fault_presets, faults, run, store, transfer as transfer_lib
 from mjx_cl.config import PRESETS, AdaptConfig, RunConfig
 from mjx_cl.dreamer.agent import Agent
 from mjx_cl.envs.car import Car
 from mjx_cl.envs.car_real import CarReal
 from mjx_cl.errors import UserError
+from mjx_cl.faults import certificate
 from mjx_cl.fault_presets import SOCKS, SOCKS_GRIP, Change, Preset
 from mjx_cl.rollout import Rollout, nest, start
 from mjx_cl.transfer import Moving, Transfer
@@ -205,6 +206,17 @@ def test_after_the_change_the_robot_is_the_other_one(lived, robots, agent, param
       assert rows.terminated[k, g] == outs[1].terminated
       gaps.append(np.abs(rows.final_obs[k, g] - outs[0].obs).max())
   assert np.median(gaps) > 0.02  # the same actions in car are another life
+
+
+def test_the_certificate_of_a_change(robots, monkeypatch):
+  """It acts from the first step of the episode after the end, not before; one that comes early is seen."""
+  moved = certify.become(*robots, "car/sim-to-real", onset=10)
+  assert (moved.first_step, moved.early, moved.identical, moved.finite) == (0, False, False, True)
+  assert 0 < moved.diff_1 < moved.diff_10 and certificate.faulty([moved]) == []
+  merge = transfer_lib.merge
+  monkeypatch.setattr(transfer_lib, "merge", lambda t, enter, before, after: merge(t, enter - 1, before, after))
+  early = certify.become(*robots, "car/sim-to-real", onset=10)
+  assert early.early and early.first_step == -1 and "before the onset" in certificate.faulty([early])[0]
 
 
 def test_a_fault_of_the_second_robot_follows(lived, transfer, params, keys):
