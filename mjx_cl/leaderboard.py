@@ -324,22 +324,24 @@ def _guarded(one: Entry, data: Data, runner: passes.Runner, samples) -> Found:
 
 
 def _pages(data: Data, oracle: dict, alarms: dict) -> list[dict]:
-  """For each fault the streams of the first scoring seed around the onset, thinned, and each detector's first alarm there."""
-  out, control_s = [], data.fault.control_s
-  horizon = data.horizon
+  """For each fault the streams of every scoring seed around the onset, thinned, and each detector's first alarm there; those of the first in twice the detail."""
+  out, horizon = [], data.horizon
   for key, o in oracle.items():
-    own = data.own(key)
-    k, onset = int(own[0]), int(data.fault.onset[own[0]])
-    window = slice(max(0, onset - horizon // 2), onset + horizon)
-    thin = max(1, (window.stop - window.start) // 300)
-    channels = {c: getattr(data.fault.residual, c)[window, k] for c in ("opr", "rpr", "reward", "surprise")}
-    values = {c: [None if not math.isfinite(v) else float(f"{v:.4g}") for v in x[::thin]] for c, x in channels.items()}
-    lanes, first = {name: fired[:, k] for name, fired in alarms.items()} | ({ORACLES[1]: o.run.fired[:, 0]} if o.run else {}), {}
-    for name, fired in lanes.items():
-      hit = np.flatnonzero(fired[onset:onset + horizon])
-      first[name] = int(onset + hit[0]) if len(hit) else None
-    out.append({"robot": data.robot, "fault": key[0], "severity": key[1], "target": data.fault.target[k], "seed": int(data.fault.seed[k]),
-                "onset": onset, "first": window.start, "every": thin, "control_s": control_s, "channels": values, "alarms": first})
+    lives = []
+    for j, k in enumerate(int(k) for k in data.own(key)):
+      onset = int(data.fault.onset[k])
+      window = slice(max(0, onset - horizon // 2), onset + horizon)
+      points, digits = (150, ".3g") if lives else (300, ".4g")
+      thin = max(1, (window.stop - window.start) // points)
+      channels = {c: getattr(data.fault.residual, c)[window, k] for c in ("opr", "rpr", "reward", "surprise")}
+      values = {c: [None if not math.isfinite(v) else float(format(v, digits)) for v in x[::thin]] for c, x in channels.items()}
+      lanes, first = {name: fired[:, k] for name, fired in alarms.items()} | ({ORACLES[1]: o.run.fired[:, j]} if o.run else {}), {}
+      for name, fired in lanes.items():
+        hit = np.flatnonzero(fired[onset:onset + horizon])
+        first[name] = int(onset + hit[0]) if len(hit) else None
+      lives.append({"target": data.fault.target[k], "seed": int(data.fault.seed[k]), "onset": onset, "first": window.start, "every": thin, "channels": values,
+                    "alarms": first})
+    out.append({"robot": data.robot, "fault": key[0], "severity": key[1], "control_s": data.fault.control_s} | lives[0] | {"others": lives[1:]})
   return out
 
 

@@ -13,6 +13,7 @@ ASSETS = pathlib.Path(__file__).parent / "assets"
 REFERENCES = ("never", "always", "periodic", "random", "oracle")  # drawn in grey and not ranked
 PROFILES = {"standard": "standard", "few_false": "few false alarms", "few_misses": "few misses"}
 FAULT_KEYS = ("robot", "fault", "severity", "onset", "control_s", "channels", "alarms")
+LIFE_KEYS = ("seed", "onset", "channels", "alarms")
 POINT_KEYS = ("false_alarms_per_hour", "latency_mean_s", "detected")
 DIGITS = 6  # significant digits that are embedded; the tables show three
 
@@ -111,7 +112,8 @@ def write(path, rows: list[dict], overall: list[dict], curves: dict, faults: lis
     overall: one dict per detector, with every key of COLUMNS for `overall`, key_ci likewise.
     curves: {detector: {robot: [point, ...]}}, a point has POINT_KEYS.
     faults: dicts with FAULT_KEYS: onset [control steps], channels {name: values}, alarms {detector: control step or None}; value k of a channel
-      belongs to control step first + k * every (optional keys, 0 and 1 where absent).
+      belongs to control step first + k * every (optional keys, 0 and 1 where absent). Optional are seed, target, and others: the streams of further seeds, dicts with
+      LIFE_KEYS, first, every and target likewise.
     meta: printed at the foot as it is, save for critical_difference (of mean ranks, or None), references (names drawn in grey, instead of
       REFERENCES) and notes (text, or a list of texts).
   Raises:
@@ -120,6 +122,8 @@ def write(path, rows: list[dict], overall: list[dict], curves: dict, faults: lis
   for name, table, keys in (("row", rows, _keys("rows")), ("overall", overall, _keys("overall")), ("fault", faults, FAULT_KEYS)):
     for i, row in enumerate(table):
       _demand(f"{name} {i}", row, keys)
+      for j, life in enumerate(row.get("others", ()) if name == "fault" else ()):
+        _demand(f"{name} {i}, other stream {j}", life, LIFE_KEYS)
   for detector, robots in curves.items():
     for robot, points in robots.items():
       for i, point in enumerate(points):

@@ -79,6 +79,9 @@ def synthetic(seed=0, detectors=REAL + page.REFERENCES, robots=ROBOTS, faults=FA
         alarms |= {"always": 0, "never": None, "oracle": 1200}
         pages.append({"robot": robot, "fault": fault, "severity": severity, "onset": 1200, "control_s": control_s, "every": every,
                       "channels": channels, "alarms": alarms})
+  pages[0] |= {"seed": 0, "target": "left_hip"}
+  pages[0]["others"] = [{"seed": k, "target": "right_knee", "onset": 1200 + 40 * k, "first": 40 * k, "every": 8, "alarms": {d: 1240 + 60 * k for d in detectors[:3]},
+                         "channels": {c: v[k::2] for c, v in pages[0]["channels"].items()}} for k in (1, 2)]
   meta = {"command": "mjx-cl leaderboard --seeds 10", "seeds": "0 to 9", "machine": {"cpu": "two cores", "cores": 2},
           "versions": {"jax": "0.9.2", "mujoco": "3.14.0"}, "arl0": 10_000,
           "date": "2026-11-21", "notes": ["Thresholds were set on seeds 100 to 109."], "critical_difference": 2.4}
@@ -473,6 +476,31 @@ def test_fault_page_draws_streams_and_alarms(browser, file, board):
   assert browser.hash() == "#fault/walker/gear/0.5?span=near"
   browser.js("document.querySelector('#page .back').click()")
   assert browser.one("#board").is_displayed() and browser.column("overall", "detector")
+
+
+def test_fault_page_draws_the_stream_of_any_seed(browser, file, board):
+  fault = board["faults"][0]
+  first, second = fault["others"]
+  address = f"#fault/{fault['robot']}/{fault['fault']}/{fault['severity']}"
+  browser.open(file, address)
+  drawn = lambda: {s.get_attribute("data-channel"): s.find_element("css selector", ".trace").get_attribute("d") for s in browser.all("#streams svg")}
+  foot = lambda: browser.one("#alarms + .foot").text
+  before = drawn()
+  assert foot().startswith("Seed 0, target left_hip.") and "other seeds" in foot()
+  assert [b.text for b in browser.all("#seeds button")] == ["0", "1", "2"] and len(browser.all("#alarms .other")) == 6  # three detectors alarm in each of the two others
+  browser.js("document.querySelectorAll('#seeds button')[2].click()")
+  assert foot().startswith("Seed 2, target right_knee.") and browser.hash() == address + "?seed=2"
+  after = drawn()
+  assert after.keys() == before.keys() and all(after[c] != before[c] for c in before)
+  assert after["reward"].count("L") + 1 == len(second["channels"]["reward"])
+  lanes = {g.get_attribute("data-name"): g.text for g in browser.all("#alarms g.lane")}
+  shown = [name for name, text in lanes.items() if "no alarm" not in text]
+  assert set(shown) == set(second["alarms"]) and len(lanes) == len(second["alarms"])
+  browser.open(file, address + "?seed=77")  # not there: the first
+  assert foot().startswith("Seed 0")
+  (other,) = [f for f in board["faults"][1:2]]
+  browser.open(file, f"#fault/{other['robot']}/{other['fault']}/{other['severity']}")
+  assert not browser.all("#seeds") and foot().startswith("One seed.")
 
 
 def test_unknown_fault_says_so(browser, file):

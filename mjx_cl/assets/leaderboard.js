@@ -132,7 +132,7 @@
 
   // ---- state: the hash holds all of it -----------------------------------------------------------------------------------------------
 
-  const FIRST = {profile: "standard", robot: "", fault: "", severity: "", q: "", refs: "", cols: "", sort: "", top: "", span: ""};
+  const FIRST = {profile: "standard", robot: "", fault: "", severity: "", q: "", refs: "", cols: "", sort: "", top: "", span: "", seed: ""};
   let state = {...FIRST, show: null};  // show: names with a curve, null: firstShown
   let route = null;                    // [robot, fault, severity] of a fault page, null: the board
   let allRows = false;
@@ -409,12 +409,14 @@
   }
 
   function showFault() {
-    const host = byId("page"), fault = pageOf(route), back = el("a", {class: "back", href: `#${query()}`}, "\u2190 leaderboard");
-    if (!fault) {
+    const host = byId("page"), found = pageOf(route), back = el("a", {class: "back", href: `#${query()}`}, "\u2190 leaderboard");
+    if (!found) {
       return host.replaceChildren(el("nav", null, back), el("h2", null, "No such fault"),
         el("p", {class: "empty"}, `No streams of ${route.join(" / ")} were recorded.`));
     }
-    const at = data.faults.indexOf(fault), title = `${fault.robot}: ${fault.fault}, severity ${figure(fault.severity, "number")}`;
+    const lives = [found, ...(found.others || [])], life = lives.find(one => String(one.seed) === state.seed) || found;
+    const fault = {...found, ...life}, others = lives.filter(one => one !== life);
+    const at = data.faults.indexOf(found), title = `${fault.robot}: ${fault.fault}, severity ${figure(fault.severity, "number")}`;
     const neighbour = (other, text) => other ? el("a", {href: pathOf([other.robot, other.fault, other.severity])}, text) : null;
     const alarms = [...entries(fault.alarms)].filter(([name]) => isKept(name));
     const own = rows.filter(row => keyOf(row) === keyOf(fault) && isKept(row.detector));
@@ -422,14 +424,19 @@
     document.title = `${title} ${DASH} mjx_cl leaderboard`;
     const span = value => el("button", {type: "button", "aria-pressed": String(state.span === value), "data-focus": `span:${value}`,
       onclick: () => change({span: value})}, value ? "Around the onset" : "Whole stream");
+    const seed = one => el("button", {type: "button", "aria-pressed": String(one === life), "data-focus": `seed:${one.seed}`,
+      "aria-label": `seed ${one.seed}`, onclick: () => change({seed: one === found ? "" : String(one.seed)})}, String(one.seed));
+    const which = lives.length < 2 ? "One seed." : `Seed ${life.seed}${isNull(life.target) ? "" : `, target ${life.target}`}.`;
     host.replaceChildren(
       el("nav", null, back, neighbour(data.faults[at - 1], "previous fault"), neighbour(data.faults[at + 1], "next fault")),
       el("h2", null, title), el("p", {class: "summary"}, summary(fault, alarms)),
-      el("section", null, el("div", {class: "bar"}, span(""), span("near")), el("div", {id: "streams"}), el("div", {id: "alarms"}),
-        el("p", {class: "foot"}, "One seed. The upright line is the onset; marks are first alarms, hollow where they came before the onset.")),
+      el("section", null, el("div", {class: "bar"}, span(""), span("near"), lives.length < 2 ? null : el("span", {id: "seeds", role: "group", "aria-label": "seed"}, "Seed ", lives.map(seed))),
+        el("div", {id: "streams"}), el("div", {id: "alarms"}),
+        el("p", {class: "foot"}, `${which} The upright line is the onset; marks are first alarms, hollow where they came before the onset`
+          + `${others.length ? ", faint and small those of the other seeds" : ""}.`)),
       el("section", null, el("h3", null, "All seeds"), el("div", {class: "scroll", id: "own"},
         table("sort", columns.rows.filter(c => chosen(c) && !Object.hasOwn(choices, c.key)), sorted(own, order), order)), footnotes(own)));
-    showStreams(fault, alarms);
+    showStreams(fault, alarms, others);
   }
 
   function summary(fault, alarms) {
@@ -440,7 +447,7 @@
       + `In this seed ${after.length} of ${real.length} detectors alarm after the onset${first}.${early ? ` ${early} had alarmed before.` : ""}`;
   }
 
-  function showStreams(fault, alarms) {
+  function showStreams(fault, alarms, others) {
     const channels = entries(fault.channels), w = byId("streams").clientWidth, left = Math.min(150, 0.3 * w), right = w - Math.min(84, 0.2 * w);
     const every = fault.every || 1, first = fault.first || 0, time = step => (step - fault.onset) * fault.control_s;
     const longest = Math.max(0, ...[...channels.values()].map(values => values.length));
@@ -470,11 +477,11 @@
       if (inside(0)) svg.append(line(x(0), 0, x(0), h, "onset"));
       return svg;
     }));
-    byId("alarms").replaceChildren(alarmLanes(fault, alarms, {w, left, right, low, high, x, inside, time}));
+    byId("alarms").replaceChildren(alarmLanes(fault, alarms, others, {w, left, right, low, high, x, inside, time}));
   }
 
   /** One lane per detector under the streams, on the same time axis; the earliest alarm after the onset first. */
-  function alarmLanes(fault, alarms, {w, left, right, low, high, x, inside, time}) {
+  function alarmLanes(fault, alarms, others, {w, left, right, low, high, x, inside, time}) {
     const place = step => isNull(step) ? Number.MAX_VALUE : step < fault.onset ? 1e12 + step : step;
     const list = [...alarms].sort((a, b) => place(a[1]) - place(b[1]));
     const row = 20, top = 6, bottom = top + row * list.length;
@@ -487,6 +494,12 @@
       const g = draw("g", {class: `lane${references.has(name) ? " reference" : ""}`, "data-name": name},
         label(left - 8, at + 4, shorten(name, Math.floor((left - 8) / 6.6)), "name", "end"), line(left, at, right, at, "rail"),
         label(right + 8, at + 4, text, t === null || t < 0 ? "tick" : "name"));
+      for (const one of others) {
+        const step = Object.hasOwn(one.alarms, name) ? one.alarms[name] : null, late = isNull(step) ? null : (step - one.onset) * fault.control_s;
+        if (late !== null && inside(late)) {
+          g.append(draw("circle", {cx: x(late), cy: at, r: 2.5, class: "other", "aria-hidden": "true", style: `fill:${look(name).color}`}));
+        }
+      }
       if (t !== null && inside(t)) {
         const dot = fill(marker(name, x(t), at, 4.5, t < 0), {class: "alarm"}, []);
         const when = t < 0 ? `${text}: before the onset, false` : `${text} after the onset`;
