@@ -225,6 +225,21 @@ def test_stronger_faults_are_found_sooner_and_the_oracles_bound_all(board):
   assert pick(board, detector="never", fault="bias")[0]["miss_probability"] == 1
 
 
+def test_pages_hold_the_stream_of_every_seed_and_its_alarms(small, board):
+  """Alarms of a detector that always alarms stand at each stream's own onset; missed and found ones are as many as the row counts."""
+  data = leaderboard.load(small[0], "walker")
+  assert {(p["fault"], p["severity"]) for p in board.faults} == set(small[0].faults("walker"))
+  for found in board.faults:
+    lives, own = [found] + found["others"], data.own((found["fault"], found["severity"]))
+    assert [one["seed"] for one in lives] == data.fault.seed[own].tolist() and len(lives) > 1
+    (row,) = pick(board, detector="cusum", fault=found["fault"], severity=found["severity"])
+    assert sum(one["alarms"]["cusum"] is None for one in lives) == round(row["miss_probability"] * len(lives))
+    for k, one in zip(own, lives):
+      assert (one["onset"], one["alarms"]["always"], one["alarms"]["never"]) == (data.fault.onset[k], data.fault.onset[k], None)
+      reward = np.asarray(one["channels"]["reward"], float)
+      np.testing.assert_allclose(reward, data.fault.residual.reward[one["first"]::one["every"], k][:len(reward)], rtol=5e-3)  # three digits
+
+
 def test_information_of_the_channel_is_that_of_the_shift(board):
   """Two independent channels, each shifted by 2 deviations: 2 x 2^2 / 2 = 4 nats; 2 seeds x 40 faulty steps fit 34 coefficients of the after
   model, which costs a few tenths of a nat."""
