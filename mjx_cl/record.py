@@ -6,10 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_cl import faults as faults_lib
+from mjx_cl.config import CHUNK
 from mjx_cl.monitor import Monitor
 from mjx_cl.rollout import Rollout, nest, start
-
-CHUNK = 64
 
 
 def stream_keys(seeds, streams: int) -> jax.Array:

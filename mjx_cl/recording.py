@@ -12,10 +12,10 @@ from typing import NamedTuple
 import numpy as np
 
 from mjx_cl import store
+from mjx_cl.config import CHUNK
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.streams import COLUMNS, LATENT, META, SCHEMA, VERSION, Suite
 
-CHUNK = 64
 TILE = 16      # lanes are filled up to a multiple of it
 MADE = ("command", "versions", "python", "git_commit", "machine")  # of config.json: how a set was made
 HELD = "held.json"  # config.json of the set whose files are being replaced

@@ -365,7 +365,7 @@ def test_blocks_of_streams_live_as_each_alone(story):
     # obs, reward, flags and counters to the bit; latents that an update has refreshed are its own
     exact = lambda r: (r.count, r.queue, r.data.obs, r.data.action, r.data.reward, r.data.first, r.data.terminal)
     jax.tree.map(np.testing.assert_array_equal, exact(one.state.replay), exact(other.state.replay))
-    for learnt in (lambda t: t.state.train.params, lambda t: t.state.acting, lambda t: t.state.train.slow):  # what was learnt, against the size of it
+    for learnt in (lambda t: t.state.train.params, lambda t: t.state.acting, lambda t: t.state.train.slow, lambda t: t.state.train.opt):  # what was learnt, against the size of it
       start = learnt(Told(begin, None))
       moved = lambda t: jax.tree.map(lambda a, b: np.asarray(a, float) - b, learnt(t), start)
       jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=0, atol=1e-7 + 0.05 * np.abs(a).max()), moved(one), moved(other))
