@@ -212,7 +212,7 @@ def other_size(folder):
 AGENTS = {
     "another robot": (lambda f: tamper(f, env="car"), 2, "car"),
     "another size": (other_size, 1, "does not fit size size1m"),
-    "unknown size": (lambda f: tamper(f, dreamer={"size": "size2m"}), 2, "size1m"),
+    "unknown size": (lambda f: tamper(f, dreamer={"size": "size3k"}), 2, "size1m"),
     "truncated": (truncated, 1, "agent.npz"),
     "empty": (lambda f: (f / "agent.npz").write_bytes(b""), 1, "agent.npz"),
     "foreign": (foreign, 1, "does not fit"),

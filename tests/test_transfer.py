@@ -208,11 +208,15 @@ def test_after_the_change_the_robot_is_the_other_one(lived, robots, agent, param
   assert np.median(gaps) > 0.02  # the same actions in car are another life
 
 
-def test_the_certificate_of_a_change(robots, monkeypatch):
-  """It acts from the first step of the episode after the end, not before; one that comes early is seen."""
+def test_the_certificate_of_a_change(robots):
+  """It acts from the first step of the episode after the end, not before."""
   moved = certify.become(*robots, "car/sim-to-real", onset=10)
   assert (moved.first_step, moved.early, moved.identical, moved.finite) == (0, False, False, True)
   assert 0 < moved.diff_1 < moved.diff_10 and certificate.faulty([moved]) == []
+
+
+@pytest.mark.slow
+def test_a_change_that_comes_early_is_seen(robots, monkeypatch):
   merge = transfer_lib.merge
   monkeypatch.setattr(transfer_lib, "merge", lambda t, enter, before, after: merge(t, enter - 1, before, after))
   early = certify.become(*robots, "car/sim-to-real", onset=10)

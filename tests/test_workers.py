@@ -124,7 +124,7 @@ def test_a_worker_that_is_killed_is_said(mini, tmp_path):  # noqa: F811
     worker.check()
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
+@pytest.mark.parametrize("number", [signal.SIGKILL, pytest.param(signal.SIGINT, marks=pytest.mark.slow)])
 def test_no_worker_outlives_its_parent_and_all_have_saved(long, tmp_path, number):
   """The parent is killed outright, or asked to end: each worker saves between two chunks and ends."""
   out, parts = tmp_path / "out", ("grip/severity=0.5", "grip/severity=1.0")
