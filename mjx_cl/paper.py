@@ -140,11 +140,11 @@ def stop(rows: list[dict]) -> Measured:
 
 
 def last_stop(rows: list[dict]) -> Measured:
-  """Absolute step of the last stop or abort; None while a stream is still adapting. A maximum has no bootstrap interval."""
+  """Absolute step of the last stop or abort; None while a stream is still adapting, for the first time or again. A maximum has no bootstrap interval."""
   ends, still = [r["adapt_stop"] for r in rows if r["adapt_stop"] is not None], sum(r["outcome"] == "adapting" for r in rows)
   last = max(ends) if ends and not still else None
-  more = f", {still} still adapting" if still else ""
-  return Measured(last, f"{number(last)}, {len(ends)} streams that ended one{more}, a maximum has no interval")
+  said = f"{len(ends)} streams ended one" + (f", the last at {number(max(ends))}; {still} still adapting at the end of the run" if ends and still else "")
+  return Measured(last, f"{number(last)} ({said})")
 
 
 def outcomes(rows: list[dict]) -> Measured:
@@ -187,13 +187,13 @@ def setup(experiment: Experiment, config: dict) -> list[str]:
            (own("lr"), author.lr, "learning rate {:g} in place of {:g}"),
            (own("policy_lr"), author.policy_lr, "the policy's own steps {:g} times as long"),
            (own("anchor"), author.anchor, "policy held to the actions taken with a weight of {:g}"),
-           (dreamer["min_std"], author.min_std, "deviation of the actions from {:g} on in place of {:g}"),
-           (dreamer["max_std"], author.max_std, "up to {:g} in place of {:g}"), (dreamer["entropy"], author.entropy, "entropy weight {:g} in place of {:g}"),
-           (dreamer["horizon"], author.horizon, "horizon {} in place of {}"), (adapt["ratio"], RATIO, "train ratio {:g} in place of {:g}"),
+           (dreamer["min_std"], author.min_std, "standard deviation of the actions at least {:g} in place of {:g}"),
+           (dreamer["max_std"], author.max_std, "at most {:g} in place of {:g}"), (dreamer["entropy"], author.entropy, "entropy weight {:g} in place of {:g}"),
+           (dreamer["horizon"], author.horizon, "discount horizon {} in place of {}"), (adapt["ratio"], RATIO, "train ratio {:g} in place of {:g}"),
            (config["onset"], experiment.onset, "onset {:,} in place of {:,}")]
   words = [text.format(ours, theirs) for ours, theirs, text in pairs if ours != theirs]
   if config["detector"] != "rolling_sigma_plain":
-    words.append(f"detector `{config['detector']}` in place of three deviations of single residuals")
+    words.append(f"detector `{config['detector']}` in place of three standard deviations of single residuals")
   if card.get("demonstrator"):
     words.append("agent pretrained with a demonstrator")
   return words + ([experiment.robot] if experiment.robot else [])

@@ -1,7 +1,7 @@
 """Numbers of README and docs from the files of results/: what lies between `<!-- report:NAME -->` and `<!-- /report -->` is written by BLOCKS[NAME].
 
 Both markers stand alone on their lines. A block is a function of the results folder that returns Markdown, with links as of a page beside that folder;
-a new one is one function and one line of the table. No JAX is needed here.
+a new one is one function and one line of the table. No JAX is needed but for the blocks of CODE.
 """
 from __future__ import annotations
 
@@ -57,25 +57,6 @@ class Bench:
     if name not in self.rows:
       raise FileError(f"{self.path} has no row {name!r}")
     return self.rows[name]
-
-  def value(self, name: str, digits: int = 0, scale: float = 1.0) -> str:
-    value = self.row(name)["value"]
-    return number(None if value is None else scale * value, digits)
-
-  def goals(self, *names: str) -> str:
-    """The goals of some rows, each with `missed` where it is."""
-    rows = [self.row(name) for name in names]
-    return " / ".join(verdict(r) for r in rows) if any(r["goal"] for r in rows) else ""
-
-
-def verdict(row: dict) -> str:
-  """`0.45, missed`, `0.60`, or `-` without a goal."""
-  return "-" if row["goal"] is None else row["goal"].split()[-1] + ("" if row["holds"] or row["holds"] is None else ", missed")
-
-
-def missed(row: dict) -> str:
-  """` (goal 1.15, missed)` where a goal is missed, else nothing."""
-  return f" (goal {verdict(row)})" if row["holds"] is False else ""
 
 
 def percent(x: float | None, digits: int = 0) -> str:
@@ -139,9 +120,9 @@ def run_walker(results: pathlib.Path) -> str:
     if r["affected"]:
       ends.setdefault(part(r), []).append(r["reward_final"] / r["reward_pre"])
   text = fill(f"""
-      Seeds {first} to {first + n - 1}, one shipped agent, shares and counts with 95 % Wilson intervals, rewards as interquartile mean with 95 %
-      bootstrap intervals over the {n} streams (conditional on that one agent), {machine['cores']} cores ({machine['cpu']}),
-      {number(summary['wall_s'] / 60, 1)} minutes wall (shared machine; {shares}). Affected: {hit} of {n}{others}.""")
+      Seeds {first} to {first + n - 1}, one shipped agent; {number(summary['wall_s'] / 60, 1)} minutes on {machine['cores']} shared cores ({machine['cpu']}; {shares}).
+      Brackets hold 95 % intervals: Wilson for shares and counts, bootstrap over the {n} streams for medians and for rewards (interquartile means), all for that one agent;
+      `-` is a value that is not reached. Affected: {hit} of {n}{others}.""")
   count = lambda name, of: f"{main[name]} of {of} {span(main[name + '_ci'], 1)}"
   recovered = f"{count('recovered_within_10000', hit)} ({main['recovered']} within {number(summary['steps'] - summary['onset'])})"
   ended = " / ".join(str(main[k]) for k in ("converged", "aborted_by_rule", "aborted_by_budget", "adapting"))
@@ -150,15 +131,15 @@ def run_walker(results: pathlib.Path) -> str:
       (f"streams with a false alarm in {number(summary['onset'])} nominal steps", count("false_alarm_streams", n),
        f"{none['false_alarm_streams']} of {n}"),
       ("affected streams that alarm within 500 steps of onset", count("affected_alarmed_within_500", hit), ""),
-      ("median latency, all streams, misses counted as infinite [steps]", both(main, "latency_median_steps"), ""),
+      ("median latency over all streams, a miss counted as infinite [steps]", both(main, "latency_median_steps"), ""),
       ("miss probability, all streams", both(main, "miss_probability", 2), ""),
       ("affected streams recovered within 10,000 steps", recovered, f"{none['recovered_within_10000']} of {none['affected']}"),
       ("recovery, median over the affected [steps after onset]", both(main, "recovery_median_steps"), number(none["recovery_median_steps"])),
-      ("converged / aborted by rule / by budget / still adapting", f"{ended} ({sum(r['outcome'] == 'nominal' for r in runs)} never alarmed)", ""),
+      ("finetuning converged / aborted by rule / by budget / still running", f"{ended} (the other {sum(r['outcome'] == 'nominal' for r in runs)} never alarmed)", ""),
       ("reward per step before onset", both(main, "reward_pre", 2), both(none, "reward_pre", 2)),
       ("share of it lost over 2,000 steps after onset, without adaptation", "", both(none, "reward_drop", 2)),
       ("reward over the last 2,000 steps, affected streams", both(main, "reward_final_affected", 2), both(none, "reward_final_affected", 2)),
-      ("the same over reward before onset, by joint (streams)", joints, ""),
+      ("that reward over the reward before onset, by joint (streams)", joints, ""),
   ]
   return text + "\n\n" + grid(("", "arm `detector`", "arm `none`"), rows)
 
@@ -189,7 +170,7 @@ def mute(rows) -> dict[str, set]:
 
 def dagger(marked: dict[str, set]) -> str:
   """The note under a board on the detectors marked so."""
-  return f"† no threshold gives that rate of false alarms, it stays silent: {'; '.join(f'{name} on {joined(sorted(own))}' for name, own in marked.items())}."
+  return f"† no threshold gives that rate, the detector never alarms: {'; '.join(f'{name} on {joined(sorted(own))}' for name, own in marked.items())}."
 
 
 SCORED = ("detector", "reference", "robot", "fault", "severity", "cost_standard", "streams", "stream_latency_steps", "stream_healthy_alarms", "healthy_steps")
@@ -210,7 +191,7 @@ def lead(rows: list[dict], overall: list[dict]) -> str:
   from mjx_cl.scoring import metrics
   first, second = [r["detector"] for r in overall if "(oracle)" not in r["detector"]][:2]
   ahead, interval = metrics.difference(rows, first, second)
-  return f"`{first}` lies {number(ahead, 1)} {span(interval, 1)} above `{second}` (paired, intervals over seeds; it says nothing of other faults)."
+  return f"`{first}` lies {number(ahead, 1)} {span(interval, 1)} above `{second}` (paired over seeds, for these faults only)."
 
 
 def leaderboard(results: pathlib.Path) -> str:
@@ -224,16 +205,14 @@ def leaderboard(results: pathlib.Path) -> str:
   asked = {r["robot"]: 3600 / r["control_s"] / meta["arl0_target"] for r in rows}
   silent = mute(rows)
   text = fill(f"""
-      Every detector sees the same recorded streams of frozen agents: {joined(robots)}, {faults} fault settings (fault x severity),
-      {high - low + 1} scoring seeds each; thresholds at ARL0 = {number(meta['arl0_target'])} control steps, calibrated on other seeds' healthy
-      streams ({alarms} alarms for most{', so every rate is an order of magnitude and marked so' if alarms < 50 else ''}): asked for are
-      {joined([f"{number(asked[r], 1)} ({r})" for r in robots])} false alarms an hour, what came on the scoring seeds stands in the table. Score: 0 for never
-      alarming, 100 for alarming at the onset and at no other time, a mean over all faults of all robots; intervals over seeds. Best on each robot:
-      {best(rows)}. {lead(rows, overall)} Mean ranks closer than {number(meta['critical_difference'], 1)} are not
-      told apart (Nemenyi; references take no rank). `mjx-cl leaderboard` ({len(overall)} detectors;
-      {number(meta['stream_steps'] / 1e6, 1)} million stream-steps, {number(minutes, 1)} minutes on {meta["machine"]["cores"]} core{'s' if meta['machine']['cores'] > 1 else ''}; goal 3
-      minutes{', missed' if minutes > 3 else ''}). The page: [results/leaderboard.html](results/leaderboard.html), one file, sortable, a page per
-      fault.""")
+      `mjx-cl leaderboard`: {len(overall)} detectors on the same recordings of frozen agents: {joined(robots)}, {faults} fault settings (fault x severity),
+      {high - low + 1} scoring seeds each. Thresholds are set to ARL0 = {number(meta['arl0_target'])} control steps on other seeds' healthy streams, that is
+      {joined([f"{number(asked[r], 1)} ({r})" for r in robots])} false alarms an hour; they rest on {alarms} alarms for most detectors{', so the rates are orders of magnitude' if alarms < 50 else ''},
+      and the table holds what the scoring seeds gave. Score: 0 for never alarming, 100 for alarming at the onset and at no other time; mean over all faults of all robots,
+      intervals over seeds. Best on each robot: {best(rows)}. {lead(rows, overall)} Mean ranks closer than {number(meta['critical_difference'], 1)} are not
+      told apart (Nemenyi test; oracles and dummies take no rank). {number(meta['stream_steps'] / 1e6, 1)} million stream-steps in {number(minutes, 1)} minutes on
+      {meta["machine"]["cores"]} core{'s' if meta['machine']['cores'] > 1 else ''} (goal 3 minutes{', missed' if minutes > 3 else ''}). The page, sortable, one view per fault:
+      [results/leaderboard.html](results/leaderboard.html).""")
   score = {r["detector"]: r["cost_standard"] for r in overall}
   plain = lambda name: name if "(oracle)" in name else re.split("[@ ]", name)[0]  # cusum@opr and cusum white are variants of cusum
   kind = lambda name: "worse" if not score[name] > 0 else "variant" if score[name] < score.get(plain(name), score[name]) else "shown"
@@ -265,7 +244,7 @@ def leaderboard_100k(results: pathlib.Path) -> str:
   text = fill(f"""
       Thresholds at ARL0 = {number(meta['arl0_target'])} control steps, calibrated on {number(alarms * like['arl0'])} healthy steps for each robot ({alarms} alarms for most: ARL0
       {number(like['arl0'])} {span((like["arl0_low"], like["arl0_high"]))}), {high - low + 1} scoring seeds; asked for are {joined([f"{number(x, 2)} ({robot})" for robot, x in sorted(asked.items())])} false alarms
-      an hour. Score as on the board: 0 for never alarming, 100 for alarming at the onset and at no other time; detectors that score above 0. Best on each robot: {best(rows)}.
+      an hour. Score as on the default leaderboard: 0 for never alarming, 100 for alarming at the onset and at no other time; detectors that score above 0. Best on each robot: {best(rows)}.
       {lead(rows, overall)} `mjx-cl leaderboard runs/streams-100k`:
       {number(meta['stream_steps'] / 1e6)} million stream-steps, {number(minutes)} minutes on {meta["machine"]["cores"]} shared core{'s' if meta['machine']['cores'] > 1 else ''}.""")
   whole = lambda x: f"{percent(x)}%"
@@ -275,46 +254,64 @@ def leaderboard_100k(results: pathlib.Path) -> str:
   return text + "\n\n" + grid(("detector", "score [95 %]", "at ARL0 10,000", "within 5 s", "missed", "false alarms/h"), shown) + (f"\n\n{fill(dagger(marked))}" if marked else "")
 
 
+def speed(results: pathlib.Path, stem: str, lines) -> str:
+  """A table of speeds: `lines` of (words, names of rows that share a cell, unit, digits), a column for each machine: STEM.json and STEM_*.json.
+
+  A value that misses its goal is marked. A row that a machine's file lacks is a dash there; one that no file has is an error. lines None: every row of the first file.
+  """
+  benches = [Bench(results / f"{stem}.json")] + [Bench(path) for path in sorted(results.glob(f"{stem}_*.json"))]
+  lines = lines or [(name, (name,), row["unit"], None) for name, row in benches[0].rows.items()]
+
+  def cell(bench, names, digits):
+    have = [bench.rows.get(name) for name in names]
+    return " / ".join("-" if r is None else short(r["value"], digits) + (" (missed)" if r["holds"] is False else "") for r in have) if any(have) else "-"
+
+  def goal(names):
+    found = [next((b.rows[name]["goal"] for b in benches if b.rows.get(name, {}).get("goal")), None) for name in names]
+    return " / ".join(g or "-" for g in found) if any(found) else ""
+  rows = []
+  for words, names, unit, digits in lines:
+    for name in names:
+      if not any(name in b.rows for b in benches):
+        benches[0].row(name)
+    rows.append((words, unit, *(cell(b, names, digits) for b in benches), goal(names)))
+  files = ", ".join(f"[{b.path.name}](results/{b.path.name})" for b in benches)
+  said = f"`{benches[0].about['command']}`; medians, a column for each machine ({files})." if "command" in benches[0].about else ""
+  return (fill(said) + "\n\n" if said else "") + grid(("", "unit", *(b.about.get("machine", "measured") for b in benches), "goal"), rows)
+
+
+def short(x: float | None, digits: int | None) -> str:
+  """A measured value: with so many digits, or three significant ones."""
+  return "-" if x is None else number(x, digits) if digits is not None else f"{x:.3g}" if abs(x) < 1000 else number(x)
+
+
 def physics(results: pathlib.Path) -> str:
   """Speed of physics and fault layer."""
-  bench = Bench(results / "physics.json")
-  said = lambda name, digits: bench.value(name, digits) + missed(bench.row(name))
-  native = lambda robot, digits: said(f"{robot}: native against MJX, batch 256", digits)
-  lidar, cost = bench.row("car: 160 streams with lidar"), "walker: all faults traced, one active per stream, against none"
-  return fill(f"""
-      Speed ({bench.about['machine']}; `{bench.about['command']}`, medians, [results/physics.json](results/physics.json)): a jitted rollout of 160
-      walkers runs at {said('walker: jitted rollout of 160 streams against bare mjbatch', 2)} of bare mjbatch stepping of the same work; native
-      against MJX on the same cores, batch 256: walker {native('walker', 0)} (as it is, with MuJoCo's default solver iterations), quadruped
-      {native('quadruped', 1)}, `car_real` {native('car_real', 1)}; `car` with lidar {number(round(lidar['value'], -3))} control
-      steps/s{missed(lidar)}; all faults of the walker traced and one active on every stream cost
-      {bench.value(cost, 3)} times none{missed(bench.row(cost))}.""")
+  native = lambda robot: (f"{robot}: native against MJX, batch 256",)
+  return speed(results, "physics", [
+      ("jitted rollout of 160 walkers, against bare mjbatch stepping of the same work", ("walker: jitted rollout of 160 streams against bare mjbatch",), "ratio", 2),
+      ("all faults of the walker traced, one active on every stream, against none", ("walker: all faults traced, one active per stream, against none",), "ratio", 2),
+      ("native against MJX on the same cores, batch 256: walker", native("walker"), "ratio", 0), ("quadruped", native("quadruped"), "ratio", 1), ("`car_real`", native("car_real"), "ratio", 2),
+      ("`car` / `car_real` with lidar, 160 streams", ("car: 160 streams with lidar", "car_real: 160 streams with lidar"), "control steps/s", 0),
+      ("largest rise of the cost per stream from 16 to 64, 256 and 1,024 walkers", ("walker: largest rise of the cost from one of these sizes to the next",), "ratio", 2)])
 
 
 def dreamer(results: pathlib.Path) -> str:
   """Speed of the learner."""
-  bench = Bench(results / "dreamer_update.json")
-  v, goals = bench.value, bench.goals
-  small, large = (f"update {size}, share of the matrix rate" for size in ("size1m", "size12m"))
-  acting = [f"acting, 40 streams, {whose}, per control step" for whose in ("one agent", "an agent each")]
-  watching = [f"monitor, 40 streams, {whose}, share of the matrix rate" for whose in ("one agent", "an agent each")]
-  seeds = "ten seeds in one program (lax.map), per seed / one seed alone"
-  rows = [
-      ("update size1m, 16 x 64, 15 imagined from 1,024 states", f"{v('update size1m, 1,024 starts')} ms, share {v(small, 2)}", goals(small)),
-      ("the same, 256 starts (preset `cpu`)", f"{v('update size1m, 256 starts (preset cpu)')} ms", ""),
-      ("update size12m", f"{v('update size12m')} ms, share {v(large, 2)}", goals(large)),
-      ("ten seeds in one program, per seed, against one alone", v(seeds, 2), goals(seeds)),
-      ("acting, 40 streams of one agent / with an agent each, per control step", f"{v(acting[0], 2)} / {v(acting[1], 1)} ms", goals(*acting)),
-      ("monitor, 40 streams of one agent / with an agent each, share", f"{v(watching[0], 2)} / {v(watching[1], 2)}", goals(*watching)),
-  ]
-  for name in ("update", "monitor", "rollout"):
-    cold, cached = f"compile {name}, cold", f"compile {name}, cached"
-    digits = 0 if (bench.row(cold)["value"] or 0) >= 10 else 1
-    rows.append((f"compile {name}, cold / cached", f"{v(cold, digits)} / {v(cached, 1)} s", goals(cold, cached)))
-  text = fill(f"""
-      **Speed and memory** (`{bench.about['command']}`, [results/dreamer_update.json](results/dreamer_update.json); {bench.about['machine']};
-      medians). The share is floating-point operations / time / the rate of a 2,048 x 2,048 float32 product in the same process, the figure that
-      carries over between machines.""")
-  return text + "\n\n" + grid(("", "measured", "goal"), rows)
+  share = lambda size: (f"update {size}, share of the matrix rate",)
+  seeds = lambda how, more="": (f"ten seeds {how}{more}, per seed / one seed alone",)
+  acting = tuple(f"acting, 40 streams, {whose}, per control step" for whose in ("one agent", "an agent each"))
+  watching = tuple(f"monitor, 40 streams, {whose}, share of the matrix rate" for whose in ("one agent", "an agent each"))
+  lines = [("update size1m, 16 x 64, 15 imagined from 1,024 states", ("update size1m, 1,024 starts",), "ms", 0), ("that, share of the matrix rate", share("size1m"), "share", 2),
+           ("update size1m, 256 starts (preset `cpu`)", ("update size1m, 256 starts (preset cpu)",), "ms", 0),
+           ("update size12m", ("update size12m",), "ms", 0), ("that, share of the matrix rate", share("size12m"), "share", 2),
+           ("ten seeds in one program, one device: per seed, against one seed alone", seeds("in one program (lax.map)"), "ratio", 2),
+           ("ten seeds, a share for each core (`train --seeds`): the same", seeds("a share for each core"), "ratio", 2),
+           ("the same, 256 starts", seeds("a share for each core", ", 256 starts"), "ratio", 2),
+           ("acting, 40 streams of one agent / with an agent each, per control step", acting, "ms", 2),
+           ("monitor, 40 streams of one agent / with an agent each, share of the matrix rate", watching, "share", 2)]
+  lines += [(f"compile {name}, cold / cached", (f"compile {name}, cold", f"compile {name}, cached"), "s", 1) for name in ("update", "monitor", "rollout")]
+  return speed(results, "dreamer_update", [*lines, ("float32 product of two 2,048 x 2,048 matrices", ("matrix rate",), "GFLOP/s", 0)])
 
 
 GOALS = {"velocity_error_m_s": 0.25, "fall_rate": 0.05}  # of the quadruped's agents
@@ -353,9 +350,7 @@ def agents(results: pathlib.Path) -> str:
 
 def detectors(results: pathlib.Path) -> str:
   """Speed of the detectors."""
-  bench = Bench(results / "detectors.json")
-  value = lambda r: "-" if r["value"] is None else f"{r['value']:.3g}" if abs(r["value"]) < 1000 else number(r["value"])
-  return grid(("", "measured", "goal"), [(name, f"{value(r)} {r['unit']}".strip(), bench.goals(name)) for name, r in bench.rows.items()])
+  return speed(results, "detectors", None)
 
 
 def experiments(results: pathlib.Path) -> str:
@@ -375,9 +370,9 @@ def experiments(results: pathlib.Path) -> str:
     raise FileError(f"{results / 'paper'} holds no experiment; run mjx-cl bench paper --publish {results / 'paper'}")
   common = [words for words in next(iter(differs.values())) if all(words in other for other in differs.values())]
   text = fill(f"""
-      Arm `detector`. Times are medians in control steps in which a stream that never gets there counts as infinite, shares interquartile means;
-      95 % intervals are bootstrapped over streams, of counts Wilson's, all conditional on the one agent that the streams of an experiment share. In
-      brackets: the paper's section. {f"Other than in the paper, everywhere: {'; '.join(common)}." if common else ""}
+      Arm `detector`; round brackets name the paper's section. Times are median control steps, a stream that never gets there counted as infinite; shares are
+      interquartile means. 95 % intervals: bootstrap over streams, Wilson for counts, all for the one agent of an experiment; `-`: not reached.
+      {f"Everywhere other than in the paper: {'; '.join(common)}." if common else ""}
       {f"Not run to its end yet: {joined(absent)}." if absent else ""}""")
   own = {name: "; ".join(words for words in differs[name] if words not in common) for name in differs}
   return text + "\n\n" + grid(("experiment", "what", "paper", "mjx_cl", "difference", "set-up other than the paper's"), [
@@ -440,11 +435,11 @@ def stop_rule(results: pathlib.Path) -> str:
       for k, (names, own) in enumerate(alike(left_out)):
         floorless.append((f"`{part}`" if not k else "", number(CHUNK * int(patience)) if not k else "", names, *stopped(own)))
   text = fill(f"""
-      The oracle stop is the earliest snapshot whose frozen episodes on the broken robot reach {percent(first['share'])} % of the best snapshot's. Medians and
+      The oracle stop is the earliest snapshot whose frozen episodes on the faulty robot reach {percent(first['share'])} % of the best snapshot's. Medians and
       interquartile means with 95 % bootstrap intervals over streams; an adaptation that never ended counts as later than all others. Return lost is the best
       snapshot's reward less that of the stop, over {number(first['horizon_steps'])} control steps, and as a share of the former: an upper bound, since the best of many noisy snapshots is the luckiest too.""")
   more = fill("""
-      The rule lived again over the recorded signals of the adaptations that never stop, with each signal left out: how many converge, abort, and
+      The rule replayed over the recorded signals of the adaptations that never stop, with each signal left out: how many converge, abort, and
       when.""")
   return "\n\n".join([text, grid(("fault", "arm", "ended", "steps after the oracle stop", "earlier than it", "return lost", "share of the best", "updates wasted (mean)",
                                    "aborts right / wrong", "ended on a lost fault"), rows), more,
@@ -539,9 +534,9 @@ def full(results: pathlib.Path) -> str:
       Of {hit} affected streams {len(first)} alarm; {back} recover in arm `detector`, {alone} in arm `none`. {len(entries)} of {len(plan)} parts of suite `full` are finished ({done}), seeds {one['first_seed']} to {one['first_seed'] + one['seeds'] - 1}. Affected streams; streams with a false alarm
       before the onset; streams that alarm after it; affected ones that do within 500 steps; median latency of all streams, misses counted as infinite; affected streams
       recovered before the run ends, without and with finetuning; their reward over the last 2,000 steps over that before the onset (interquartile mean); normalised recovery (0: arm
-      `none`, 1: the reward before onset, interquartile mean with 95 % bootstrap interval over the streams that end a tenth or more below it without adaptation); finetunings that converge / are given up / still go on; updates a stream. {FEW if any(" to " in cell for row in rows for cell in row) else ""}""")
+      `none`, 1: the reward before onset, interquartile mean with 95 % bootstrap interval over the streams that end a tenth or more below it without adaptation); finetunings that converge / are aborted / still run; updates a stream. {FEW if any(" to " in cell for row in rows for cell in row) else ""}""")
   return text + "\n\n" + grid(("robot", "fault, severity", "affected", "false alarms", "alarm", "within 500", "latency [steps]", "recovered, `none`", "recovered",
-                                "reward left, `none`", "reward left", "normalised recovery", "converged / given up / going on", "updates"), rows)
+                                "reward left, `none`", "reward left", "normalised recovery", "converged / aborted / still running", "updates"), rows)
 
 
 def in_loop(results: pathlib.Path) -> str:
@@ -566,7 +561,7 @@ def in_loop(results: pathlib.Path) -> str:
     first = lost.get((base.setdefault(one["env"], part), "detector"), {})
     if new:  # arm `none` lives the same life whatever watches it
       none = entries[part]["arms"]["none"]
-      rows.append((f"`{one['env']}`", "none, untouched", "", "", "", "", of(none, "recovered"), of(none, "recovered_within_10000"), "",
+      rows.append((f"`{one['env']}`", "none", "", "", "", "", of(none, "recovered"), of(none, "recovered_within_10000"), "",
                    mean([*lost.get((part, "none"), {}).values()]), "", "", "", ""))
     rows.append(("", f"`{one['detector']}`", str(own["false_alarm_streams"]), f"{own['alarms']} of {own['seeds']}", of(own, "affected_alarmed_within_500"), both(own, "latency_median_steps"),
                  of(own, "recovered"), of(own, "recovered_within_10000"), few(worth, "normalised", worth["seeds"], 2) if worth and worth["seeds"] else "-", mean([*mine.values()]),
@@ -578,11 +573,11 @@ def in_loop(results: pathlib.Path) -> str:
   text = fill(f"""
       {done}{'; '.join(f"`{one['env']}`: `{one['fault']}` at step {number(one['onset'])} of {number(one['steps'])}" for one in robots)}; seeds {joined([f"{a} to {b}" for a, b in seeds])}. Streams with
       a false alarm before the onset; streams that alarm after it; affected ones that do within 500 steps; median latency of all streams, misses counted as infinite; affected streams recovered before the run ends,
-      and within 10,000 steps; normalised recovery over the last 2,000 steps (0: arm `none`, 1: the reward before onset; interquartile mean); return lost from the onset to the run's end, against the untouched stream's reward before
-      it, a stream's mean; how much less of it than with its robot's first detector, a mean paired over seeds (95 % bootstrap intervals over streams); finetunings begun, of all streams together; streams whose last one converged / was given up / still
-      went on; updates a stream. {FEW if any(" to " in row[8] for row in rows) else ""}""")
+      and within 10,000 steps; normalised recovery over the last 2,000 steps (0: arm `none`, 1: the reward before onset; interquartile mean); return lost from the onset to the run's end, against the reward of arm `none` before
+      it, a stream's mean; how much less of it than with its robot's first detector, a mean paired over seeds (95 % bootstrap intervals over streams); finetunings begun, of all streams together; streams whose last one converged / was aborted /
+      still ran; updates a stream. {FEW if any(" to " in row[8] for row in rows) else ""}""")
   return text + "\n\n" + grid(("robot", "detector", "false alarms", "alarm", "within 500", "latency [steps]", "recovered", "within 10,000", "normalised recovery", "return lost", "less", "begun",
-                                "converged / given up / going on", "updates"), rows)
+                                "converged / aborted / still running", "updates"), rows)
 
 
 def two_agents(results: pathlib.Path) -> str:
@@ -616,7 +611,7 @@ def gradient(results: pathlib.Path) -> str:
   text = fill(f"""
       A step is the root mean square change of the policy's mean action; promise (the mean imagined advantage) and gain are in reward per control step on the healthy
       robot, the gain with 95 % bootstrap intervals over {kinds}, common keys.""")
-  return text + "\n\n" + grid(("agent", "step along the gradient", "the dream promises", "the robot gains", "terminations"), rows)
+  return text + "\n\n" + grid(("agent", "step along the gradient", "the imagined rollouts promise", "the robot gains", "terminations"), rows)
 
 
 def quadruped(results: pathlib.Path) -> str:
@@ -651,12 +646,12 @@ def ppo(results: pathlib.Path) -> str:
   own = load(results / "ppo_finetune.json")
   paper = load(results / "paper" / "bench.json")["entries"]["walker"]
   rows = []
-  for arm, learner in (("ppo-none", "PPO, as pretrained"), ("ppo", "PPO, told the onset")):
+  for arm, learner in (("ppo-none", "PPO, as pretrained"), ("ppo", "PPO, from the true onset")):
     r = own["arms"][arm]
     worth = f"{both(r, 'normalised', 2)}, {r['affected']} seeds" if r["normalised"] is not None else "-"
     rows.append((learner, f"{r['recovered']} of {r['affected']}", both(r, "recovery_median_steps"), both(r, "reward_pre", 2), both(r, "reward_final_affected", 2), worth,
                  number(r["updates"]), number(r["terminations"] / r["seeds"], 1)))
-  for arm, learner in (("none", "DreamerV3, as shipped"), ("detector", "DreamerV3, by its own alarm"), ("oracle", "DreamerV3, told the onset")):
+  for arm, learner in (("none", "DreamerV3, as shipped"), ("detector", "DreamerV3, by its own alarm"), ("oracle", "DreamerV3, from the true onset")):
     if arm not in paper["arms"]:
       continue
     r, worth = paper["arms"][arm], paper["scores"]["normalised"][arm]
@@ -673,6 +668,23 @@ def ppo(results: pathlib.Path) -> str:
 BLOCKS = {"run-walker": run_walker, "arl0": arl0, "leaderboard": leaderboard, "leaderboard-100k": leaderboard_100k, "physics": physics, "dreamer": dreamer, "agents": agents,
           "detectors": detectors, "paper": experiments, "arms": arms,
           "other-arms": other_arms, "stop-rule": stop_rule, "again": again, "study": study, "full": full, "in-loop": in_loop, "two-agents": two_agents, "gradient": gradient, "quadruped": quadruped, "ppo": ppo}
+
+
+def catalogue(results: pathlib.Path) -> str:
+  """Every fault of the package, from its docstring."""
+  from mjx_cl import faults
+  rows = [(f"`{name}`", family, *(x.replace("|", "\\|") for x in faults.said(name))) for family, members in faults.FAMILIES.items() for name in members]
+  return grid(("fault", "family", "what happens", "severity", "target", "owns"), rows)
+
+
+def gap(results: pathlib.Path) -> str:
+  """The items of the reality gap between `car` and `car_real`."""
+  from mjx_cl.envs.car_real import GAP
+  value = lambda x: f"{x:.4g}"
+  return grid(("item", "unit", "`car`", "`car_real`", "leaf", "source"), [(f"`{name}`", i.unit, value(i.simulator), value(i.real), f"`{i.leaf}`", i.source) for name, i in GAP.items()])
+
+
+CODE = {"faults": catalogue, "gap": gap}  # blocks that are written from the code, by modules that need JAX
 
 
 # ---- pages -----------------------------------------------------------------------------------------------------------------------
@@ -707,8 +719,8 @@ def find(lines: list[str], where: str) -> list[Block]:
       continue
     if opened is not None:
       break
-    if name not in BLOCKS:
-      raise FileError(f"{here}: unknown block {name!r}; choose from: {', '.join(sorted(BLOCKS))}")
+    if name not in BLOCKS | CODE:
+      raise FileError(f"{here}: unknown block {name!r}; choose from: {', '.join(sorted(BLOCKS | CODE))}")
     opened = name, k
   if opened is not None:
     raise FileError(f"{where}:{opened[1] + 1}: block {opened[0]!r} is not closed by <!-- /report -->")
@@ -718,7 +730,7 @@ def find(lines: list[str], where: str) -> list[Block]:
 def render(name: str, results: pathlib.Path) -> str:
   """Text of a block; a file that is missing or holds something else gives one line with the block's name."""
   try:
-    return BLOCKS[name](results)
+    return (BLOCKS | CODE)[name](results)
   except FileError as e:
     raise FileError(f"block {name!r}: {e}") from None
   except (KeyError, IndexError, TypeError, ValueError, AttributeError, ArithmeticError, statistics.StatisticsError) as e:

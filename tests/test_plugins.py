@@ -10,6 +10,7 @@ import sys
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from mjx_cl import cli, detectors, envs, faults
@@ -313,3 +314,25 @@ def test_a_file_robot_that_is_a_shipped_one_by_another_path(tmp_path, capsys):
   name = f"{tmp_path}/mine.py:Mine"
   with pytest.raises(UserError, match="register it"):
     recording.prepare(types.SimpleNamespace(name="s", robots={name: {}}), (), "auto", None)
+
+
+def test_the_fault_of_the_docs(tmp_path):
+  """The example of docs/faults.md as a file of one's own, against a loop by hand: target hit alone, band, an episode's start, severity 0."""
+  text = (ROOT / "docs/faults.md").read_text()
+  (block,) = [b for b in re.findall(r"^```python\n(.*?)^```", text, re.S | re.M) if "# mine.py" in b]
+  (tmp_path / "mine.py").write_text(block)
+  env = envs.make("walker")
+  fault = faults.make(f"{tmp_path / 'mine.py'}:sticky", env)
+  assert fault.targets[:2] == ("right_hip", "right_knee") and fault.owns == ("ctrl",)
+  commands = np.random.default_rng(0).uniform(-1, 1, (40, 6)).astype(np.float32)
+  step = jax.jit(lambda state, severity, ctrl, first: fault.apply(state, severity, jax.random.key(0), faults.Ports(env.model, ctrl=ctrl, first=first)))
+  for severity in (0.0, 0.8):
+    state, held, differs = fault.init(jax.random.key(0), 1), np.zeros(6, np.float32), 0
+    for t, ctrl in enumerate(commands):
+      state, ports = step(state, jnp.float32(severity), ctrl, jnp.bool_(t in (0, 20)))
+      held = np.where(np.abs(ctrl - held) > np.float32(0.5) * np.float32(severity), ctrl, held) if t not in (0, 20) else ctrl
+      want = ctrl.copy()
+      want[1] = held[1]
+      np.testing.assert_array_equal(np.asarray(ports.ctrl), want)
+      differs += ports.ctrl[1] != ctrl[1]
+    assert (differs > 3) == (severity > 0)

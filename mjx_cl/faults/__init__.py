@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import inspect
 import re
+from typing import NamedTuple
 
 import jax.numpy as jnp
 
@@ -30,12 +31,26 @@ def family(name: str) -> str:
   return next((f for f, members in FAMILIES.items() if name in members), "none" if name == "none" else "plugin")
 
 
-def about(name: str) -> str:
-  """One line on fault `name` from its docstring: family, what happens, what severity means, what a target is, what it owns."""
+class Said(NamedTuple):
+  """What the docstring of a fault says of it. Attributes: what: happens, its first line. severity, target, owns: in words, "" where it does not say."""
+  what: str
+  severity: str
+  target: str
+  owns: str
+
+
+def said(name: str) -> Said:
+  """`Said` of fault `name`."""
   text = inspect.getdoc(FAULTS[name]) or ""
   last = " ".join(text.split("\n\n")[-1].split()).replace("`", "")
-  said = {word: re.search(rf"\b{word}:? (.*?)\.(?: [A-Z]|$)", last) for word in ("Severity", "Target", "Owns")}
-  return "; ".join([f"{family(name)}: {text.split(chr(10))[0]}"] + [f"{word.lower()}: {found[1]}" for word, found in said.items() if found])
+  found = {word: re.search(rf"\b{word}:? (.*?)\.(?: [A-Z]|$)", last) for word in ("Severity", "Target", "Owns")}
+  return Said(text.split("\n")[0], *(hit[1] if hit else "" for hit in found.values()))
+
+
+def about(name: str) -> str:
+  """One line on fault `name` from its docstring: family, what happens, what severity means, what a target is, what it owns."""
+  own = said(name)
+  return "; ".join([f"{family(name)}: {own.what}"] + [f"{word}: {getattr(own, word)}" for word in Said._fields[1:] if getattr(own, word)])
 
 
 def make(name: str, env) -> Fault:
