@@ -20,6 +20,7 @@ import time
 
 GFLOP = {"size1m": 32.0, "size12m": 470.0, "monitor": 0.5}
 STREAMS = 40
+SEEDS = 10
 
 
 class Clock:
@@ -69,7 +70,7 @@ def batch(agent, key):
 
 
 def updater(size: str, last_starts: int = 0, seeds: int = 0, how: str = "map", **options):
-  """A function that takes one update (of each of `seeds` seeds) and blocks."""
+  """A function that takes one update (of each of `seeds` seeds) and blocks. how: `map`, `pairs` and `vmap` on one device, `devices`: `map` on each of several."""
   import jax
   from mjx_cl.config import PRESETS
   from mjx_cl.dreamer.agent import Agent
@@ -81,9 +82,15 @@ def updater(size: str, last_starts: int = 0, seeds: int = 0, how: str = "map", *
     holder = [jax.jit(agent.init)(jax.random.key(0))]
   else:
     one = lambda state: agent.update(state, data, key)[0]
-    many = {"map": lambda s: jax.lax.map(one, s), "pairs": lambda s: jax.lax.map(one, s, batch_size=2), "vmap": jax.vmap(one)}[how]
-    step = jax.jit(many, donate_argnums=0)
+    each = lambda s: jax.lax.map(one, s)
+    many = {"map": each, "devices": each, "pairs": lambda s: jax.lax.map(one, s, batch_size=2), "vmap": jax.vmap(one)}[how]
     holder = [jax.jit(jax.vmap(agent.init))(jax.random.split(jax.random.key(0), seeds))]
+    if how == "devices":  # as train.make_learn shares seeds
+      from mjx_cl.train import seeds_mesh
+      mesh, mine = seeds_mesh(seeds), jax.sharding.PartitionSpec("seeds")
+      many = jax.shard_map(many, mesh=mesh, in_specs=mine, out_specs=mine, check_vma=False)
+      holder = [jax.device_put(holder[0], jax.sharding.NamedSharding(mesh, mine))]
+    step = jax.jit(many, donate_argnums=0)
 
   def run():
     holder[0] = jax.block_until_ready(step(holder[0]))
@@ -198,7 +205,8 @@ def main() -> None:
   parser.add_argument("--quick", action="store_true", help="size1m's update and acting alone, few rounds")
   args = parser.parse_args()
   from mjx_cl import runtime
-  runtime.setup()
+  shared = runtime.sharing(SEEDS)
+  runtime.setup(shared)  # for the rows of ten seeds; all others are on the first device, with all cores
   clock, rows = Clock(), []
 
   def row(name, value, unit, goal=None):
@@ -220,10 +228,14 @@ def main() -> None:
     row(f"monitor, {STREAMS} streams, {what}, per control step", times[name] / 64 * 1e3, "ms")
     row(f"monitor, {STREAMS} streams, {what}, share of the matrix rate", GFLOP["monitor"] / (times[name] / 64) / clock.rate, "", ">= 0.45")
   if not args.quick:
-    times = clock.measure({"one": updater("size1m")} | {how: updater("size1m", seeds=10, how=how) for how in ("map", "pairs", "vmap")}, 8)
-    row("ten seeds in one program (lax.map), per seed / one seed alone", times["map"] / 10 / times["one"], "ratio", "<= 0.9")
-    row("ten seeds in pairs, per seed / one seed alone", times["pairs"] / 10 / times["one"], "ratio")
-    row("ten seeds by vmap, per seed / one seed alone", times["vmap"] / 10 / times["one"], "ratio")
+    for starts, more in ((0, ""), (16, ", 256 starts")):
+      ways = {} if starts else {"map": "in one program (lax.map)", "pairs": "in pairs", "vmap": "by vmap"}
+      if shared > 1:
+        ways["devices"] = "a share for each core"
+      times = clock.measure({"one": updater("size1m", starts)} | {how: updater("size1m", starts, seeds=SEEDS, how=how) for how in ways}, 8)
+      for how, words in ways.items():
+        goal = "<= 0.9" if not starts and how == ("devices" if shared > 1 else "map") else None  # of the way that `train --seeds` takes on this machine
+        row(f"ten seeds {words}{more}, per seed / one seed alone", times[how] / SEEDS / times["one"], "ratio", goal)
     times = clock.measure({"x": updater("size12m")}, 5)
     row("update size12m", times["x"] * 1e3, "ms")
     row("update size12m, share of the matrix rate", GFLOP["size12m"] / times["x"] / clock.rate, "", ">= 0.6")

@@ -1015,7 +1015,7 @@ def main(argv: list[str] | None = None) -> int:
     command = parse(argv)
     if not isinstance(command, (Plot, Query, Report)):
       from mjx_cl import runtime
-      runtime.setup()
+      runtime.setup(runtime.sharing(command.seeds) if isinstance(command, Train) and command.seeds > 0 else 1)
     with apart(command):
       DO[type(command)](command)
 

@@ -167,7 +167,7 @@ def train(env, out: str | os.PathLike, steps: int, seed: int = 0, evals: int = 1
 
   ppo.train(
       environment=adapter, num_timesteps=steps - done, episode_length=env.spec.episode_steps, seed=seed + done, num_evals=evals, restore_params=params,
-      progress_fn=on_progress, policy_params_fn=on_params,
+      progress_fn=on_progress, policy_params_fn=on_params, max_devices_per_host=1 if jax.default_backend() == "cpu" else None,  # several seeds: runtime.setup
       network_factory=functools.partial(networks.make_ppo_networks, policy_hidden_layer_sizes=HIDDEN, value_hidden_layer_sizes=HIDDEN),
       **SIZES | PPO | own.get("ppo", {}) | settings)
   return rows

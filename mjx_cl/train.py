@@ -40,7 +40,8 @@ def make_learn(agent: Agent, batch: int, length: int, mesh=None):
   `culprit` is the index into agent.CAUSES of the term at fault, -1 for none: with the update at fault, which changes no weights, the seed's updates end.
 
   Seeds run one after another inside the program (`lax.map`): on a CPU that is as fast as vmap or faster, and needs the memory of one. A seed
-  that is not active is passed over. With a `mesh` each of its devices does its own share of the seeds.
+  that is not active is passed over. With a `mesh` each of its devices does its own share of the seeds: `mjx-cl train` on a CPU makes as many devices of
+  the cores as share the seeds evenly (runtime.sharing).
   """
   def one_seed(train, replay, key, weights, updates):
     keys = jax.random.split(key, updates)
@@ -205,7 +206,7 @@ class Trainer:
     self.plain = Agent(dreamer, len(spec.obs), len(spec.act))
     self.mesh = seeds_mesh(seeds)
     memory.check(dreamer.size, len(spec.obs), len(spec.act), config.envs * config.capacity, seeds, ("capacity", lambda n: n * config.envs), dreamer.bins,
-                 1 if self.mesh is None else self.mesh.size)
+                 1 if self.mesh is None or jax.default_backend() == "cpu" else self.mesh.size)  # devices of a CPU share its memory
     self.failed: dict[int, str] = {}  # seed -> the term that was not finite, and when
     fault, self.plan, self.target = faults_of(env, config)
     self.collect = {"pure": Rollout(env, self.plain, fault, config.repeat)}

@@ -17,11 +17,7 @@ from collections.abc import Callable
 
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.interrupt import Interruptible
-
-
-def cores() -> list[int]:
-  """Numbers of the cores that this process may use; where the system has no affinity, of all."""
-  return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(os.cpu_count() or 1))
+from mjx_cl.runtime import cores
 
 
 def number(asked: int | None, needs: list[int], space: int) -> int:

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjx_cl import runtime
+from mjx_cl import cli, runtime
 from mjx_cl.physics.native import Native
 
 SCHEDULER = "--xla_cpu_enable_concurrency_optimized_scheduler"
@@ -123,6 +123,28 @@ def test_setup_survives_a_home_that_cannot_be_written(monkeypatch, tmp_path):
   monkeypatch.setenv("XLA_FLAGS", "")
   runtime.setup()
   assert jax.config.jax_compilation_cache_dir == before
+
+
+@pytest.mark.parametrize("cores, seeds, devices", [(2, 10, 2), (2, 3, 1), (4, 9, 3), (4, 2, 2), (1, 8, 1), (16, 10, 10), (2, 1, 1)])
+def test_cores_share_seeds_evenly(monkeypatch, cores, seeds, devices):
+  monkeypatch.setattr(runtime, "cores", lambda: list(range(cores)))
+  assert runtime.sharing(seeds) == devices
+
+
+@pytest.mark.parametrize("asked, own, want", [(2, {}, 2), (1, {}, 1), (2, {"XLA_FLAGS": "--xla_force_host_platform_device_count=3"}, 3), (2, {"JAX_NUM_CPU_DEVICES": "4"}, 4)])
+def test_a_cpu_counts_as_many_devices_as_asked_unless_the_user_has_decided(asked, own, want):
+  env = {k: v for k, v in os.environ.items() if k not in ("XLA_FLAGS", "JAX_NUM_CPU_DEVICES")} | own
+  code = f"from mjx_cl import runtime; runtime.setup({asked}); import jax; print(len(jax.devices()))"
+  assert int(subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, check=True).stdout) == want
+
+
+@pytest.mark.parametrize("argv, devices", [(["train", "walker", "--seeds", "4"], 2), (["train", "walker"], 1), (["run", "walker", "--seeds", "4"], 1)])
+def test_the_seeds_of_a_training_are_shared_by_the_cores(monkeypatch, argv, devices):
+  asked = []
+  monkeypatch.setattr(runtime, "cores", lambda: [0, 1])
+  monkeypatch.setattr(runtime, "setup", lambda devices=1: asked.append(devices))
+  monkeypatch.setattr(cli, "DO", {kind: lambda command: None for kind in cli.DO})
+  assert cli.main(argv) == 0 and asked == [devices]
 
 
 def test_256_mjx_walkers_finish_and_agree_with_mujoco(walker, pair, fields, crowd, within):

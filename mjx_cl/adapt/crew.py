@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_cl.adapt.loop import Choices, Digest, Loop, LoopState
-from mjx_cl.workers import cores
+from mjx_cl.runtime import cores
 
 LATER = ("history", "past")                         # fields of a LoopState whose streams lie along axis 1; of the others along axis 0
 ROWS = ("residual", "score", "fired")               # fields of a Digest, likewise
