@@ -75,7 +75,7 @@ def join(folders, out, config: RunConfig) -> dict:
     UserError where pieces differ in their agent or physics; FileError for a piece that cannot be read.
   """
   import numpy as np
-  from mjx_cl import envs, plots, run
+  from mjx_cl import envs, ledger, plots
   from mjx_cl.scoring import stop
   folders, out = [pathlib.Path(f) for f in folders], pathlib.Path(out)
   summaries, configs = [], []
@@ -112,7 +112,7 @@ def join(folders, out, config: RunConfig) -> dict:
   invalid = [(s["invalid_share"], c["seeds"]) for s, c in zip(summaries, configs) if s["invalid_share"] is not None]
   spec = envs.make(config.env).spec
   value = {k: summaries[0][k] for k in SUMMED[:6]}
-  value |= run.by_arm(runs, config, spec.control_s)
+  value |= ledger.by_arm(runs, config, spec.control_s)
   value |= {"invalid_share": mean(*zip(*invalid)) if invalid else None, "wall_s": float(sum(wall)),
             "wall_s_arms": {arm: float(sum(s["wall_s_arms"][arm] for s in summaries)) for arm in summaries[0]["wall_s_arms"]},
             "wall_share": {k: mean([s["wall_share"][k] for s in summaries], wall) for k in summaries[0]["wall_share"]}}

@@ -126,14 +126,14 @@ def main(arguments: list[str]) -> int:
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # where the parent died, nobody reads what is said, and saying it would be an error before the state is saved
     os.kill(os.getpid(), signal.SIGTERM)
   threading.Thread(target=orphan, daemon=True).start()
-  from mjx_cl import bench, cli, run, runtime
+  from mjx_cl import bench, cli, display, run, runtime
 
   def do():
     runtime.setup()
     folder = pathlib.Path(out)
     values = json.loads((folder / "suite.json").read_text())["parts"][name]
-    with cli.RunDisplay() as display:
-      run.execute(bench.config(name, values), folder / name, resume=(folder / name / "config.json").exists(), progress=display)
+    with display.RunDisplay() as shown:
+      run.execute(bench.config(name, values), folder / name, resume=(folder / name / "config.json").exists(), progress=shown)
   return cli.attempt(do)
 
 

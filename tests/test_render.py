@@ -12,7 +12,7 @@ import pytest
 from PIL import Image, ImageSequence
 from test_cli import mjx, refused  # noqa: F401  fixtures
 
-from mjx_cl import adapters, cli, envs, render
+from mjx_cl import adapters, cli, commands, envs, render
 from mjx_cl.envs.course import Course
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.types import EnvState
@@ -305,9 +305,9 @@ def test_the_shipped_agent_acts_by_default(monkeypatch, tmp_path):
   monkeypatch.setattr(render, "render", lambda env, out, *_, **options: taken.update(options, out=out) or
                       {"file": out, "frames": 1, "steps": 1, "fps": 20.0, "drawn_by": "-"})
   monkeypatch.chdir(tmp_path)
-  cli.do_render(cli.Render("walker", duration=7))
+  commands.do_render(cli.Render("walker", duration=7))
   assert type(taken["agent"]).__name__ == "Agent" and taken["params"] and taken["repeat"] == 1 and taken["duration"] == 7 and taken["out"] == "walker.gif"
-  cli.do_render(cli.Render("walker", agent="none"))
+  commands.do_render(cli.Render("walker", agent="none"))
   assert taken["agent"].spread == 0
 
 

@@ -131,7 +131,7 @@ def test_each_part_has_its_own_column(saved, tmp_path):
   shape = lambda *more: np.zeros((64, 2, *more), np.float32)
   trace = {k: shape() for k in ("reward", "severity", "episode", "terminated", "truncated", "opr", "rpr", "valid", "score", "alarm", "updates")}
   trace |= {"phase": np.zeros((64, 2), np.int8), "signals": np.zeros((1, 2, 6)), "parts": shape(8) + np.arange(8) + 100 * np.arange(2)[:, None]}
-  table = runner._trace_table(trace, ["none", "none"])
+  table = runner._ledger(["none", "none"]).trace(trace)
   for k, (name, at) in enumerate(runner.env.spec.watched):
     assert at
     np.testing.assert_array_equal(table[f"residual_{name}"], np.repeat([k, 100 + k], 64))
