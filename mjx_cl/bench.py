@@ -354,7 +354,7 @@ def scores(folder) -> dict:
     without_floor: patience [chunks], as text -> the same without the floor of `least` control steps, so that the signals alone decide.
   """
   from mjx_cl.scoring import normalised, recovery, stop, survival
-  config, rows = json.loads((folder / "config.json").read_text()), store.read_rows(folder / "runs.parquet")
+  config, rows = store.read_json(folder / "config.json"), store.read_rows(folder / "runs.parquet")
   first, arms = [r for r in rows if not r["change"]], config["arms"]
   scored = normalised.rows(rows) if "none" in arms else []
   out = {"normalised": normalised.summarise(scored) or None, "against_oracle": None, "recovery": {}}
@@ -394,7 +394,7 @@ def collect(out: pathlib.Path, plan: Suite, known: dict | None = None) -> dict:
   for part in plan.parts:
     if not finished(out, part):
       continue
-    summary = json.loads((out / part.name / "summary.json").read_text())
+    summary = store.read_json(out / part.name / "summary.json")
     value["finished"] += 1
     if part.name not in known:
       known[part.name] = scores(out / part.name)

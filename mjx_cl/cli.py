@@ -6,11 +6,13 @@ Here is what each command takes, one dataclass a command; what it does is in com
 """
 from __future__ import annotations
 
+import atexit
 import contextlib
 import io
 import re
 import signal
 import sys
+import threading
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -20,6 +22,7 @@ from mjx_cl import __version__, commands
 from mjx_cl.config import AdaptConfig
 from mjx_cl.display import apart, say
 from mjx_cl.errors import FileError, UserError
+from mjx_cl.interrupt import Lasting
 
 Positional = tyro.conf.Positional
 
@@ -405,9 +408,24 @@ def parse(argv: list[str] | None):
 
 def attempt(do, again=lambda: "") -> int:
   """Exit status of `do()`; what goes wrong becomes one line on standard error, an interrupt one that ends in `again()`."""
-  def stop(*_):
+  def stop(number, frame):
+    if frame is not None and frame.f_code.co_name == "_xla_gc_callback":  # JAX's; Python drops what is raised in there
+      threading.Timer(0.01, signal.raise_signal, (number,)).start()
+      return
     raise KeyboardInterrupt
   signal.signal(signal.SIGTERM, stop)
+  if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+    signal.signal(signal.SIGINT, stop)
+  before = sys.stderr
+  sys.stderr = Lasting(before)
+  try:
+    return _attempt(do, again)
+  finally:
+    if sys.stderr._stream is before:
+      sys.stderr = before
+
+
+def _attempt(do, again) -> int:
   try:
     do()
     return 0
@@ -416,8 +434,9 @@ def attempt(do, again=lambda: "") -> int:
     return e.exit_code
   except KeyboardInterrupt:
     say(f"mjx-cl: interrupted{again()}")
+    atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)  # a second Ctrl-C finds an interpreter that is clearing up
     return 130
-  except BrokenPipeError:
+  except BrokenPipeError:  # of standard output: the reader has what it wanted, and results are in their files by then
     return 0
   except OSError as e:
     say(f"mjx-cl: {e.strerror or e}{f': {e.filename}' if e.filename else ''}")

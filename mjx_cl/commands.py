@@ -6,16 +6,20 @@ import json
 import math
 import os
 import pathlib
+import re
 import sys
 import time
 from typing import TYPE_CHECKING
 
-from mjx_cl.config import ARMS, PRESETS, RunConfig, TrainConfig, replace
+from mjx_cl.config import ARMS, PRESETS, RunConfig, TrainConfig, check_seeds, finite, replace
 from mjx_cl.display import RunDisplay, TrainDisplay, clock, detect_table, emit, json_value, plan_lines, say, show, summary_text
 from mjx_cl.errors import FileError, UserError, choose
 
 if TYPE_CHECKING:
   from mjx_cl.cli import Bench, Certify, Detect, Doctor, Eval, Leaderboard, List, Plot, Query, Record, Render, Report, Run, Train
+
+
+MOST_EPISODES = 10_000  # all at once in one program
 
 
 def settings(pairs: tuple[str, ...]) -> dict:
@@ -29,6 +33,7 @@ def settings(pairs: tuple[str, ...]) -> dict:
       out[name] = json.loads(value.lower() if value in ("True", "False") else value)
     except ValueError:
       out[name] = value
+  finite(out, "--set")
   return out
 
 
@@ -55,7 +60,7 @@ def do_bench(args: Bench) -> None:
                               ("physics", None if args.physics == "auto" else args.physics)) if v is not None}
   suite = bench.suite(args.suite, change)
   k, sign, n = args.shard.partition("/")
-  if not (sign and k.isdigit() and n.isdigit()):
+  if not (sign and re.fullmatch("[0-9]+", k) and re.fullmatch("[0-9]+", n)):
     raise UserError(f"--shard takes K/N, such as 0/2; got {args.shard!r}")
   if args.jobs is not None and args.jobs < 1:
     raise UserError(f"--jobs must be above 0; got {args.jobs}")
@@ -120,6 +125,11 @@ def do_train(args: Train) -> None:
   dreamer = replace(preset.dreamer, **rest)
   if args.seeds < 1:
     raise UserError(f"seeds must be above 0; got {args.seeds}")
+  check_seeds(args.seed)
+  if args.agent == "":
+    raise UserError("--agent is a shipped name or a folder; got an empty name")
+  if not 0 < args.save_every_s < float("inf"):
+    raise UserError(f"--save-every-s must be above 0; got {args.save_every_s}")
   from mjx_cl import envs, run, store, train
   env = envs.make(args.env, args.physics)
   if args.demonstrator not in (None, "ppo"):  # whatever can be refused is refused before an earlier training is touched
@@ -155,8 +165,11 @@ def do_train(args: Train) -> None:
 
 
 def do_eval(args: Eval) -> None:
-  if args.episodes < 1:
-    raise UserError(f"episodes must be above 0; got {args.episodes}")
+  if not 1 <= args.episodes <= MOST_EPISODES:
+    raise UserError(f"episodes must lie in 1..{MOST_EPISODES:,}, which are lived side by side; got {args.episodes}")
+  check_seeds(args.seed, args.episodes)
+  if args.agent == "":
+    raise UserError("--agent is a shipped name or a folder; got an empty name")
   from mjx_cl import agents, envs, evaluate
   env = envs.make(args.env, args.physics)
   trained = agents.of(env, args.agent)
@@ -177,8 +190,8 @@ def do_eval(args: Eval) -> None:
 
 
 def do_certify(args: Certify) -> None:
-  if args.episodes < 0:
-    raise UserError(f"episodes must be at least 0; got {args.episodes}")
+  if not 0 <= args.episodes <= MOST_EPISODES:
+    raise UserError(f"episodes must lie in 0..{MOST_EPISODES:,}; got {args.episodes}")
   from mjx_cl import certify, envs
   names = args.env or tuple(envs.ENVS)
   certify.check(names)
@@ -200,11 +213,12 @@ def do_certify(args: Certify) -> None:
 
 
 def do_record(args: Record) -> None:
-  from mjx_cl import recording, streams
+  from mjx_cl import recording, store, streams
   suite, out = streams.suite(args.suite), args.out
   if args.overwrite:
     recording.prepare(suite, args.robot, args.physics, args.agent)  # what is refused must not cost the set that is there
   recording.claim(suite, out, args.overwrite, args.robot)
+  store.probe(out)
   told = [0.0]
 
   def progress(part, done, steps, lanes):
@@ -233,11 +247,11 @@ def do_leaderboard(args: Leaderboard) -> None:
   held = streams.StreamSet(args.streams)
   robots = held.choose(args.robot)
   if args.export:
+    store.probe(args.export)
     files = submissions.export(held, args.export, robots, args.overwrite)
     emit(files) if args.json else print("\n".join(files))
     return
-  if os.path.exists(args.out) and not os.path.isdir(args.out):
-    raise UserError(f"--out {args.out} is a file")
+  store.probe(args.out)  # before minutes are spent
   if os.path.exists(os.path.join(args.out, "leaderboard.json")) and not args.overwrite:
     raise UserError(f"{args.out} holds a leaderboard; give --overwrite to replace it, or another --out")
   known, extra = leaderboard.variants(), []
@@ -400,7 +414,7 @@ def do_list(args: List) -> None:
             "agents": lambda: {k: "shipped" for k in agents.shipped()}, "arms": lambda: {k: a.about for k, a in ARMS.items()},
             "fault-presets": lambda: {k: f"{p.about} ({p.source})" for k, p in fault_presets.PRESETS.items()}, "schedules": lambda: fault_presets.SCHEDULES,
             "sizes": memory.table, "suites": streams.about, "benches": bench.shipped}
-  chosen = {k: make() for k, make in (tables if args.what == "all" else {args.what: choose("list", args.what, tables)}).items()}
+  chosen = {k: make() for k, make in (tables if choose("list", args.what, tables | {"all": None}) is None else {args.what: tables[args.what]}).items()}
   if args.json:
     emit(chosen)
     return

@@ -29,6 +29,27 @@ def not_below_0(config, *names: str) -> None:
       raise UserError(f"{name} must be 0 or above; got {value}")
 
 
+def whole(config, *names: str, most: int = fault_presets.FOREVER - 1) -> None:
+  """Raises unless every named field is a whole number of at least 0 and at most `most`."""
+  for name in names:
+    value = getattr(config, name)
+    if not (isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= most):
+      raise UserError(f"{name} must be a whole number in 0..{most:,}; got {value}")
+
+
+def check_seeds(first: int, count: int = 1, name: str = "seed") -> None:
+  """Raises unless `count` seeds from `first` on are whole numbers from 0 to 2,147,483,647, as files hold them."""
+  if not 0 <= first <= 2**31 - count:
+    raise UserError(f"{name} must lie in 0..{2**31 - count:,}; got {first}")
+
+
+def finite(values: dict, where: str) -> None:
+  """Raises where a setting is a number that is not finite: results could not hold it as JSON."""
+  for name, value in values.items():
+    if isinstance(value, float) and not math.isfinite(value):
+      raise UserError(f"{where}: {name} must be finite; got {value}")
+
+
 def fraction(config, *names: str) -> None:
   """Raises unless every named field lies in [0, 1]."""
   for name in names:
@@ -168,6 +189,7 @@ class TrainConfig:
   severity: float = 1.0
 
   def __post_init__(self):
+    whole(self, "envs", "updates", "capacity", "repeat", "clone", "fade", "pure", "hold", *(("episode",) if self.episode is not None else ()))
     positive(self, "envs", "updates", "ratio", "capacity", "repeat", *(("episode",) if self.episode is not None else ()))
     if self.fault is not None and fault_presets.named(self.fault) and self.severity != 1.0:
       raise UserError(f"preset {self.fault!r} brings its own severity; leave severity out")
@@ -243,11 +265,16 @@ class AdaptConfig:
   random_steps: int = 6000
 
   def __post_init__(self):
+    whole(self, "start_windows", "least", "give_up", "budget", "warmup", "period", "period_steps", "random_steps")
+    whole(self, "patience", most=100_000)  # what a stream keeps for it lies in memory
+    whole(self, "refit", most=1_000_000)
     positive(self, "ratio", "start_windows", "trend", "fluctuation", "excess", "near", "least", "give_up", "budget", "refit", "average", "period",
              "period_steps", "random_steps")
+    if self.batch is not None:
+      whole(self, "batch", most=4096)
+    if self.acceptance is not None and not math.isfinite(self.acceptance):
+      raise UserError(f"acceptance must be finite; got {self.acceptance}")
     fraction(self, "average")
-    if not self.warmup >= 0:
-      raise UserError(f"warmup must be 0 or above; got {self.warmup}")
     if self.patience < 4:
       raise UserError(f"patience must be at least 4 chunks; got {self.patience}")
     if self.last_starts is not None and (self.last_starts < 0 or self.last_starts == 1):
@@ -318,8 +345,10 @@ class RunConfig:
     positive(self, "steps", "seeds")
     if self.steps >= fault_presets.FOREVER:
       raise UserError(f"steps must be below {fault_presets.FOREVER:,} control steps; got {self.steps}")
-    if self.first_seed < 0:
-      raise UserError(f"first_seed must be at least 0; got {self.first_seed}")
+    check_seeds(self.first_seed, self.seeds, "first_seed")
+    finite(self.settings, "settings of the detector")
+    if self.agent == "":
+      raise UserError("agent is a shipped name or a folder; got an empty name")
     if not 0 <= self.onset <= last:
       raise UserError(f"onset must lie in 0..{'steps=' if last == self.steps else ''}{last}; got {self.onset}")
     for arm in self.arms:

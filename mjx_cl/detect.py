@@ -175,8 +175,8 @@ def detect(path, nominal_path, columns: tuple[str, ...] = (), detectors: tuple[s
   """
   if not (arl0 > 1 and np.isfinite(arl0)):
     raise UserError(f"arl0 must be a finite number above 1 sample; got {arl0}")
-  if rate is not None and not (rate > 0 and np.isfinite(rate)):
-    raise UserError(f"rate must be above 0 samples a second; got {rate}")
+  if rate is not None and not 1e-9 <= rate <= 1e12:
+    raise UserError(f"rate must lie in 1e-9..1e12 samples a second; got {rate}")
   names, every = list(dict.fromkeys(detectors)) or list(table()), not detectors
   if settings and not any(":" in name for name in names):
     raise UserError("settings are for host detectors (module:Class, file.py:Class); the others are calibrated")
@@ -188,7 +188,10 @@ def detect(path, nominal_path, columns: tuple[str, ...] = (), detectors: tuple[s
   xs, past = (np.stack([one.columns[c] for c in found], 1) for one in (log, nominal))
   if logarithm:
     xs, past = _logarithm(xs, found, path), _logarithm(past, found, nominal_path)
-  middle, spread = np.nanmean(past, 0), np.nanstd(past, 0)
+  with np.errstate(over="ignore", invalid="ignore"):
+    middle, spread = np.nanmean(past, 0), np.nanstd(past, 0)
+  if not np.isfinite(spread).all():
+    raise FileError(f"{nominal_path}: column {found[int(np.argmin(np.isfinite(spread)))]} holds numbers too large to be computed with")
   if not (spread > 0).all():
     raise FileError(f"{nominal_path}: column {found[int(np.argmin(spread))]} varies too little to be told from a constant"
                     + (" once its logarithm is taken" if logarithm else ""))

@@ -55,8 +55,8 @@ def summary_text(s: dict, out: str) -> str:
   number = lambda x, form: "-" if x is None else format(x, form)
   width = max(9, *map(len, s["arms"]))
   for arm, a in s["arms"].items():
-    lines.append(f"  {arm:{width}s} {a['seeds']} seeds, {a['affected']} affected; false-alarm streams {a['false_alarm_streams']}; alarm within 500 steps "
-                 f"{a['affected_alarmed_within_500']}/{a['affected']}, median {number(a['latency_median_steps'], '.0f')} steps; recovered within 10,000 steps "
+    lines.append(f"  {arm:{width}s} {a['seeds']} seeds, {a['affected']} affected{f', {busy} adapting at the onset' if (busy := a.get('adapting_at_onset')) else ''}; false-alarm streams {a['false_alarm_streams']}; alarm within 500 steps "
+                 f"{a['affected_alarmed_within_500']}/{a.get('affected_watched', a['affected'])}, median {number(a['latency_median_steps'], '.0f')} steps; recovered within 10,000 steps "
                  f"{a['recovered_within_10000']}/{a['affected']}, median {number(a['recovery_median_steps'], '.0f')}; converged {a['converged']}, aborted by rule "
                  f"{a['aborted_by_rule']}, by budget {a['aborted_by_budget']}{f', numeric failures {failed}' if (failed := a.get('failed')) else ''}; reward {number(a['reward_pre'], '.2f')} -> drop {number(a['reward_drop'], '.0%')} -> "
                  f"{number(a['reward_final'], '.2f')}; a stream: {number(a['updates_mean'], '.0f')} updates in {number(a['adapted_steps_mean'], '.0f')} steps of "

@@ -5,9 +5,37 @@ then KeyboardInterrupt be raised.
 """
 from __future__ import annotations
 
+import os
 import signal
 import sys
 import threading
+
+
+class Lasting:
+  """A text stream that swallows what cannot be written: where the reader of progress lines has gone (`2>&1 | tee log` dies of the same Ctrl-C) the work goes on and is saved."""
+
+  def __init__(self, stream):
+    self._stream = stream
+
+  def write(self, text: str) -> int:
+    try:
+      return self._stream.write(text)
+    except (OSError, ValueError):  # ValueError: it is closed
+      self._deaf()
+      return len(text)
+
+  def flush(self) -> None:
+    try:
+      self._stream.flush()
+    except (OSError, ValueError):
+      self._deaf()
+
+  def _deaf(self) -> None:
+    """From now on nothing is kept for a reader that is gone, so that the interpreter's last flush finds nothing to fail on."""
+    self._stream = open(os.devnull, "w")
+
+  def __getattr__(self, name):
+    return getattr(self._stream, name)
 
 
 class Interruptible:

@@ -4,16 +4,20 @@ NumPy on the host; nothing here moves a robot. Definitions: scoring/recovery.py,
 """
 from __future__ import annotations
 
+import dataclasses
+import pathlib
 from typing import NamedTuple
 
 import numpy as np
 
+from mjx_cl import store
 from mjx_cl.adapt import phase as phase_lib
 from mjx_cl.adapt.arms import ARMS, FOREVER, NEVER
 from mjx_cl.adapt.convergence import SIGNALS
-from mjx_cl.config import RunConfig
+from mjx_cl.config import AdaptConfig, RunConfig
+from mjx_cl.errors import FileError
 from mjx_cl.monitor import watched
-from mjx_cl.scoring import alarms as alarm_score, bootstrap, recovery
+from mjx_cl.scoring import alarms as alarm_score, bootstrap, recovery, special
 from mjx_cl.types import Spec
 
 # by decision: what a stream has come to
@@ -178,7 +182,7 @@ class Ledger(NamedTuple):
             "terminations": int(trace["terminated"][begin:end, g].sum()),
             "adapted_steps": int(np.sum(trace["phase"][begin:end, g] == phase_lib.ADAPTING)),
             "updates": int(last), "wall_s": None if change else float(self.stream_seconds[g])})
-    return rows
+    return set_apart(rows, events)
 
   def summary(self, rows, trace, seconds, quiet, chunks) -> dict:
     """summary.json: per arm the aggregates, each with its interval; arm `detector` also at the top level.
@@ -190,8 +194,10 @@ class Ledger(NamedTuple):
     out = {"env": self.config.env, "fault": self.config.fault, "severity": severity, "onset": self.config.onset, "steps": self.config.steps,
            "detector": self.config.detector}
     out |= by_arm(rows, self.config, self.spec.control_s)
-    nominal = trace["valid"][15 * self.repeat:]
-    out["invalid_share"] = float(1.0 - nominal[self.repeat - 1::self.repeat].mean()) if len(nominal) >= self.repeat else None
+    known = trace["valid"][15 * self.repeat:][self.repeat - 1::self.repeat]
+    each = 1.0 - known.mean(0) if len(known) else []  # of each stream
+    out["invalid_share"] = float(np.mean(each)) if len(each) else None
+    out["invalid_share_ci"] = bootstrap.interval(each, np.mean) if len(each) else None
     wall = sum(seconds.values())
     quiet = float(np.median(quiet)) if quiet else 0.0
     monitor = min(seconds["digest"], quiet * max(1, chunks - 1))
@@ -201,6 +207,43 @@ class Ledger(NamedTuple):
     out["wall_s_arms"] = {arm: float(sum(r["wall_s"] or 0.0 for r in rows if r["arm"] == arm)) for arm in out["arms"]}
     out["wall_share"] = {k: v / wall for k, v in shares.items()}
     return out
+
+
+def set_apart(rows: list[dict], events: list[dict]) -> list[dict]:
+  """Rows with `adapting_at_onset`: whether the stream's finetuning was under way when the change came. Such a stream is a false alarm (or one that was told to adapt) and
+  is kept apart from latency: what its detector says then starts nothing, so it has no `alarm_step`, `latency_steps` and `latency_s`, and counts neither as a detection nor
+  as a miss."""
+  out = []
+  for r in rows:
+    last = None
+    if r["onset"] is not None:
+      own = [e["kind"] for e in events if e["stream"] == r["stream"] and e["step"] < r["onset"] and e["kind"] in ("start", "stop", "abort")]
+      last = own[-1] if own else None
+    under_way = last == "start"
+    out.append(r | {"adapting_at_onset": under_way} | (dict.fromkeys(("alarm_step", "latency_steps", "latency_s")) if under_way else {}))
+  return out
+
+
+def rescore(folder) -> dict:
+  """Writes runs.parquet and summary.json of a finished run anew by today's definitions, as far as they follow from its rows and events: `adapting_at_onset` and what is
+  kept apart by it, and every aggregate of the rows. Returns summary.json's value. For results of an earlier version; what a run writes needs it not.
+
+  Raises:
+    FileError where the folder is not a finished run's.
+  """
+  folder = pathlib.Path(folder)
+  config, summary = store.read_json(folder / "config.json"), store.read_json(folder / "summary.json")
+  rows = set_apart(store.read_rows(folder / "runs.parquet"), store.read_rows(folder / "events.parquet"))
+  try:
+    own = {f.name for f in dataclasses.fields(RunConfig)}
+    adapt = AdaptConfig(**{k: v for k, v in config["adapt"].items() if k in {f.name for f in dataclasses.fields(AdaptConfig)}})
+    run = RunConfig(**{k: tuple(v) if k == "arms" else v for k, v in config.items() if k in own and k not in ("adapt", "physics")}, adapt=adapt)  # physics: as resolved there
+    summary |= by_arm(rows, run, config["control_s"])
+  except (KeyError, TypeError) as e:
+    raise FileError(f"{folder} is not a finished run's: {type(e).__name__}: {e}") from None
+  store.write_table(folder / "runs.parquet", {k: [r[k] for r in rows] for k in rows[0]})
+  store.write_json(folder / "summary.json", summary)
+  return summary
 
 
 def by_arm(rows: list[dict], config: RunConfig, control_s: float) -> dict:
@@ -215,10 +258,10 @@ def by_arm(rows: list[dict], config: RunConfig, control_s: float) -> dict:
 
 def summarise(rows: list[dict], config: RunConfig, control_s: float) -> dict:
   """Aggregates of one arm. Recovery counts affected streams alone; times are censored medians; means are IQM with bootstrap intervals."""
-  affected, met = [r for r in rows if r["affected"]], [r for r in rows if r["onset"] is not None]
+  affected, met = [r for r in rows if r["affected"]], [r for r in rows if r["onset"] is not None and not r.get("adapting_at_onset")]
   latency = [np.inf if r["latency_steps"] is None else r["latency_steps"] for r in met]
   back = [np.inf if r["recovery_step"] is None else r["recovery_step"] - r["onset"] for r in affected]
-  out: dict = {"seeds": len(rows), "affected": len(affected)}
+  out: dict = {"seeds": len(rows)}
 
   def put(name, value, ci):
     out[name], out[name + "_ci"] = value, ci
@@ -226,15 +269,19 @@ def summarise(rows: list[dict], config: RunConfig, control_s: float) -> dict:
   def count(name, hits, n):
     p = bootstrap.wilson(hits, n)
     put(name, hits, None if p is None else [p[0] * n, p[1] * n])
+  count("affected", len(affected), sum(r["affected"] is not None for r in rows))
+  count("adapting_at_onset", sum(bool(r.get("adapting_at_onset")) for r in rows), len(rows))
   count("alarms", sum(np.isfinite(x) for x in latency), len(met))
   count("false_alarm_streams", sum(bool(r["false_alarms"]) for r in rows), len(rows))
   hours = sum(config.steps if r["onset"] is None else min(r["onset"], config.steps) for r in rows if not r["change"]) * control_s / 3600
-  out["false_alarms_per_hour"] = sum(r["false_alarms"] for r in rows) / hours if hours else None
+  false = sum(r["false_alarms"] or 0 for r in rows)
+  put("false_alarms_per_hour", false / hours if hours else None, [x / hours for x in special.poisson_interval(false)] if hours else None)
   median = lambda x: bootstrap.finite(bootstrap.censored_median(x)) if len(x) else None
   put("latency_median_steps", median(latency), bootstrap.interval(latency, bootstrap.censored_median) if latency else None)
   put("miss_probability", float(np.mean(~np.isfinite(latency))) if met else None, bootstrap.wilson(int(np.sum(~np.isfinite(latency))), len(latency)))
-  hit = [r["latency_steps"] is not None and r["latency_steps"] <= 500 for r in affected]
-  count("affected_alarmed_within_500", sum(hit), len(affected))
+  hit = [r["latency_steps"] is not None and r["latency_steps"] <= 500 for r in affected if not r.get("adapting_at_onset")]
+  count("affected_watched", len(hit), len(affected))
+  count("affected_alarmed_within_500", sum(hit), len(hit))
   for outcome in dict.fromkeys((*OUTCOMES[phase_lib.STOP:], "adapting")):
     hits = sum(r["outcome"] == outcome for r in rows)
     if hits or outcome != "failed":  # numeric failures are named where there are any

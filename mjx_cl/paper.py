@@ -115,7 +115,7 @@ def shares(values: list[float], n: str) -> Measured:
 
 
 def latency(rows: list[dict]) -> Measured:
-  met = [r for r in rows if r["onset"] is not None]
+  met = [r for r in rows if r["onset"] is not None and not r.get("adapting_at_onset")]
   return times([np.inf if r["latency_steps"] is None else r["latency_steps"] for r in met], "streams")
 
 

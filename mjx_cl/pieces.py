@@ -7,7 +7,6 @@ lack their trace, are left out.
 """
 from __future__ import annotations
 
-import json
 import pathlib
 
 from mjx_cl import store
@@ -18,7 +17,7 @@ ORDER = {"trace": "step", "events": "step", "runs": "change", "signals": "step",
 KEPT = ("git_commit", "machine", "python", "versions")
 SAME = ("physics", "agent_card", "repeat", "control_s")  # of config.json, beside the settings: one agent and one backend lived all the seeds
 
-SUMMED = ("env", "fault", "severity", "onset", "steps", "detector", "invalid_share", "wall_s", "wall_s_arms", "wall_share")  # what `join` takes from summary.json
+SUMMED = ("env", "fault", "severity", "onset", "steps", "detector", "invalid_share", "invalid_share_ci", "wall_s", "wall_s_arms", "wall_share")  # what `join` takes from summary.json
 
 
 def seeds_of(folder, config: RunConfig) -> list[int] | None:
@@ -32,7 +31,7 @@ def seeds_of(folder, config: RunConfig) -> list[int] | None:
   if not (folder / "config.json").exists() or not (folder / "summary.json").exists():
     return None
   check_same(folder, {k: v for k, v in identity(config).items() if k not in ("physics", "seeds", "first_seed")})
-  own = json.loads((folder / "config.json").read_text())
+  own = store.read_json(folder / "config.json")
   try:
     return list(range(own["first_seed"], own["first_seed"] + own["seeds"]))
   except (KeyError, TypeError):
@@ -81,8 +80,8 @@ def join(folders, out, config: RunConfig) -> dict:
   summaries, configs = [], []
   for folder in folders:
     try:
-      summaries.append(json.loads((folder / "summary.json").read_text()))
-      configs.append(json.loads((folder / "config.json").read_text()))
+      summaries.append(store.read_json(folder / "summary.json"))
+      configs.append(store.read_json(folder / "config.json"))
     except (OSError, ValueError) as e:
       raise FileError(f"{folder} is no finished run: {e}") from None
     lacks = [k for k in SUMMED if k not in summaries[-1]]
@@ -113,7 +112,7 @@ def join(folders, out, config: RunConfig) -> dict:
   spec = envs.make(config.env).spec
   value = {k: summaries[0][k] for k in SUMMED[:6]}
   value |= ledger.by_arm(runs, config, spec.control_s)
-  value |= {"invalid_share": mean(*zip(*invalid)) if invalid else None, "wall_s": float(sum(wall)),
+  value |= {"invalid_share": mean(*zip(*invalid)) if invalid else None, "invalid_share_ci": None, "wall_s": float(sum(wall)),
             "wall_s_arms": {arm: float(sum(s["wall_s_arms"][arm] for s in summaries)) for arm in summaries[0]["wall_s_arms"]},
             "wall_share": {k: mean([s["wall_share"][k] for s in summaries], wall) for k in summaries[0]["wall_share"]}}
   if "stop" in rows:

@@ -8,6 +8,7 @@ import warnings
 import numpy as np
 
 from mjx_cl import store
+from mjx_cl.errors import FileError
 
 UPPER = (("reward", "reward per step"), ("opr", "OPR"), ("rpr", "RPR"))
 LOWER = (("adv_mag", "advantage magnitude"), ("dyn_loss", "dynamics loss [nats]"), ("value_loss", "value loss [nats]"))
@@ -29,14 +30,22 @@ def figure(folder, width: int = 500) -> pathlib.Path:
 
   Args:
     width: steps of the trailing mean that every curve is drawn with.
+  Raises:
+    FileError where these are missing, broken or not a run's.
   """
+  try:
+    return _figure(folder, width)
+  except (KeyError, ValueError, TypeError) as e:
+    raise FileError(f"{folder} holds no run that can be drawn: {type(e).__name__}: {str(e).splitlines()[0] if str(e) else ''}") from None
+
+
+def _figure(folder, width: int) -> pathlib.Path:
   import matplotlib
   matplotlib.use("Agg")
   import matplotlib.pyplot as plt
-  import json
   folder = pathlib.Path(folder)
   trace, events = store.read_table(folder / "trace.parquet"), store.read_table(folder / "events.parquet")
-  config = json.loads((folder / "config.json").read_text())
+  config = store.read_json(folder / "config.json")
   steps = int(trace["step"].max()) + 1
   control_s = config["control_s"]
   panels = {}
@@ -100,14 +109,13 @@ def survival(out, parts: list[str], columns: int = 3) -> pathlib.Path | None:
   Returns:
     The file; None where no part has an affected stream.
   """
-  import json
   import matplotlib
   matplotlib.use("Agg")
   import matplotlib.pyplot as plt
   from mjx_cl.scoring import survival as estimate
   out, drawn = pathlib.Path(out), []
   for part in parts:
-    rows, config = store.read_rows(out / part / "runs.parquet"), json.loads((out / part / "config.json").read_text())
+    rows, config = store.read_rows(out / part / "runs.parquet"), store.read_json(out / part / "config.json")
     if any(r["affected"] for r in rows if not r["change"]):
       drawn.append((part, rows, config))
   if not drawn:

@@ -148,9 +148,9 @@ def beside(suite_: Suite, out, robots) -> dict | None:
   out = pathlib.Path(out)
   for path in (out / "config.json", out / "work" / "set" / HELD):  # the latter: files were being moved into place when it was cut off
     try:
-      config = json.loads(path.read_text())
+      config = store.read_json(path)
       break
-    except (OSError, ValueError):
+    except FileError:
       continue
   else:
     return None

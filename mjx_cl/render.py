@@ -23,11 +23,13 @@ import mujoco
 import numpy as np
 
 from mjx_cl.adapters import Puppet, join, worst
+from mjx_cl.config import check_seeds
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.rollout import nest
 from mjx_cl.types import EnvState
 
 SUFFIXES = (".gif", ".mp4")
+MOST_STEPS = 100_000  # control steps of an episode
 MARK = (214, 39, 40)          # of an acting fault
 SKY = (np.array([0.80, 0.88, 0.95]), np.array([0.97, 0.98, 1.0]))  # at the top and at the bottom of the picture
 GROUND = (0.72, 0.74, 0.74)
@@ -420,10 +422,9 @@ def check(out, steps: int, width: int, height: int, fps: float, seed: int = 0) -
   out = pathlib.Path(out)
   if out.suffix.lower() not in SUFFIXES:
     raise UserError(f"--out must end in {' or '.join(SUFFIXES)}; got {str(out)!r}")
-  if steps < 1:
-    raise UserError(f"steps must be above 0; got {steps}")
-  if seed < 0:
-    raise UserError(f"seed must be at least 0; got {seed}")
+  if not 1 <= steps <= MOST_STEPS:
+    raise UserError(f"steps must lie in 1..{MOST_STEPS:,}, whose pictures are kept in memory; got {steps}")
+  check_seeds(seed)
   for name, value in (("width", width), ("height", height)):
     if not 64 <= value <= 4096:
       raise UserError(f"{name} must lie in 64..4096; got {value}")

@@ -88,6 +88,17 @@ def few(values: dict, name: str, n: int, digits: int = 0) -> str:
   return f"{text}, {n} seed{'s' * (n != 1)}"
 
 
+def alarmed(own: dict) -> str:
+  """Streams of an arm's summary that alarm after the change, of those whose finetuning was not under way when it came."""
+  return f"{own['alarms']} of {own['seeds'] - own.get('adapting_at_onset', 0)}"
+
+
+def soon(own: dict) -> str:
+  """Affected ones of those that alarm within 500 steps."""
+  n = own.get("affected_watched", own["affected"])
+  return f"{own['affected_alarmed_within_500']} of {n}" if n else "-"
+
+
 FEW = "Of three seeds or fewer the range stands in round brackets: they give no interval."
 
 
@@ -130,7 +141,7 @@ def run_walker(results: pathlib.Path) -> str:
   rows = [
       (f"streams with a false alarm in {number(summary['onset'])} nominal steps", count("false_alarm_streams", n),
        f"{none['false_alarm_streams']} of {n}"),
-      ("affected streams that alarm within 500 steps of onset", count("affected_alarmed_within_500", hit), ""),
+      ("affected streams that alarm within 500 steps of onset", count("affected_alarmed_within_500", main.get("affected_watched", hit)), ""),
       ("median latency over all streams, a miss counted as infinite [steps]", both(main, "latency_median_steps"), ""),
       ("miss probability, all streams", both(main, "miss_probability", 2), ""),
       ("affected streams recovered within 10,000 steps", recovered, f"{none['recovered_within_10000']} of {none['affected']}"),
@@ -457,7 +468,7 @@ def again(results: pathlib.Path) -> str:
   for part, entry in entries.items():
     for change, (what, arms_) in enumerate(zip(words, [entry["arms"], *entry["later_changes"]])):
       for k, (arm, own) in enumerate(arms_.items()):
-        rows.append((f"`{part}`, {what}" if not k else "", arm, f"{own['alarms']} of {own['seeds']}", both(own, "latency_median_steps"),
+        rows.append((f"`{part}`, {what}" if not k else "", arm, alarmed(own), both(own, "latency_median_steps"),
                      f"{own['recovered']} of {own['affected']}", both(own, "recovery_median_steps"), both(own, "reward_pre", 2), both(own, "reward_final", 2),
                      number(own["updates_mean"])))
   text = fill("""
@@ -518,7 +529,7 @@ def full(results: pathlib.Path) -> str:
     worth = (entries[part]["scores"]["normalised"] or {}).get("detector")
     of = lambda arm, name: f"{arm[name]} of {arm['affected']}" if arm["affected"] else "-"
     rows.append((f"`{one['env']}`" if one["env"] != last else "", f"`{one['fault']}`" + ("" if fault_presets.named(one["fault"]) else f" {one['severity']:g}"),
-                 f"{own['affected']} of {own['seeds']}", str(own["false_alarm_streams"]), f"{own['alarms']} of {own['seeds']}", of(own, "affected_alarmed_within_500"),
+                 f"{own['affected']} of {own['seeds']}", str(own["false_alarm_streams"]), alarmed(own), soon(own),
                  both(own, "latency_median_steps"), of(none, "recovered"), of(own, "recovered"), left(part, "none"), left(part, "detector"),
                  few(worth, "normalised", worth["seeds"], 2) if worth and worth["seeds"] else "-",
                  f"{own['converged']} / {own['aborted_by_rule'] + own['aborted_by_budget']} / {own['adapting']}", number(own["updates_mean"])))
@@ -532,7 +543,7 @@ def full(results: pathlib.Path) -> str:
   first = {(p, r["seed"]) for p in plan if p in entries for r in lived if r["part"] == p and r["arm"] == "detector" and r["affected"] and r["alarm_step"] is not None}
   text = fill(f"""
       Of {hit} affected streams {len(first)} alarm; {back} recover in arm `detector`, {alone} in arm `none`. {len(entries)} of {len(plan)} parts of suite `full` are finished ({done}), seeds {one['first_seed']} to {one['first_seed'] + one['seeds'] - 1}. Affected streams; streams with a false alarm
-      before the onset; streams that alarm after it; affected ones that do within 500 steps; median latency of all streams, misses counted as infinite; affected streams
+      before the onset; streams that alarm after it, of those not adapting to a false one by then; affected ones that do within 500 steps; their median latency, misses counted as infinite; affected streams
       recovered before the run ends, without and with finetuning; their reward over the last 2,000 steps over that before the onset (interquartile mean); normalised recovery (0: arm
       `none`, 1: the reward before onset, interquartile mean with 95 % bootstrap interval over the streams that end a tenth or more below it without adaptation); finetunings that converge / are aborted / still run; updates a stream. {FEW if any(" to " in cell for row in rows for cell in row) else ""}""")
   return text + "\n\n" + grid(("robot", "fault, severity", "affected", "false alarms", "alarm", "within 500", "latency [steps]", "recovered, `none`", "recovered",
@@ -563,7 +574,7 @@ def in_loop(results: pathlib.Path) -> str:
       none = entries[part]["arms"]["none"]
       rows.append((f"`{one['env']}`", "none", "", "", "", "", of(none, "recovered"), of(none, "recovered_within_10000"), "",
                    mean([*lost.get((part, "none"), {}).values()]), "", "", "", ""))
-    rows.append(("", f"`{one['detector']}`", str(own["false_alarm_streams"]), f"{own['alarms']} of {own['seeds']}", of(own, "affected_alarmed_within_500"), both(own, "latency_median_steps"),
+    rows.append(("", f"`{one['detector']}`", str(own["false_alarm_streams"]), alarmed(own), soon(own), both(own, "latency_median_steps"),
                  of(own, "recovered"), of(own, "recovered_within_10000"), few(worth, "normalised", worth["seeds"], 2) if worth and worth["seeds"] else "-", mean([*mine.values()]),
                  "" if new else mean([first[seed] - mine[seed] for seed in first if seed in mine]),
                  str(begun[part]), f"{own['converged']} / {own['aborted_by_rule'] + own['aborted_by_budget']} / {own['adapting']}", number(own["updates_mean"])))
@@ -572,7 +583,7 @@ def in_loop(results: pathlib.Path) -> str:
   done = f"{len(entries)} of {len(plan)} parts are finished. " if len(entries) < len(plan) else ""
   text = fill(f"""
       {done}{'; '.join(f"`{one['env']}`: `{one['fault']}` at step {number(one['onset'])} of {number(one['steps'])}" for one in robots)}; seeds {joined([f"{a} to {b}" for a, b in seeds])}. Streams with
-      a false alarm before the onset; streams that alarm after it; affected ones that do within 500 steps; median latency of all streams, misses counted as infinite; affected streams recovered before the run ends,
+      a false alarm before the onset; streams that alarm after it, of those not adapting to a false one by then; affected ones that do within 500 steps; their median latency, misses counted as infinite; affected streams recovered before the run ends,
       and within 10,000 steps; normalised recovery over the last 2,000 steps (0: arm `none`, 1: the reward before onset; interquartile mean); return lost from the onset to the run's end, against the reward of arm `none` before
       it, a stream's mean; how much less of it than with its robot's first detector, a mean paired over seeds (95 % bootstrap intervals over streams); finetunings begun, of all streams together; streams whose last one converged / was aborted /
       still ran; updates a stream. {FEW if any(" to " in row[8] for row in rows) else ""}""")
@@ -586,7 +597,7 @@ def two_agents(results: pathlib.Path) -> str:
   for agent, folder in (("`walker`", "walker_gear"), ("`walker-plain`", "walker_plain")):
     own = load(results / folder / "summary.json")["arms"]
     r, still = own["detector"], own["none"]
-    rows.append((agent, f"{r['false_alarm_streams']} of {r['seeds']}", f"{r['affected_alarmed_within_500']} of {r['affected']}", both(r, "latency_median_steps"),
+    rows.append((agent, f"{r['false_alarm_streams']} of {r['seeds']}", f"{r['affected_alarmed_within_500']} of {r.get('affected_watched', r['affected'])}", both(r, "latency_median_steps"),
                  f"{r['recovered_within_10000']} of {r['affected']} ({r['recovered']} in the end)", both(r, "reward_pre", 2), both(still, "reward_final_affected", 2),
                  both(r, "reward_final_affected", 2), f"{r['converged']} of {r['seeds']}", number(r["updates_mean"])))
   text = fill("""

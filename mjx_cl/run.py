@@ -451,12 +451,14 @@ def doubts(config: RunConfig) -> list[str]:
 def execute(config: RunConfig, out, resume: bool = False, overwrite: bool = False, progress=lambda p: None, save_every_s: float = 60.0,
             tell=lambda text: None) -> dict:
   """Runs `config` into `out` and returns summary.json's value. A kill at any moment loses at most `save_every_s` seconds of work."""
+  if not str(out):
+    raise UserError("--out is a folder; got an empty name")
   out = pathlib.Path(out)
   fresh = not out.exists()
   state = store.claim_folder(out, resume, overwrite)
   if state == "done":
     check_same(out, {k: v for k, v in identity(config).items() if k != "physics"})  # `auto` is resolved there
-    return json.loads((out / "summary.json").read_text())
+    return store.read_json(out / "summary.json")
   try:
     runner = Runner(config, out)  # refuses wrong names and broken agents before anything of an earlier run is removed
   except UserError:
@@ -493,13 +495,9 @@ def execute(config: RunConfig, out, resume: bool = False, overwrite: bool = Fals
   return runner.finish(lambda text: last and progress(last._replace(note=text)))
 
 
-RESULTS = ("config.json", "trace.parquet", "events.parquet", "runs.parquet", "residuals.parquet", "summary.json", "figure.png", "metrics.parquet",
-           "signals.parquet", "snapshots.parquet", "stop.parquet")
-
-
 def clear(out: pathlib.Path) -> None:
   """Removes an earlier run's own files, nothing else."""
-  for name in RESULTS:
+  for name in ("config.json", *store.RESULTS):
     (out / name).unlink(missing_ok=True)
   for name in ("work", "checkpoints"):
     shutil.rmtree(out / name, ignore_errors=True)
@@ -526,9 +524,9 @@ def identity(config: RunConfig) -> dict:
 def check_same(out: pathlib.Path, values: dict) -> None:
   """Refuses to resume with other settings than the run began with."""
   try:
-    old = json.loads((out / "config.json").read_text())
-  except ValueError:
-    raise FileError(f"{out / 'config.json'} is not a run's; give --overwrite or another --out") from None
+    old = store.read_json(out / "config.json")
+  except FileError as e:
+    raise FileError(f"{e}; give --overwrite or another --out") from None
   skip = ("git_commit", "machine", "python")
   if isinstance(old.get("adapt"), dict):
     old["adapt"] = {**dataclasses.asdict(AdaptConfig()), **old["adapt"]}

@@ -1,7 +1,7 @@
 """What must be decided before JAX starts its first backend: XLA flags, compile cache, dispatch.
 
-Importing this module is free of JAX; `setup()` is idempotent and is called by every entry point (`mjx_cl/__init__` calls
-it when the package is imported for its API, the CLI before a command that computes).
+Importing this module is free of JAX; `setup()` is idempotent. The command line calls it before a command that computes; a program of one's own calls it before its
+first use of JAX: `from mjx_cl import runtime; runtime.setup()`.
 """
 from __future__ import annotations
 

@@ -9,6 +9,7 @@ import pathlib
 import platform
 import re
 import subprocess
+import tempfile
 import tomllib
 
 from mjx_cl.errors import FileError, UserError
@@ -44,6 +45,23 @@ def write_json(path, value) -> None:
   """Writes JSON (nan and infinity refused)."""
   text = json.dumps(value, indent=1, allow_nan=False, default=plain) + "\n"
   atomic(path, lambda file: file.write(text.encode()))
+
+
+def read_json(path) -> dict:
+  """The JSON object in a file.
+
+  Raises:
+    FileError where there is none, or something else.
+  """
+  try:
+    value = json.loads(pathlib.Path(path).read_text())
+  except OSError as e:
+    raise FileError(f"cannot read {path}: {e.strerror}") from None
+  except ValueError as e:  # of JSON and of UTF-8
+    raise FileError(f"{path} is broken: {str(e).splitlines()[0]}") from None
+  if not isinstance(value, dict):
+    raise FileError(f"{path} holds {type(value).__name__} in place of an object; it is not of mjx-cl")
+  return value
 
 
 def write_table(path, columns: dict, nan_is_null: bool = True, codec: str = "zstd", level: int | None = None,
@@ -257,6 +275,33 @@ def _cpu() -> str:
   return platform.processor() or platform.machine()
 
 
+def probe(out) -> None:
+  """Makes the folder `out` and refuses one that cannot be written to, before what goes there is computed. An empty folder that was not there is left."""
+  if not str(out):
+    raise UserError("--out is a folder; got an empty name")
+  out = pathlib.Path(out)
+  if out.exists() and not out.is_dir():
+    raise UserError(f"--out {out} is a file")
+  try:
+    out.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryFile(dir=out):
+      pass
+  except OSError as e:
+    raise FileError(f"cannot write in {out}: {e.strerror or e}; give another --out") from None
+
+
+# what a run or training leaves beside config.json
+RESULTS = ("trace.parquet", "events.parquet", "runs.parquet", "residuals.parquet", "summary.json", "figure.png", "metrics.parquet", "signals.parquet", "snapshots.parquet", "stop.parquet")
+
+
+def _foreign(out: pathlib.Path) -> str | None:
+  """What a run or training would replace in a folder without config.json that is not one's own, which was cut off while it began: its name, or None."""
+  left = {"work": r"checkpoints|snapshots|trace(-\d+|\.tmp)\.npz", "work/checkpoints": r"\d.*", "checkpoints": r"\d.*"}
+  strange = [name for name in (*RESULTS, "agent") if (out / name).exists()]
+  strange += [f"{folder}/{path.name}" for folder, known in left.items() for path in sorted((out / folder).glob("*")) if not re.fullmatch(known, path.name)]
+  return strange[0] if strange else None
+
+
 def claim_folder(out, resume: bool, overwrite: bool, done_marker: str = "summary.json") -> str:
   """Decides what a command may do with --out.
 
@@ -265,6 +310,8 @@ def claim_folder(out, resume: bool, overwrite: bool, done_marker: str = "summary
   Raises:
     UserError where the folder holds another run and neither --resume nor --overwrite was given.
   """
+  if not str(out):
+    raise UserError("--out is a folder; got an empty name")
   out = pathlib.Path(out)
   if out.exists() and not out.is_dir():
     raise UserError(f"--out {out} is a file")
@@ -275,8 +322,11 @@ def claim_folder(out, resume: bool, overwrite: bool, done_marker: str = "summary
       return "done" if (out / done_marker).exists() else "resume"
     if not overwrite:
       raise UserError(f"{out} holds another run; give --resume to go on with it, --overwrite to replace it, or another --out")
-  elif out.is_dir() and any(out.iterdir()) and not (resume or overwrite):
-    raise UserError(f"{out} is not empty and holds no run of mjx-cl; give another --out")
+  elif out.is_dir() and any(out.iterdir()):
+    if not (resume or overwrite):
+      raise UserError(f"{out} is not empty and holds no run of mjx-cl; give another --out")
+    if name := _foreign(out):
+      raise UserError(f"{out} holds no config.json of mjx-cl, but {name}, which would be replaced; give another --out")
   try:
     out.mkdir(parents=True, exist_ok=True)
   except OSError as e:

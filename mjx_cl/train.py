@@ -429,10 +429,10 @@ def build(env, dreamer: DreamerConfig, config: TrainConfig, out, seed: int, seed
   trainer.about = {"env": env.spec.name, "preset": preset, "command": command, "seed": seed, "repeat": config.repeat,
                    "dreamer": dataclasses.asdict(dreamer), "train": dataclasses.asdict(config), "started_from": agent_name}
   values = {"command": "train", "seeds": seeds, **trainer.about, **store.provenance()}
-  if resume:
+  if resume and trainer.checkpoints.latest() is not None:
     trainer.resume()
     store.write_json(out / "config.json", values)  # `updates` may have grown
-  else:
+  else:  # one that was cut off before its first checkpoint begins anew
     if agent_name:
       check(env, dreamer, config, agent_name)
       trained = agents.of(env, agent_name)
@@ -515,11 +515,11 @@ def run(trainer: Trainer, progress=lambda row: None, save_every_s: float = 240.0
   saved = time.monotonic()
   with Interruptible() as interrupt:
     while not trainer.done:
+      progress(trainer.step())
       try:
-        progress(trainer.step())
         interrupt.check()
       except KeyboardInterrupt:
-        trainer.save()
+        trainer.save()  # between two chunks; a second signal, in the middle of one, leaves nothing whole to save
         raise
       if time.monotonic() - saved > save_every_s:
         trainer.save()

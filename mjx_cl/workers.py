@@ -6,7 +6,6 @@ none outlives its parent.
 """
 from __future__ import annotations
 
-import json
 import os
 import pathlib
 import subprocess
@@ -15,6 +14,7 @@ import threading
 import time
 from collections.abc import Callable
 
+from mjx_cl import store
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.interrupt import Interruptible
 from mjx_cl.runtime import cores
@@ -131,7 +131,7 @@ def main(arguments: list[str]) -> int:
   def do():
     runtime.setup()
     folder = pathlib.Path(out)
-    values = json.loads((folder / "suite.json").read_text())["parts"][name]
+    values = store.read_json(folder / "suite.json")["parts"][name]
     with display.RunDisplay() as shown:
       run.execute(bench.config(name, values), folder / name, resume=(folder / name / "config.json").exists(), progress=shown)
   return cli.attempt(do)

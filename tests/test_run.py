@@ -18,7 +18,7 @@ import numpy as np
 import pyarrow.parquet
 import pytest
 
-from mjx_cl import agents, cli, envs, plots, run, store, workers
+from mjx_cl import agents, cli, commands, envs, plots, run, store, workers
 from mjx_cl.config import AdaptConfig, RunConfig
 from mjx_cl.dreamer.agent import Agent
 from mjx_cl.envs.walker import Walker
@@ -463,6 +463,48 @@ def test_an_interrupt_is_acted_on_between_two_chunks(tmp_path, monkeypatch, requ
     call()
   assert notes == ["step 1", "step 2"] + (["step 3"] + want if want else [])
   assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+class Broken:
+  """A text stream whose reader has gone."""
+  def write(self, text):
+    raise BrokenPipeError
+  flush = write
+
+
+def test_progress_that_nobody_reads_ends_no_work(monkeypatch, tmp_path):
+  """`2>&1 | tee log`: Ctrl-C kills tee as well; what is said then goes nowhere, the state is saved, and the exit code is 130."""
+  monkeypatch.setattr(run, "Runner", type("Stubbed", (Stub,), {"signals": 1, "notes": (notes := [])}))
+  monkeypatch.setattr(commands, "RunDisplay", lambda: contextlib.nullcontext(lambda p: commands.say("a line of progress")))
+  monkeypatch.setattr(sys, "stderr", broken := Broken())
+  before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+  try:
+    assert cli.main(["run", "walker", "--out", str(tmp_path / "x")]) == 130
+  finally:
+    for number, handler in zip((signal.SIGINT, signal.SIGTERM), before):
+      signal.signal(number, handler)
+  assert notes[-1] == "save" and sys.stderr is not broken  # what is said from now on goes nowhere
+
+
+def test_a_signal_inside_of_jaxs_collector_is_not_lost():
+  """Python drops what is raised in JAX's callback of the garbage collector; the interrupt comes a moment later."""
+  import time
+  before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+  signal.signal(signal.SIGINT, signal.default_int_handler)
+
+  def _xla_gc_callback():
+    signal.raise_signal(signal.SIGINT)
+
+  def do():
+    _xla_gc_callback()
+    for _ in range(200):
+      time.sleep(0.01)
+    raise AssertionError("the interrupt was lost")
+  try:
+    assert cli.attempt(do) == 130
+  finally:
+    for number, handler in zip((signal.SIGINT, signal.SIGTERM), before):
+      signal.signal(number, handler)
 
 
 # ---- agents --------------------------------------------------------------------------------------------------------------------------

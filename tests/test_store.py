@@ -4,6 +4,7 @@ import json
 import math
 import os
 import pathlib
+import re
 import types
 
 import numpy as np
@@ -298,6 +299,48 @@ def test_claim_of_a_folder_of_something_else(tmp_path):
     claim(tmp_path)
   assert "holds no run" in one_line(error)
   assert claim(tmp_path, overwrite=True) == "new" and (tmp_path / "thesis.tex").read_text() == "years"
+
+
+@pytest.mark.parametrize("name", ["summary.json", "work/thesis.txt", "work/checkpoints/mine", "checkpoints/mine.txt", "agent/agent.npz"])
+def test_what_is_somebody_elses_is_not_replaced(tmp_path, name):
+  (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+  (tmp_path / name).write_text("years")
+  for flags in ({"overwrite": True}, {"resume": True}):
+    with pytest.raises(UserError) as error:
+      claim(tmp_path, **flags)
+    assert re.search(f"but {name.split('/mine')[0].removesuffix('/agent.npz')}\\b", one_line(error)) and "another --out" in one_line(error)
+  assert (tmp_path / name).read_text() == "years"
+
+
+def test_what_was_cut_off_at_its_begin_goes_on(tmp_path):
+  for name in ("work/checkpoints/5/state", "work/trace-000005.npz", "work/trace.tmp.npz", "work/snapshots/x", "checkpoints/3/state", "demonstrator/policy_1.npz"):
+    (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+    (tmp_path / name).write_text("")
+  assert claim(tmp_path, resume=True) == "new" and claim(tmp_path, overwrite=True) == "new"
+
+
+def test_claim_refuses_an_empty_name():
+  with pytest.raises(UserError, match="empty name"):
+    claim("")
+
+
+@pytest.mark.parametrize("text, says", [("{", "broken"), ("", "broken"), ("[1]", "list"), ("null", "NoneType"), (None, "No such file")])
+def test_json_that_is_no_object_is_one_line(tmp_path, text, says):
+  if text is not None:
+    (tmp_path / "x.json").write_text(text)
+  with pytest.raises(FileError) as error:
+    store.read_json(tmp_path / "x.json")
+  assert says in one_line(error) and "x.json" in one_line(error)
+
+
+def test_a_folder_is_probed_before_what_goes_there_is_computed(tmp_path):
+  store.probe(tmp_path / "a/b")
+  assert list((tmp_path / "a/b").iterdir()) == []
+  (tmp_path / "file").write_text("")
+  with pytest.raises(UserError, match="is a file"):
+    store.probe(tmp_path / "file")
+  with pytest.raises(FileError, match="another --out"):
+    store.probe(tmp_path / "file/below")
 
 
 def test_claim_refuses_a_file_and_both_flags(tmp_path):

@@ -236,8 +236,33 @@ def test_a_training_is_resumed_with_its_own_settings(begun, capsys):
 
 
 def test_resume_without_a_checkpoint(short_walker, tmp_path):
+  """One that was killed before its first checkpoint begins anew: as a fresh one, with the agent that it was to start from."""
   with pytest.raises(FileError, match="no checkpoint"):
     make_trainer(short_walker, tmp_path).resume()
+  build = lambda resume: train.build(short_walker, DREAMER, TrainConfig(envs=4, updates=8, ratio=1.0, capacity=64), tmp_path / "cut", 3, 1, None, None, "tiny", "", resume)
+  first = build(False)
+  again = build(True)
+  assert again.updates == 0 and json.loads((tmp_path / "cut/config.json").read_text())["seed"] == 3
+  assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(first.state.train), jax.tree.leaves(again.state.train)))
+
+
+def test_a_second_signal_saves_no_half_of_a_chunk(tmp_path):
+  """The first interrupt lets the chunk end and saves; one more, in the middle of it, leaves nothing whole to save."""
+  notes = []
+
+  class Half:
+    done = False
+
+    def step(self):
+      notes.append("step")
+      if len(notes) == 2:
+        raise KeyboardInterrupt  # as the second signal does
+
+    def save(self):
+      notes.append("save")
+  with pytest.raises(KeyboardInterrupt):
+    train.run(Half())
+  assert notes == ["step", "step"]
 
 
 # ---- train ratio -----------------------------------------------------------------------------------------------------------------

@@ -4,10 +4,12 @@ from __future__ import annotations
 import functools
 import inspect
 import json
+import numbers
 import pathlib
 from typing import NamedTuple
 
 import jax
+import numpy as np
 
 from mjx_cl.detectors import combine
 from mjx_cl.detectors import references
@@ -101,10 +103,17 @@ def calibrated(name: str, robot: str, settings: dict) -> Threshold | None:
   None where a threshold is among the settings, or the board has no such robot or no detector that is set so. PAPER's have figures of their own.
   """
   use, channel = split(name)
+  _check_channel(name, channel)
+  _check_channel(name, settings.get("channel"))
   rows = [row for row in board().get(robot, {}).values() if row["settings"]["use"] == use]
   own = _told(use, {"channel": channel or settings.get("channel")} | {k: v for k, v in settings.items() if k != "channel"}) if rows else None
   return next((Threshold(row["threshold"], row["arl0"], row["alarms"]) for row in rows
                if own == _told(use, {k: v for k, v in row["settings"].items() if k != "use"})), None)
+
+
+def _check_channel(name: str, channel) -> None:
+  if channel is not None and not (channel and isinstance(channel, str)):
+    raise UserError(f"detector {name!r}: {channel!r} is no channel; choose from: {combine.NAMES}")
 
 
 def _told(use: str, settings: dict) -> dict:
@@ -161,6 +170,27 @@ def factory(name: str):
   return choose("detector", split(name)[0], DETECTORS)
 
 
+KINDS = {"int": numbers.Integral, "float": numbers.Real, "bool": bool, "None": type(None)}
+WORDS = {"int": "a whole number", "float": "a number", "bool": "true or false", "None": "none"}
+
+
+def check_kinds(name: str, settings: dict, *builds) -> None:
+  """Refuses a setting of another kind than its annotation in one of `builds` says, before a program is traced with it. What is annotated otherwise passes, and so
+  do numbers of JAX.
+
+  Raises:
+    UserError that names the setting and what it takes.
+  """
+  known = {p.name: getattr(p.annotation, "__name__", str(p.annotation)) for build in builds for p in inspect.signature(build).parameters.values() if p.annotation is not p.empty}
+  for key, value in settings.items():
+    words = [word.strip() for word in known.get(key, "").split("|")]
+    if isinstance(value, jax.Array) or not all(word in KINDS for word in words):
+      continue
+    kinds = tuple(KINDS[word] for word in words)
+    if not isinstance(value, kinds) or isinstance(value, (bool, np.bool_)) and bool not in kinds:
+      raise UserError(f"detector {name!r}: {key} takes {' or '.join(WORDS[word] for word in words)}; got {value!r}")
+
+
 def make(name: str, channel: str | None = None, log: bool | None = None, whiten: int = 0, patience: int = 1, cool_down: int = 0,
          robot: str | None = None, shared: bool = False, **settings) -> Detector:
   """Builds detector `name`, a map over monitor.Residual. Unknown settings are refused.
@@ -180,7 +210,11 @@ def make(name: str, channel: str | None = None, log: bool | None = None, whiten:
     shared: `rolling_sigma` has one threshold for both residuals, see `one_threshold`.
   """
   name, own = split(name)
+  _check_channel(name, own)
+  _check_channel(name, channel)
   build, channel = factory(name), own or channel
+  more = (paper_rule, rolling_sigma) if build in (calibrated_rule, paper_rule) else ()
+  check_kinds(name, {**settings, "log": log, "whiten": whiten, "patience": patience, "cool_down": cool_down}, *more, build, make)
   if ":" in name:
     build = _pure(name, build)
   if name == "rolling_sigma":
