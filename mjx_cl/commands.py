@@ -251,7 +251,8 @@ def do_leaderboard(args: Leaderboard) -> None:
     files = submissions.export(held, args.export, robots, args.overwrite)
     emit(files) if args.json else print("\n".join(files))
     return
-  store.probe(args.out)  # before minutes are spent
+  if os.path.exists(args.out) and not os.path.isdir(args.out):
+    raise UserError(f"--out {args.out} is a file")
   if os.path.exists(os.path.join(args.out, "leaderboard.json")) and not args.overwrite:
     raise UserError(f"{args.out} holds a leaderboard; give --overwrite to replace it, or another --out")
   known, extra = leaderboard.variants(), []
@@ -278,6 +279,7 @@ def do_leaderboard(args: Leaderboard) -> None:
     if time.monotonic() - told[0] > 2 or done == total:
       told[0] = time.monotonic()
       say(f"{done}/{total}  {robot}: {name}, {clock(seconds)} gone, {clock(seconds / done * (total - done))} left")
+  store.probe(args.out)  # before minutes are spent
   board = leaderboard.score(held, entries, robots, extra, progress)
   meta = {"command": "mjx-cl " + " ".join(sys.argv[1:]), "seeds": {k: list(v) for k, v in held.suite.seeds.items()}, "arl0_target": held.suite.arl0,
           "streams": held.config.get("command"), **({"kept": {r: v.get("command") for r, v in held.config["kept"].items()}} if "kept" in held.config else {}),

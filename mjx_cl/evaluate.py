@@ -22,19 +22,24 @@ def evaluate(env, agent, params, episodes: int, seed: int = 0, repeat: int = 1, 
   fault = faults.make("none", env)
   rollout = Rollout(env, agent, fault, repeat, deterministic)
   total, steps, sums, ended = live(env, rollout, agent, params, episodes, seed)
-  out = {"episodes": episodes, "return_mean": float(total.mean()), "return_iqm": float(bootstrap.iqm(total)), "return_ci": bootstrap.interval(total),
-         "terminations": int(ended.sum()), "returns": [round(float(x), 2) for x in total]}
-  for name, value in sums.items():  # a mean over steps, so that a short episode counts for little; drawn anew by episodes
+  counted = lambda name, hits: {name: int(hits.sum()), name + "_ci": (p := bootstrap.wilson(int(hits.sum()), episodes)) and [x * episodes for x in p]}
+
+  def per_step(name, value, steps):
+    """A mean over steps, so that a short episode counts for little; drawn anew by episodes."""
     over = lambda drawn, axis: value[drawn.astype(int)].sum(axis) / np.maximum(1, steps[drawn.astype(int)].sum(axis))
-    out |= {name: float(value.sum() / max(1, steps.sum())), name + "_ci": bootstrap.interval(np.arange(episodes), over)}
+    return {name: float(value.sum() / max(1, steps.sum())), name + "_ci": bootstrap.interval(np.arange(episodes), over)}
+  out = {"episodes": episodes, "return_mean": float(total.mean()), "return_iqm": float(bootstrap.iqm(total)), "return_ci": bootstrap.interval(total),
+         **counted("terminations", ended), "returns": [round(float(x), 2) for x in total]}
+  for name, value in sums.items():
+    out |= per_step(name, value, steps)
   rate = getattr(env, "termination_rate", None)
   if rate:
     out |= {rate: float(ended.mean()), rate + "_ci": bootstrap.wilson(int(ended.sum()), episodes)}
   if hasattr(env, "reference"):
     driver = Rollout(env, agent, fault, repeat, expert=lambda stream: env.reference(stream.env))
     reference, steps, sums, ended = live(env, driver, agent, params, episodes, seed, drive=True)
-    out |= {"reference_return": float(reference.mean()), "reference_speed_m_s": float(sums["mean_speed_m_s"].sum() / steps.sum()),
-            "reference_collisions": int(ended.sum())}
+    out |= {"reference_return": float(reference.mean()), "reference_return_ci": bootstrap.interval(reference, np.mean),
+            **per_step("reference_speed_m_s", sums["mean_speed_m_s"], steps), **counted("reference_collisions", ended)}
   return out
 
 

@@ -61,8 +61,9 @@ THIRD = (1.0 - 1.0 / 3.0) / 0.95       # severity of velocity_limit that leaves 
 SOCKS_GRIP = 0.575                     # coefficient left under the rear wheels, of 0.65: a car that has adapted loses a fifth of its reward, results/socks.json
 SOCKS = (1.0 - SOCKS_GRIP / 0.65) / 0.95
 SOCKS_AFTER = 42_000                   # control steps, 35 minutes
-LEVELS = {"easy": (1, 0.1, 0.01), "medium": (2, 0.3, 0.05), "hard": (3, 1.0, 0.1)}  # thirds of 9 steps of delay, deviation, probability
-THERE = {"easy": (10, 1, 1), "medium": (20, 5, 2), "hard": (40, 10, 3)}  # the suite's delay of the reward, length of a loss, of an action
+# thirds of 9 steps of delay; deviation; severity of a burst, probability that it begins and control steps that it lasts
+LEVELS = {"easy": (1, 0.1, 0.1, 0.01, 1), "medium": (2, 0.3, 0.5, 0.05, 5), "hard": (3, 1.0, 1.0, 0.1, 10)}
+THERE = {"easy": (10, 1), "medium": (20, 2), "hard": (40, 3)}  # the suite's delay of the reward, length of an action
 
 PRESETS: dict[str, Preset] = {
     "walker/gear-half": Preset("walker", (Change("gear", None, 0.5),), "one random joint's gear ratio halved", "the paper, walker"),
@@ -76,25 +77,25 @@ PRESETS: dict[str, Preset] = {
     "car/socks": Preset("car_real", (Change("friction", "rear", SOCKS),), f"socks on the rear wheels: friction {SOCKS_GRIP} in place of 0.65",
                         "the paper, race car; chosen to cost the paper's 20 % of reward, no figure of a sock was found"),
 }
-for _level, (_thirds, _deviation, _probability) in LEVELS.items():
+for _level, (_thirds, _deviation, _burst, _probability, _lasts) in LEVELS.items():
   _rwrl = f"realworldrl_suite, level {_level}"
-  _reward, _lasts, _repeats = THERE[_level]
-  _once = "each for one control step" + f" (there: {_lasts})" * (_lasts > 1)
-  _beyond = f"; of the suite's combined challenge they leave out dummy channels, changed lengths, the reward's delay ({_reward} control steps)" + (
-      f", repeated actions (each for {_repeats}) and that a lost or stuck reading lasts ({_lasts})" if _lasts > 1 else "")
+  _reward, _repeats = THERE[_level]
+  _once = f"each for {_lasts} control step{'s' * (_lasts > 1)}"
+  _beyond = "; of the suite's combined challenge they leave out dummy channels, changed lengths" + (", repeated actions (each for {0}) and the reward's delay ({1} control steps)".format(
+      _repeats, _reward) if _repeats > 1 else f" and the reward's delay ({_reward} control steps)")
   PRESETS |= {
       f"any/observation-delay-{_level}": Preset("*", (Change("delay", "all", _thirds / 3),), f"observations {3 * _thirds} control steps late", _rwrl),
       f"any/action-delay-{_level}": Preset("*", (Change("command_delay", "all", _thirds / 3),), f"commands {3 * _thirds} control steps late", _rwrl),
       f"any/observation-noise-{_level}": Preset("*", (Change("noise", "all", _deviation),),
                                                 f"Gaussian noise of {_deviation:g} typical deviations (there: of raw units)", _rwrl),
       f"any/action-noise-{_level}": Preset("*", (Change("command_noise", "all", _deviation),), f"Gaussian noise of {_deviation:g} on commands", _rwrl),
-      f"any/observation-dropout-{_level}": Preset("*", (Change("dropout", "all", 2 * _probability),),
+      f"any/observation-dropout-{_level}": Preset("*", (Change("dropout_burst", "all", _burst),),
                                                   f"readings lost with probability {_probability:g}, {_once}", _rwrl),
-      f"any/observation-stuck-{_level}": Preset("*", (Change("freeze", "all", _probability),),
+      f"any/observation-stuck-{_level}": Preset("*", (Change("freeze_burst", "all", _burst),),
                                                 f"readings held with probability {_probability:g}, {_once}", _rwrl),
       f"any/all-{_level}": Preset("*", tuple(Change(f, "all", s) for f, s in (
-          ("delay", _thirds / 3), ("command_delay", _thirds / 3), ("noise", _deviation), ("command_noise", _deviation), ("dropout", 2 * _probability),
-          ("freeze", _probability))), f"all of these at once{_beyond}", _rwrl),
+          ("delay", _thirds / 3), ("command_delay", _thirds / 3), ("noise", _deviation), ("command_noise", _deviation), ("dropout_burst", _burst),
+          ("freeze_burst", _burst))), f"all of these at once{_beyond}", _rwrl),
   }
 for _level, _damping, _grip in (("easy", 0.05, 0.2), ("medium", 0.25, 0.5), ("hard", 1.0, 1.0)):
   PRESETS |= {

@@ -40,6 +40,7 @@ def test_figures_are_those_of_single_episodes(case):
   hand = [by_hand(env, agent, params, seed, plain) for seed in (5, 6)]
   np.testing.assert_allclose(got["returns"], [h[0] for h in hand], atol=0.02)  # rounded to 0.01
   assert got["terminations"] == sum(h[2] for h in hand) and got["episodes"] == 2
+  assert {k for k in got if not k.endswith("_ci") and k + "_ci" not in got} == {"episodes", "returns", "return_mean", "return_iqm"}  # these two: return_ci
   if env.spec.name == "walker":
     assert "mean_speed_m_s" not in got
     return

@@ -81,7 +81,7 @@ def test_delays_of_the_levels_are_3_6_9_steps():
 
 def test_run_takes_a_preset_and_refuses_what_contradicts_it():
   c = RunConfig("walker", fault="any/all-easy", duration=50)
-  assert [x.fault for x in config.changes(c)] == ["delay", "command_delay", "noise", "command_noise", "dropout", "freeze"]
+  assert [x.fault for x in config.changes(c)] == ["delay", "command_delay", "noise", "command_noise", "dropout_burst", "freeze_burst"]
   assert all(x.duration == 50 for x in config.changes(c))
   assert config.changes(RunConfig("walker"))[0] == Change("gear", None, 0.5)
   assert config.changes(RunConfig("walker", severity=0.25, schedule="ramp", period=9))[0] == Change("gear", None, 0.25, schedule="ramp", period=9)
@@ -111,3 +111,38 @@ def test_a_robot_of_ones_own_takes_presets_of_shipped_ones():
   for robot in {p.robot for p in PRESETS.values()} - {"*", "walker"}:  # among shipped robots each has its own
     with pytest.raises(UserError, match=f"is of robot 'walker', not of '{robot}'"):
       fault_presets.find("walker/gear-half", robot)
+
+
+@pytest.mark.parametrize("level, chance, steps", [("easy", 0.01, 1), ("medium", 0.05, 5), ("hard", 0.1, 10)])
+@pytest.mark.parametrize("kind, fault", [("dropout", "dropout_burst"), ("stuck", "freeze_burst")])
+def test_lost_and_stuck_readings_are_those_of_realworldrl_suite(kind, fault, level, chance, steps):
+  """Probability and length of the suite's levels (facts 4.5), against a loop by hand with the same draws: 500 steps of a walker's 24 readings, an episode's start among them."""
+  import jax
+  import jax.numpy as jnp
+  from mjx_cl import envs, faults
+  (change,) = fault_presets.resolve("walker", f"any/observation-{kind}-{level}")
+  assert (change.fault, change.target) == (fault, "all")
+  env = envs.make("walker")
+  made, length, size = faults.make(fault, env), 500, len(env.spec.obs)
+  keys, starts = jax.random.split(jax.random.key(3), length), np.isin(np.arange(length), (0, 300))
+  readings = np.random.default_rng(0).normal(size=(length, size)).astype(np.float32)
+
+  def step(state, x):
+    key, obs, first = x
+    state, ports = made.apply(state, jnp.float32(change.severity), key, faults.Ports(env.model, obs=obs, first=first))
+    return state, ports.obs
+  got = np.asarray(jax.jit(lambda xs: jax.lax.scan(step, made.init(jax.random.key(0), made.targets.index("all")), xs)[1])((keys, readings, starts)))
+  draws = np.asarray(jax.vmap(lambda key: jax.random.uniform(key, (size,)))(keys))
+  begun, left, held = 0, np.zeros(size, int), np.zeros(size, np.float32)
+  for t in range(length):
+    if starts[t]:
+      left[:] = 0
+    new = (left == 0) & (draws[t] < np.float32(chance))
+    if kind == "stuck" and starts[t]:
+      new[:] = False  # nothing to hold yet
+    left[new] = steps
+    begun += int(new.sum())
+    want = np.where(left > 0, 0.0 if kind == "dropout" else held, readings[t]).astype(np.float32)
+    np.testing.assert_array_equal(got[t], want)
+    held, left = want, np.maximum(left - 1, 0)
+  assert begun > 50  # it was put to the test

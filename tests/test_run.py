@@ -265,7 +265,7 @@ def test_a_preset_of_several_faults_ends_in_all_files(saved, tmp_path):
   summary = run.execute(config, tmp_path / "out")
   assert summary["fault"] == "any/all-easy" and summary["severity"] == pytest.approx(1 / 3)
   e = table(tmp_path / "out", "events")
-  names = ["delay", "command_delay", "noise", "command_noise", "dropout", "freeze"]
+  names = ["delay", "command_delay", "noise", "command_noise", "dropout_burst", "freeze_burst"]
   onsets = [(s, r.split(",")[0]) for s, k, r in zip(e["step"], e["kind"], e["reason"]) if k == "onset"]
   assert onsets == [(40, n) for n in names]
   assert [(s, r) for s, k, r in zip(e["step"], e["kind"], e["reason"]) if k == "repair"] == [(70, f"{n}, after 30 steps") for n in names]

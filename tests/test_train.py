@@ -239,7 +239,7 @@ def test_resume_without_a_checkpoint(short_walker, tmp_path):
   """One that was killed before its first checkpoint begins anew: as a fresh one, with the agent that it was to start from."""
   with pytest.raises(FileError, match="no checkpoint"):
     make_trainer(short_walker, tmp_path).resume()
-  build = lambda resume: train.build(short_walker, DREAMER, TrainConfig(envs=4, updates=8, ratio=1.0, capacity=64), tmp_path / "cut", 3, 1, None, None, "tiny", "", resume)
+  build = lambda resume: train.build(short_walker, DREAMER, TrainConfig(envs=4, updates=8, ratio=1.0, capacity=128), tmp_path / "cut", 3, 1, None, None, "tiny", "", resume)
   first = build(False)
   again = build(True)
   assert again.updates == 0 and json.loads((tmp_path / "cut/config.json").read_text())["seed"] == 3

@@ -12,6 +12,7 @@ from mjx_cl.errors import UserError
 from mjx_cl.faults.base import Fault, channel_targets, fault
 
 MOST_DELAY = 9        # control steps at severity 1
+BURST = (0.1, 10)     # at severity 1: probability that one begins, control steps that it lasts; the hard level of realworldrl_suite
 DRIFT_STEPS = 2000    # control steps until a drift is complete
 
 
@@ -68,8 +69,7 @@ def noise(env) -> Fault:
 def dropout(env) -> Fault:
   """A reading is lost now and then: 0 in its place.   P(x_i' = 0) = 0.5 severity, each channel and step alone
 
-  A loss lasts one control step. realworldrl_suite's lasts 5 at its medium level (probability 0.05) and 10 at its hard one (0.1), so that more is lost
-  there at the same probability.
+  A loss lasts one control step; those of `dropout_burst` last longer.
 
   Severity: 1 loses every other reading [probability]; realworldrl_suite has 0.01, 0.05, 0.1. Target: a group of channels (drawn), all,
   or one channel. Owns `obs`. Not visible to: a channel that reads 0. Source: dropped observations of realworldrl_suite, facts 4.5.
@@ -81,8 +81,7 @@ def dropout(env) -> Fault:
 def freeze(env) -> Fault:
   """A reading stands still: it is not renewed.   P(x_i'(t) = x_i'(t - 1)) = severity, each channel and step alone
 
-  A draw holds for one control step; a reading stands for longer only where draws repeat it. realworldrl_suite's stuck sensors stand for 5 at its medium
-  level (probability 0.05) and for 10 at its hard one (0.1).
+  A draw holds for one control step; a reading stands for longer only where draws repeat it, in `freeze_burst` for a while at once.
 
   Severity: how likely a reading is held for another step [probability]; 1 holds it for ever. Target: a group of channels (drawn), all, or one channel.
   Owns `obs`. Memory: the last reading; an episode's start renews it. Not visible to: a channel that does not change. Source: stuck sensors of
@@ -93,6 +92,42 @@ def freeze(env) -> Fault:
     value = jnp.where(hold, held, ports.obs)
     return value, value
   return _sensor("freeze", env, change, jnp.zeros(len(env.spec.obs)))
+
+
+def _burst(left, severity, key, ports):
+  """Control steps (O,) that the burst of each channel still lasts, this one included; a new one may begin where none is under way."""
+  begins = jax.random.uniform(key, ports.obs.shape) < BURST[0] * severity
+  lasts = jnp.maximum(1, jnp.ceil(BURST[1] * severity - 1e-4).astype(jnp.int32))  # 0.1, 0.5, 1 are 1, 5, 10, whatever float32 makes of them
+  left = jnp.where(ports.first, 0, left)
+  return jnp.where(left > 0, left, jnp.where(begins, lasts, 0))
+
+
+def dropout_burst(env) -> Fault:
+  """A reading is lost now and then for a while: 0 in its place.   A burst begins with P = 0.1 severity, each channel alone, and lasts ceil(10 severity) control steps
+
+  Severity: 0.1, 0.5, 1 are realworldrl_suite's easy, medium and hard: probability 0.01, 0.05, 0.1 [1], length 1, 5, 10 [control steps]. Target: a group of channels
+  (drawn), all, or one channel. Owns `obs`. Memory: how long a burst still lasts; an episode's start ends it. Not visible to: a channel that reads 0. Source: dropped
+  observations of realworldrl_suite, facts 4.5.
+  """
+  def change(left, severity, key, ports, _):
+    left = _burst(left, severity, key, ports)
+    return jnp.maximum(left - 1, 0), jnp.where(left > 0, 0.0, ports.obs)
+  return _sensor("dropout_burst", env, change, jnp.zeros(len(env.spec.obs), jnp.int32))
+
+
+def freeze_burst(env) -> Fault:
+  """A reading stands still now and then for a while.   A burst begins with P = 0.1 severity, each channel alone, and holds the last reading for ceil(10 severity) control steps
+
+  Severity: 0.1, 0.5, 1 are realworldrl_suite's easy, medium and hard: probability 0.01, 0.05, 0.1 [1], length 1, 5, 10 [control steps]. Target: a group of channels
+  (drawn), all, or one channel. Owns `obs`. Memory: the last reading and how long it is still held; an episode's start renews it. Not visible to: a channel that does
+  not change. Source: stuck sensors of realworldrl_suite, facts 4.5.
+  """
+  def change(memory, severity, key, ports, _):
+    left, held = memory
+    left = jnp.where(jnp.asarray(ports.first), 0, _burst(left, severity, key, ports))
+    value = jnp.where(left > 0, held, ports.obs)
+    return (jnp.maximum(left - 1, 0), value), value
+  return _sensor("freeze_burst", env, change, (jnp.zeros(len(env.spec.obs), jnp.int32), jnp.zeros(len(env.spec.obs))))
 
 
 def delay(env) -> Fault:
@@ -125,4 +160,5 @@ def lidar_loss(env) -> Fault:
   return fault("lidar_loss", env, ("obs",), [name for name, _ in beams], act, rows=rank)
 
 
-SENSOR = {"bias": bias, "drift": drift, "scale": scale, "noise": noise, "dropout": dropout, "freeze": freeze, "delay": delay, "lidar_loss": lidar_loss}
+SENSOR = {"bias": bias, "drift": drift, "scale": scale, "noise": noise, "dropout": dropout, "freeze": freeze, "dropout_burst": dropout_burst,
+          "freeze_burst": freeze_burst, "delay": delay, "lidar_loss": lidar_loss}
