@@ -421,8 +421,10 @@ def attempt(do, again=lambda: "") -> int:
   try:
     return _attempt(do, again)
   finally:
-    if sys.stderr._stream is before:
+    if getattr(sys.stderr, "_stream", None) is before:
       sys.stderr = before
+    if signal.getsignal(signal.SIGINT) is stop:
+      signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def _attempt(do, again) -> int:

@@ -194,10 +194,7 @@ class Ledger(NamedTuple):
     out = {"env": self.config.env, "fault": self.config.fault, "severity": severity, "onset": self.config.onset, "steps": self.config.steps,
            "detector": self.config.detector}
     out |= by_arm(rows, self.config, self.spec.control_s)
-    known = trace["valid"][15 * self.repeat:][self.repeat - 1::self.repeat]
-    each = 1.0 - known.mean(0) if len(known) else []  # of each stream
-    out["invalid_share"] = float(np.mean(each)) if len(each) else None
-    out["invalid_share_ci"] = bootstrap.interval(each, np.mean) if len(each) else None
+    out["invalid_share"], out["invalid_share_ci"] = invalid(trace["valid"], self.repeat)
     wall = sum(seconds.values())
     quiet = float(np.median(quiet)) if quiet else 0.0
     monitor = min(seconds["digest"], quiet * max(1, chunks - 1))
@@ -207,6 +204,13 @@ class Ledger(NamedTuple):
     out["wall_s_arms"] = {arm: float(sum(r["wall_s"] or 0.0 for r in rows if r["arm"] == arm)) for arm in out["arms"]}
     out["wall_share"] = {k: v / wall for k, v in shares.items()}
     return out
+
+
+def invalid(valid: np.ndarray, repeat: int) -> tuple[float | None, list | None]:
+  """Share of the decisions whose residuals are not known, the first 15 apart, and its interval over streams; None for shorter runs. valid: bool (control steps, groups)."""
+  known = valid[15 * repeat:][repeat - 1::repeat]
+  each = 1.0 - known.mean(0) if len(known) else []
+  return (float(np.mean(each)), bootstrap.interval(each, np.mean)) if len(each) else (None, None)
 
 
 def set_apart(rows: list[dict], events: list[dict]) -> list[dict]:

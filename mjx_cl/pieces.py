@@ -17,7 +17,7 @@ ORDER = {"trace": "step", "events": "step", "runs": "change", "signals": "step",
 KEPT = ("git_commit", "machine", "python", "versions")
 SAME = ("physics", "agent_card", "repeat", "control_s")  # of config.json, beside the settings: one agent and one backend lived all the seeds
 
-SUMMED = ("env", "fault", "severity", "onset", "steps", "detector", "invalid_share", "invalid_share_ci", "wall_s", "wall_s_arms", "wall_share")  # what `join` takes from summary.json
+SUMMED = ("env", "fault", "severity", "onset", "steps", "detector", "invalid_share", "wall_s", "wall_s_arms", "wall_share")  # what `join` takes from summary.json
 
 
 def seeds_of(folder, config: RunConfig) -> list[int] | None:
@@ -112,7 +112,10 @@ def join(folders, out, config: RunConfig) -> dict:
   spec = envs.make(config.env).spec
   value = {k: summaries[0][k] for k in SUMMED[:6]}
   value |= ledger.by_arm(runs, config, spec.control_s)
-  value |= {"invalid_share": mean(*zip(*invalid)) if invalid else None, "invalid_share_ci": None, "wall_s": float(sum(wall)),
+  interval = None  # of streams, so it needs their trace
+  if "trace" in rows:
+    interval = ledger.invalid(rows["trace"]["valid"].to_numpy(zero_copy_only=False).reshape(len(number), -1).T, int(configs[0]["repeat"]))[1]
+  value |= {"invalid_share": mean(*zip(*invalid)) if invalid else None, "invalid_share_ci": interval, "wall_s": float(sum(wall)),
             "wall_s_arms": {arm: float(sum(s["wall_s_arms"][arm] for s in summaries)) for arm in summaries[0]["wall_s_arms"]},
             "wall_share": {k: mean([s["wall_share"][k] for s in summaries], wall) for k in summaries[0]["wall_share"]}}
   if "stop" in rows:

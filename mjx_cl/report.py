@@ -511,6 +511,29 @@ def study(results: pathlib.Path) -> str:
   return text + "\n\n" + grid(("severity", "train ratio", "seeds", "recovered", "restricted mean [steps]", "normalised recovery", "updates"), rows)
 
 
+def sizes(results: pathlib.Path) -> str:
+  """Recovery against the model's size from a known onset."""
+  folder, rows = results / "size", []
+  plan, entries = load(folder / "suite.json")["parts"], load(folder / "bench.json")["entries"]
+  for part in (p for p in plan if p in entries):
+    card, own, entry = load(folder / part / "config.json")["agent_card"], entries[part]["arms"], entries[part]
+    (arm,) = (name for name in own if name != "none")
+    back, worth = entry["scores"]["recovery"][arm], (entry["scores"]["normalised"] or {}).get(arm)
+    healthy, lived = card["eval"], own[arm]
+    rows.append((f"`{card['dreamer']['size']}`", number(card["updates"]), f"{number(healthy['return_iqm'])} {span(healthy['return_ci'])}", f"{plan[part]['adapt']['ratio']:g}", str(lived["seeds"]),
+                 f"{back['recovered']} of {back['n']}" if back else "none affected", both(back, "restricted_mean_steps") if back else "-",
+                 few(worth, "normalised", worth["seeds"], 2) if worth and worth["seeds"] else "-", both(lived, "reward_pre", 2), both(own["none"], "reward_final", 2),
+                 both(lived, "reward_final", 2), number(lived["updates_mean"])))
+  one = plan[part]
+  gone = joined([f"`{part}`" for part in plan if part not in entries]) if len(entries) < len(plan) else ""
+  text = fill(f"""
+      Finetuning from the true onset for {number(one['steps'] - one['onset'])} steps ({one['env']}, {one['fault']}, {one['target']}, severity {one['severity']:g}), one agent of each size. Updates and healthy
+      return (interquartile mean of {healthy['episodes']} episodes) of its training; affected streams that recover, restricted mean time to recovery, normalised recovery over the last 2,000 steps (0: no
+      adaptation, 1: the reward before onset); reward a step before the onset, and over the last 2,000 steps without adaptation and with it (interquartile means of all streams); updates a stream.
+      {FEW if any(" to " in cell for row in rows for cell in row) else ""} {f"Not run yet: {gone}." if gone else ""}""")
+  return text + "\n\n" + grid(("size", "training", "healthy return", "train ratio", "seeds", "recovered", "restricted mean [steps]", "normalised recovery", "reward before", "at the end, `none`", "at the end", "updates"), rows)
+
+
 def full(results: pathlib.Path) -> str:
   """Fault by fault what the method does, of the finished parts of suite `full`, and how complete it is."""
   from mjx_cl.scoring import bootstrap
@@ -678,7 +701,7 @@ def ppo(results: pathlib.Path) -> str:
 
 BLOCKS = {"run-walker": run_walker, "arl0": arl0, "leaderboard": leaderboard, "leaderboard-100k": leaderboard_100k, "physics": physics, "dreamer": dreamer, "agents": agents,
           "detectors": detectors, "paper": experiments, "arms": arms,
-          "other-arms": other_arms, "stop-rule": stop_rule, "again": again, "study": study, "full": full, "in-loop": in_loop, "two-agents": two_agents, "gradient": gradient, "quadruped": quadruped, "ppo": ppo}
+          "other-arms": other_arms, "stop-rule": stop_rule, "again": again, "study": study, "size": sizes, "full": full, "in-loop": in_loop, "two-agents": two_agents, "gradient": gradient, "quadruped": quadruped, "ppo": ppo}
 
 
 def catalogue(results: pathlib.Path) -> str:

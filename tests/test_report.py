@@ -36,6 +36,7 @@ SOURCES = {
     "stop-rule": ("stop/bench.json",),
     "again": ("again/bench.json",),
     "study": ("study/bench.json", "study/suite.json", "study/bench.parquet"),
+    "size": ("size/bench.json", "size/suite.json", "size/less/config.json"),
     "full": ("full/bench.json", "full/suite.json", "full/bench.parquet"),
     "in-loop": ("loop/bench.json", "loop/suite.json", *(f"loop/{part}/{file}.parquet" for part in ("walker/detector=ewma", "walker/detector=cusum@surprise") for file in ("runs", "events"))),
     "two-agents": ("walker_gear/summary.json", "walker_plain/summary.json"),
@@ -70,7 +71,7 @@ def write(path, rows):
 def results(tmp_path):
   """A copy of results/ in which no file of any block is missing: the experiments of the paper are the walker's run, the car's with two changes."""
   out = tmp_path / "results"
-  shutil.copytree(RESULTS, out, ignore=shutil.ignore_patterns("*.png", "*.html", "paper", "arms", "stop", "again", "study", "full", "loop", "detectors*.json", "policy_gradient.json"))
+  shutil.copytree(RESULTS, out, ignore=shutil.ignore_patterns("*.png", "*.html", "paper", "arms", "stop", "again", "study", "size", "full", "loop", "detectors*.json", "policy_gradient.json"))
   rows = [{"name": "cusum: 1000 streams", "value": 0.4567, "unit": "s", "goal": "<= 1", "holds": True},
           {"name": "adwin: 1000 streams", "value": 23.4, "unit": "s", "goal": "<= 20", "holds": False},
           {"name": "ewma: a sample", "value": 1234.5, "unit": "ns", "goal": None, "holds": None}]
@@ -109,6 +110,11 @@ def results(tmp_path):
            for name, factor in (("walker", 1.0), ("less", 0.8)) for r in runs]
   write(out / "study/bench.parquet", lived)
   (out / "study/bench.json").write_text(json.dumps({"suite": "study", "parts": 2, "finished": 2, "entries": {"walker": entry, "less": entry}}))
+  (out / "size/less").mkdir(parents=True)
+  shutil.copy(out / "walker_gear/config.json", out / "size/less")
+  one = part | {"adapt": {"ratio": 9.0}, "onset": 321, "steps": 7654, "target": "left_toe"}
+  (out / "size/suite.json").write_text(json.dumps({"suite": "size", "parts": {"less": one, "more": one}}))
+  (out / "size/bench.json").write_text(json.dumps({"suite": "size", "parts": 2, "finished": 1, "entries": {"less": entry}}))
   (out / "full").mkdir()
   plan = {"walker": part | {"fault": "gear"}, "other": part | {"fault": "walker/damping-easy"}, "car": part | {"env": "car"}}
   (out / "full/suite.json").write_text(json.dumps({"suite": "full", "parts": {k: v | {"first_seed": 31, "seeds": 10} for k, v in plan.items()}}))
@@ -318,6 +324,7 @@ CONSTANTS = {  # what a block says of itself: windows of the definitions, sizes 
     "stop-rule": {"95", "1", "768", "1,536", "3,072"},
     "again": {"95", "2,000"},
     "study": {"1", "2,000"},
+    "size": {"1", "2,000", "20"},
     "full": {"95", "500", "2,000", "1", "2", "3"},
     "in-loop": {"95", "500", "2,000", "10,000", "1", "2", "3"},
     "two-agents": {"95", "500", "10,000", "2,000"},

@@ -489,7 +489,7 @@ def test_the_policy_is_held_at_the_start_of_the_pure_phase(short_walker, tmp_pat
     trainer.step()
   before = np.cumsum([0] + [n for n, _ in learn.calls])[:-1]
   assert [w.policy for _, w in learn.calls] == [float(u >= 20) for u in before] and before[-1] > 20
-  with pytest.raises(UserError, match="hold must be 0 or above"):
+  with pytest.raises(UserError, match="hold must be a whole number in 0"):
     TrainConfig(hold=-1)
   with pytest.raises(UserError, match="anchor must be 0 or above"):
     replace(DREAMER, anchor=-0.5)
