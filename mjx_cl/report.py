@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 from mjx_cl import fault_presets, paper, store
 from mjx_cl.config import CHUNK
+from mjx_cl.dreamer.sizes import SIZES
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.paper import number, span
 
@@ -515,16 +516,20 @@ def sizes(results: pathlib.Path) -> str:
   """Recovery against the model's size from a known onset."""
   folder, rows = results / "size", []
   plan, entries = load(folder / "suite.json")["parts"], load(folder / "bench.json")["entries"]
-  for part in (p for p in plan if p in entries):
-    card, own, entry = load(folder / part / "config.json")["agent_card"], entries[part]["arms"], entries[part]
+  done = [(folder, part, plan[part], entries[part]) for part in plan if part in entries]
+  others, lived_there, alike = load(results / "study" / "suite.json")["parts"], load(results / "study" / "bench.json")["entries"], ("env", "fault", "target", "severity", "onset", "steps")
+  for part, one in others.items():  # the study's own, with the shipped agent
+    if part in lived_there and any([one.get(k) for k in alike] == [p.get(k) for k in alike] and one["adapt"]["ratio"] == p["adapt"]["ratio"] for *_, p, _ in done):
+      done.append((results / "study", part, one, lived_there[part]))
+  for where, part, one, entry in sorted(done, key=lambda x: list(SIZES).index(load(x[0] / x[1] / "config.json")["agent_card"]["dreamer"]["size"])):
+    card, own = load(where / part / "config.json")["agent_card"], entry["arms"]
     (arm,) = (name for name in own if name != "none")
     back, worth = entry["scores"]["recovery"][arm], (entry["scores"]["normalised"] or {}).get(arm)
     healthy, lived = card["eval"], own[arm]
-    rows.append((f"`{card['dreamer']['size']}`", number(card["updates"]), f"{number(healthy['return_iqm'])} {span(healthy['return_ci'])}", f"{plan[part]['adapt']['ratio']:g}", str(lived["seeds"]),
+    rows.append((f"`{card['dreamer']['size']}`", number(card["updates"]), f"{number(healthy['return_iqm'])} {span(healthy['return_ci'])}", f"{one['adapt']['ratio']:g}", str(lived["seeds"]),
                  f"{back['recovered']} of {back['n']}" if back else "none affected", both(back, "restricted_mean_steps") if back else "-",
                  few(worth, "normalised", worth["seeds"], 2) if worth and worth["seeds"] else "-", both(lived, "reward_pre", 2), both(own["none"], "reward_final", 2),
                  both(lived, "reward_final", 2), number(lived["updates_mean"])))
-  one = plan[part]
   gone = joined([f"`{part}`" for part in plan if part not in entries]) if len(entries) < len(plan) else ""
   text = fill(f"""
       Finetuning from the true onset for {number(one['steps'] - one['onset'])} steps ({one['env']}, {one['fault']}, {one['target']}, severity {one['severity']:g}), one agent of each size. Updates and healthy
