@@ -86,7 +86,7 @@ def setup(devices: int = 1) -> None:
 
   Args:
     devices: as how many devices a CPU counts. A program that is sharded over them keeps the cores busy with a share each, which a single program does only within its
-      larger products: ten seeds of a training take 0.60 to 0.76 of ten times one (benchmarks/README.md), 0.93 to 0.96 on one device. What is not sharded stays on the
+      larger products: ten seeds of a training take 0.58 to 0.75 of ten times one (results/dreamer_update_xeon.json), 0.93 on one device. What is not sharded stays on the
       first device and has all cores as before. A count in the user's own XLA_FLAGS or JAX_NUM_CPU_DEVICES is left as it is.
 
   Synchronous dispatch: a jax.pure_callback converts its arguments on a thread of the CPU client, and with asynchronous dispatch that conversion can wait for itself
