@@ -240,7 +240,9 @@ def test_runs_are_sums_of_the_trace(whole):
   for g in range(4):
     row = {k: v[g] for k, v in rows.items()}
     reward, alarms = trace["reward"][g].astype(float), np.flatnonzero(trace["alarm"][g])
-    after = alarms[alarms >= ONSET]
+    busy = trace["phase"][g][ONSET] == "adapting"  # kept apart from latency
+    after = alarms[(alarms >= ONSET) & (not busy)]
+    assert row["adapting_at_onset"] == busy
     assert row["alarm_step"] == (after[0] if len(after) else None) and row["false_alarms"] == (alarms < ONSET).sum()
     if len(after):
       assert row["latency_steps"] == after[0] - ONSET and row["latency_s"] == pytest.approx(0.025 * (after[0] - ONSET))

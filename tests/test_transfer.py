@@ -377,7 +377,9 @@ def test_latency_and_windows_are_counted_from_there(whole):
     then = {k: v[2 * g + 1] for k, v in rows.items()}["onset"]
     assert then == ONSET + SECOND > at
     reward, alarms = trace["reward"][g, :then].astype(float), np.flatnonzero(trace["alarm"][g, :then])
-    after = alarms[alarms >= at]
+    busy = trace["phase"][g][at] == "adapting"  # kept apart from latency
+    after = alarms[(alarms >= at) & (not busy)]
+    assert row["adapting_at_onset"] == busy
     assert row["onset"] == at and row["false_alarms"] == (alarms < at).sum() and row["alarm_step"] == (after[0] if len(after) else None)
     assert row["latency_steps"] == (after[0] - at if len(after) else None)
     acted = [int(r.split()[-1]) for _, r in events_of(out, g, "start")]
@@ -394,7 +396,9 @@ def test_the_second_change_has_rows_of_its_own(whole):
   for g in range(4):
     row, at = {k: v[2 * g + 1] for k, v in rows.items()}, ONSET + SECOND
     reward, alarms = trace["reward"][g].astype(float), np.flatnonzero(trace["alarm"][g])
-    after = alarms[alarms >= at]
+    busy = trace["phase"][g][at] == "adapting"  # kept apart from latency
+    after = alarms[(alarms >= at) & (not busy)]
+    assert row["adapting_at_onset"] == busy
     assert row["alarm_step"] == (after[0] if len(after) else None) and row["latency_steps"] == (after[0] - at if len(after) else None)
     assert row["false_alarms"] is None and row["wall_s"] is None and row["return_lost_healthy"] is None  # what comes before is the first row's
     assert row["reward_pre"] == pytest.approx(reward[:at].mean()) and row["reward_drop"] == pytest.approx(1 - reward[at:].mean() / reward[:at].mean())
