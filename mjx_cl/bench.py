@@ -24,7 +24,7 @@ from typing import NamedTuple
 
 from mjx_cl import pieces, store
 from mjx_cl.adapt.arms import ARMS, FOREVER, ONSET
-from mjx_cl.config import AdaptConfig, RunConfig, becomes, replace
+from mjx_cl.config import AdaptConfig, RunConfig, becomes, kinds, replace
 from mjx_cl.errors import FileError, UserError
 
 SUITES = pathlib.Path(__file__).parent / "suites" / "bench"
@@ -156,17 +156,7 @@ def config(where: str, values: dict) -> RunConfig:
 
 def check_kinds(where: str, of, values, before: str = "") -> None:
   """Raises UserError where a setting of the dataclass `of` has a value of another kind than its annotation says."""
-  kinds = {"bool": (bool,), "int": (int,), "float": (int, float), "str": (str,)}
-  for field in dataclasses.fields(of):
-    words = [w.strip() for w in str(field.type).split("|")]
-    allowed = tuple(k for w in words for k in kinds.get(w, ()))
-    if field.name not in values or not allowed or len(allowed) < len([w for w in words if w != "None"]):
-      continue  # not given, or of a kind of its own
-    value = values[field.name]
-    if value is None and "None" in words:
-      continue
-    if not isinstance(value, allowed) or isinstance(value, bool) and bool not in allowed:
-      raise UserError(f"{where}: {before}{field.name} takes {' or '.join(w for w in words if w != 'None')}; got {value!r}")
+  kinds(where, {field.name: str(field.type) for field in dataclasses.fields(of)}, values, before)
 
 
 # ---- the plan ------------------------------------------------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ import signal
 import sys
 import threading
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Union
 
 import tyro
 
@@ -363,28 +363,9 @@ class Doctor:
   json: bool = False
 
 
-Command = (
-    Annotated[Run, tyro.conf.subcommand("run")]
-    | Annotated[Train, tyro.conf.subcommand("train")]
-    | Annotated[Eval, tyro.conf.subcommand("eval")]
-    | Annotated[Certify, tyro.conf.subcommand("certify")]
-    | Annotated[Record, tyro.conf.subcommand("record")]
-    | Annotated[Leaderboard, tyro.conf.subcommand("leaderboard")]
-    | Annotated[Bench, tyro.conf.subcommand("bench")]
-    | Annotated[Plot, tyro.conf.subcommand("plot")]
-    | Annotated[Render, tyro.conf.subcommand("render")]
-    | Annotated[Query, tyro.conf.subcommand("query")]
-    | Annotated[Detect, tyro.conf.subcommand("detect")]
-    | Annotated[Report, tyro.conf.subcommand("report")]
-    | Annotated[List, tyro.conf.subcommand("list")]
-    | Annotated[Doctor, tyro.conf.subcommand("doctor")])
-
-
-DO = {
-    Run: commands.do_run, Bench: commands.do_bench, Train: commands.do_train, Eval: commands.do_eval,
-    Certify: commands.do_certify, Record: commands.do_record, Leaderboard: commands.do_leaderboard, Plot: commands.do_plot,
-    Render: commands.do_render, Query: commands.do_query, Report: commands.do_report, Detect: commands.do_detect,
-    List: commands.do_list, Doctor: commands.do_doctor}
+COMMANDS = (Run, Train, Eval, Certify, Record, Leaderboard, Bench, Plot, Render, Query, Detect, Report, List, Doctor)  # Run is `mjx-cl run`, done by commands.do_run
+Command = Union[tuple(Annotated[kind, tyro.conf.subcommand(kind.__name__.lower())] for kind in COMMANDS)]
+DO = {kind: getattr(commands, f"do_{kind.__name__.lower()}") for kind in COMMANDS}
 
 
 def parse(argv: list[str] | None):

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import numbers
 from dataclasses import dataclass, field
 
 from mjx_cl import fault_presets
@@ -27,6 +28,20 @@ def not_below_0(config, *names: str) -> None:
     value = getattr(config, name)
     if not (math.isfinite(value) and value >= 0):
       raise UserError(f"{name} must be 0 or above; got {value}")
+
+
+KINDS = {"bool": bool, "int": numbers.Integral, "float": numbers.Real, "str": str, "None": type(None)}
+
+
+def kinds(where: str, annotations: dict[str, str], values: dict, before: str = "") -> None:
+  """Raises UserError where a value is of another kind than its annotation says, such as `int | None`; what is annotated otherwise, or not at all, passes."""
+  for name, value in values.items():
+    words = [word.strip() for word in annotations.get(name, "").split("|")]
+    if not all(word in KINDS for word in words):
+      continue
+    allowed = tuple(KINDS[word] for word in words)
+    if not isinstance(value, allowed) or isinstance(value, bool) and bool not in allowed:
+      raise UserError(f"{where}: {before}{name} takes {' or '.join(word for word in words if word != 'None')}; got {value!r}")
 
 
 def whole(config, *names: str, most: int = fault_presets.FOREVER - 1) -> None:
@@ -195,7 +210,7 @@ class TrainConfig:
       raise UserError(f"preset {self.fault!r} brings its own severity; leave severity out")
     fraction(self, "demo_share", "clone_until", "shake", "shake_share", "severity")
     positive(self, "clone_std")
-    not_below_0(self, "jitter", "hold", "fall_cost", "penalties", "demo_noise", "clone", "clone_weight", "fade", "pure", *(("lr_end",) if self.lr_end is not None else ()))
+    not_below_0(self, "jitter", "fall_cost", "penalties", "demo_noise", "clone_weight", *(("lr_end",) if self.lr_end is not None else ()))
     if self.fall_cost and self.pure >= self.updates:
       raise UserError(f"fall_cost is not taken in the last pure={self.pure} updates, and there are no more than updates={self.updates}; set pure below that")
     if self.demonstrator and self.clone + self.fade + self.pure > self.updates:

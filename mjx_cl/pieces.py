@@ -79,11 +79,8 @@ def join(folders, out, config: RunConfig) -> dict:
   folders, out = [pathlib.Path(f) for f in folders], pathlib.Path(out)
   summaries, configs = [], []
   for folder in folders:
-    try:
-      summaries.append(store.read_json(folder / "summary.json"))
-      configs.append(store.read_json(folder / "config.json"))
-    except (OSError, ValueError) as e:
-      raise FileError(f"{folder} is no finished run: {e}") from None
+    summaries.append(store.read_json(folder / "summary.json"))
+    configs.append(store.read_json(folder / "config.json"))
     lacks = [k for k in SUMMED if k not in summaries[-1]]
     if lacks:
       raise FileError(f"{folder / 'summary.json'} is not a run's: it lacks {', '.join(lacks)}")

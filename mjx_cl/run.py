@@ -451,11 +451,8 @@ def doubts(config: RunConfig) -> list[str]:
 def execute(config: RunConfig, out, resume: bool = False, overwrite: bool = False, progress=lambda p: None, save_every_s: float = 60.0,
             tell=lambda text: None) -> dict:
   """Runs `config` into `out` and returns summary.json's value. A kill at any moment loses at most `save_every_s` seconds of work."""
-  if not str(out):
-    raise UserError("--out is a folder; got an empty name")
-  out = pathlib.Path(out)
-  fresh = not out.exists()
-  state = store.claim_folder(out, resume, overwrite)
+  fresh = not pathlib.Path(out).exists()
+  state, out = store.claim_folder(out, resume, overwrite), pathlib.Path(out)
   if state == "done":
     check_same(out, {k: v for k, v in identity(config).items() if k != "physics"})  # `auto` is resolved there
     return store.read_json(out / "summary.json")

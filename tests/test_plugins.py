@@ -125,7 +125,7 @@ def test_settings_of_a_wrong_kind_are_one_line(capsys, tmp_path):
   for argv, words in (((), "rolling_sigma"), (("--detector", "cusum"), "cusum"), (("--detector", "ewma"), "ewma")):
     assert cli.main(["run", "walker", "--set", "threshold=abc", "--out", str(tmp_path / "r"), *argv]) == 2
     err = capsys.readouterr().err
-    assert f"detector '{words}': threshold takes a number; got 'abc'" in err and err.strip().count("\n") == 0
+    assert f"detector '{words}': threshold takes float; got 'abc'" in err and err.strip().count("\n") == 0
   assert cli.main(["run", "walker", "--set", "foo=3", "--out", str(tmp_path / "r")]) == 2
   assert "window" in (err := capsys.readouterr().err) and "threshold_rpr" in err and not (tmp_path / "r").exists()
 

@@ -4,13 +4,12 @@ from __future__ import annotations
 import functools
 import inspect
 import json
-import numbers
 import pathlib
 from typing import NamedTuple
 
 import jax
-import numpy as np
 
+from mjx_cl.config import kinds
 from mjx_cl.detectors import combine
 from mjx_cl.detectors import references
 from mjx_cl.detectors.adwin import adwin
@@ -170,25 +169,11 @@ def factory(name: str):
   return choose("detector", split(name)[0], DETECTORS)
 
 
-KINDS = {"int": numbers.Integral, "float": numbers.Real, "bool": bool, "None": type(None)}
-WORDS = {"int": "a whole number", "float": "a number", "bool": "true or false", "None": "none"}
-
-
 def check_kinds(name: str, settings: dict, *builds) -> None:
-  """Refuses a setting of another kind than its annotation in one of `builds` says, before a program is traced with it. What is annotated otherwise passes, and so
-  do numbers of JAX.
-
-  Raises:
-    UserError that names the setting and what it takes.
-  """
-  known = {p.name: getattr(p.annotation, "__name__", str(p.annotation)) for build in builds for p in inspect.signature(build).parameters.values() if p.annotation is not p.empty}
-  for key, value in settings.items():
-    words = [word.strip() for word in known.get(key, "").split("|")]
-    if isinstance(value, jax.Array) or not all(word in KINDS for word in words):
-      continue
-    kinds = tuple(KINDS[word] for word in words)
-    if not isinstance(value, kinds) or isinstance(value, (bool, np.bool_)) and bool not in kinds:
-      raise UserError(f"detector {name!r}: {key} takes {' or '.join(WORDS[word] for word in words)}; got {value!r}")
+  """Refuses a setting of another kind than its annotation in one of `builds` says, before a program is traced with it. Words are the factories' own to read, and numbers
+  of JAX pass."""
+  known = {p.name: getattr(p.annotation, "__name__", str(p.annotation)) for build in builds for p in inspect.signature(build).parameters.values()}
+  kinds(f"detector {name!r}", {k: text for k, text in known.items() if "str" not in text}, {k: v for k, v in settings.items() if not isinstance(v, jax.Array)})
 
 
 def make(name: str, channel: str | None = None, log: bool | None = None, whiten: int = 0, patience: int = 1, cool_down: int = 0,
