@@ -215,8 +215,8 @@ def _row(name, reference, data, key, alarms, oracle, threshold=None, arl0=None, 
   latency = metrics.latencies(fired, onset, data.horizon)
   share = limits.efficiency(oracle.run.latency if oracle.run else latency, latency, data.horizon)
   if oracle.run is None:
-    share |= {"oracle_delay_steps": None, "efficiency": None, "efficiency_ci": None}
-  known = {k: oracle.limits[k] for k in ("information_nats_per_step", "information_nats_per_step_ci", "optimal_delay_steps")}
+    share |= dict.fromkeys(("oracle_delay_steps", "oracle_delay_steps_ci", "efficiency", "efficiency_ci"))
+  known = {k: oracle.limits[k] for k in oracles.LIMITS}
   tells = name == ORACLES[1 if oracle.run else 0]  # the row that says why a limit is unknown
   notes = [n for n in (share["note"], oracle.limits["note"] if tells else None) if n]
   arl0 = arl0 or {"arl0": None, "arl0_ci": None, "alarms": None, "few": False}
@@ -224,8 +224,7 @@ def _row(name, reference, data, key, alarms, oracle, threshold=None, arl0=None, 
           "threshold": threshold if threshold is None or math.isfinite(threshold) else None,
           "arl0": arl0["arl0"], "arl0_ci": arl0["arl0_ci"], "arl0_alarms": arl0["alarms"], "arl0_few": arl0["few"],
           **{k: (episode or {}).get(k) for k in ("episode_alarm_probability", "episode_alarm_probability_ci")},
-          **row, "us_per_sample": us, **known, "oracle_delay_steps": share["oracle_delay_steps"], "delay_steps": share["delay_steps"],
-          "efficiency": share["efficiency"], "efficiency_ci": share["efficiency_ci"], "note": "; ".join(notes) or None}
+          **row, "us_per_sample": us, **known, **share, "note": "; ".join(notes) or None}
 
 
 def oracle_rows(data: Data, oracle: dict) -> list[dict]:
@@ -266,6 +265,7 @@ def score(streams: StreamSet, entries: list[Entry], robots=(), extra=(), progres
   runners = {e.name: passes.Runner(e.build, room) for e in entries if not e.own}
   rows, curves, pages, n = [], {}, [], len(robots) * (len(entries) + len(extra) + 1)
   done = lived = 0
+  took: dict[str, float] = {}  # seconds of each detector on the robot before
   for robot in robots:
     data = load(streams, robot)
     nominal = joined(data.tune.residual, data.score.residual)
@@ -276,11 +276,15 @@ def score(streams: StreamSet, entries: list[Entry], robots=(), extra=(), progres
     rate = lambda name, result, known: rows_of(name, next((e.reference for e in entries if e.name == name), False), result, data, known)
 
     def rated(name, get):
+      started = time.perf_counter()
       result = get(data)
+      took[name] = time.perf_counter() - started
       return result, rate(name, result, oracle.result()) if oracle.done() else None
     with _workers() as pool:
       oracle = pool.submit(oracles.oracles, streams, data)  # one thread's work for a while: detectors run beside it, and are rated once it is there
-      waiting = collections.deque((name, pool.submit(rated, name, get)) for name, get in jobs)
+      longest_first = sorted(jobs, key=lambda job: -took.get(job[0], 0.0))  # a long one that begins last would keep one core waiting for another
+      begun = {name: pool.submit(rated, name, get) for name, get in longest_first}
+      waiting = collections.deque((name, begun.pop(name)) for name, _ in jobs)
       try:
         known = oracle.result()
         rows += oracle_rows(data, known)

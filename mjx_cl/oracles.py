@@ -11,6 +11,7 @@ from mjx_cl.streams import StreamSet
 
 ORDER = 8                 # of the autoregressions
 CHANNELS = ("opr", "rpr")  # the declared channel: what the single-residual detectors see
+LIMITS = tuple(k + end for k in ("information_nats_per_step", "optimal_delay_steps") for end in ("", "_ci"))
 START, HIGHEST, HALVINGS = 40.0, 1e9, 14  # of the search for a threshold [nats]
 
 
@@ -29,7 +30,7 @@ class Oracle(NamedTuple):
   """What is known of one fault.
 
   Attributes:
-    limits: information_nats_per_step, its _ci, optimal_delay_steps, and a note on why one is None. run: None where the oracle cannot be fitted.
+    limits: what LIMITS names, and a note on why one is None. run: None where the oracle cannot be fitted.
   """
   limits: dict
   run: OracleRun | None
@@ -65,7 +66,7 @@ def _known(normal: limits.Healthy, first: limits.Healthy, after: np.ndarray, arl
   fit, no_fit = _attempt(lambda: limits.fit(normal, after))
   information, no_information = _attempt(lambda: limits.information(normal, after))
   form, no_form = _attempt(lambda: limits.closed_form(first, after[..., 0], arl0))
-  unknown = dict.fromkeys(("information_nats_per_step", "information_nats_per_step_ci", "optimal_delay_steps"))
+  unknown = dict.fromkeys(LIMITS)
   return fit, unknown | {"note": no_fit or no_information or no_form} | (information or {}) | (form or {})
 
 

@@ -1,6 +1,7 @@
 """Recording of a suite: healthy and faulty robots of all seeds in one batched program per robot and split, written as streams.py describes."""
 from __future__ import annotations
 
+import concurrent.futures
 import dataclasses
 import json
 import os
@@ -46,6 +47,29 @@ def lanes(suite_: Suite, robot: str, split: str) -> list[Lane]:
   return out
 
 
+class Behind:
+  """Calls of one function on a thread of its own, in order and at most one behind: a frozen agent acts without waiting for what is made of its last chunk.
+
+    with Behind(function) as call: call(...)         an error of the function comes up at the next call, or at the end
+  """
+
+  def __init__(self, function):
+    self._function, self._pool, self._last = function, concurrent.futures.ThreadPoolExecutor(1, "behind"), None
+
+  def __enter__(self):
+    return self
+
+  def __call__(self, *args) -> None:
+    if self._last is not None:
+      self._last.result()
+    self._last = self._pool.submit(self._function, *args)
+
+  def __exit__(self, kind, *_):
+    self._pool.shutdown()
+    if kind is None and self._last is not None:
+      self._last.result()
+
+
 def _record(env, trained, lanes_: list[Lane], keys, onsets, steps: int, watch_from: int, progress) -> dict[str, np.ndarray]:
   """Lives `steps` control steps of every lane; the monitor looks at healthy lanes all the time, at the others from `watch_from` on.
 
@@ -83,14 +107,13 @@ def _record(env, trained, lanes_: list[Lane], keys, onsets, steps: int, watch_fr
   draws = jax.vmap(lambda key, chunk: jax.random.fold_in(jax.random.fold_in(key, WATCH), chunk), (0, None))
   history = monitor.init(1, len(lanes_))
   out: dict[str, list] = {c: [] for c in COLUMNS + ("episode", "terminated", "latent")}
-  for chunk in range(-(-steps // CHUNK)):
-    state, rows = rollout.chunk(params, state, CHUNK)
-    rows = jax.tree.map(lambda x: x[:, :, :n], rows)
+
+  def look(chunk, history, rows):
+    """One chunk, seen and stored."""
     everyone = (chunk + 1) * CHUNK > watch_from
     take = (lambda x: x) if everyone else (lambda x: x[:, :, :healthy])
     own = draws(keys if everyone else keys[:healthy], chunk)[None]
     _, seen = watch(params, jax.tree.map(take, history), jax.tree.map(take, rows), own)
-    history = remember(history, rows)
     seen = jax.tree.map(lambda x: np.asarray(x)[:, 0], seen)
     wide = lambda x: x if everyone else np.concatenate([x, np.full((CHUNK, len(lanes_) - healthy) + x.shape[2:], np.nan, np.float32)], 1)
     for k, name in enumerate(COLUMNS):
@@ -99,6 +122,13 @@ def _record(env, trained, lanes_: list[Lane], keys, onsets, steps: int, watch_fr
     out["episode"].append(np.asarray(rows.episode)[:, 0].astype(np.int16))
     out["terminated"].append(np.asarray(rows.terminated)[:, 0])
     progress(min(steps, (chunk + 1) * CHUNK), steps, len(lanes_))
+
+  with Behind(look) as looked:
+    for chunk in range(-(-steps // CHUNK)):
+      state, rows = rollout.chunk(params, state, CHUNK)
+      rows = jax.tree.map(lambda x: x[:, :, :n], rows)
+      looked(chunk, history, rows)
+      history = remember(history, rows)
   return {k: np.concatenate(v)[:steps] for k, v in out.items()} | {"target": np.asarray([t or "" for t in drawn])}
 
 

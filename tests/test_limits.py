@@ -1,4 +1,5 @@
 """Limits of the delay, and the oracle detector that is fitted on them: closed forms, an integral equation, SciPy, simulation."""
+import itertools
 import math
 
 import chex
@@ -285,6 +286,8 @@ def test_closed_form_is_printed_where_it_applies_alone():
   want = limits.brownian(1e4, math.sqrt(0.4 / 1.6)).delay
   # information 0.125 +- 0.009 (four errors, as above), and the delay goes about as its inverse
   assert fits["note"] is None and fits["optimal_delay_steps"] == pytest.approx(want, rel=0.08)
+  low, high = fits["optimal_delay_steps_ci"]
+  assert want * 0.85 < low < fits["optimal_delay_steps"] < high < want * 1.15  # eight streams of 2,000: the shift to 0.8 %, its ends four times that at most
   swing = nominal + 2 * np.sin(2 * np.pi * np.arange(2000) / 40)[:, None]  # a gait
   nonlinear = np.where(np.arange(2000)[:, None] // 100 % 2, nominal, 3 * rng.standard_normal((2000, 8)))
   for healthy, faulty, reason in ((nonlinear, 1 + nonlinear, "not white"), (swing, 1 + swing, "not white"), (nominal, draw(), "not show|mere"),
@@ -301,10 +304,14 @@ def test_efficiency_is_the_ratio_of_restricted_means():
   oracle, mine = (1 + 2 + 5 + 9) / 4, (4 + 100 + 8 + 100) / 4
   assert (got["oracle_delay_steps"], got["delay_steps"]) == (oracle, mine)
   assert got["efficiency"] == oracle / mine and got["note"] is None
-  low, high = got["efficiency_ci"]
-  assert low < got["efficiency"] < high
+  for name in ("efficiency", "oracle_delay_steps", "delay_steps"):
+    low, high = got[f"{name}_ci"]
+    assert low < got[name] < high
+  every = [np.mean(x) for x in itertools.product((1, 2, 5, 9), repeat=4)]  # all draws of a bootstrap over four seeds
+  assert got["oracle_delay_steps_ci"] == pytest.approx(np.quantile(every, [0.025, 0.975], method="nearest").tolist(), abs=0.26)  # a step of that law, 20,000 draws
   assert limits.efficiency([500], [600], horizon=100)["efficiency"] == 1.0  # beyond the horizon is a miss
-  assert limits.efficiency([5], [6], horizon=100)["efficiency_ci"] is None
+  one = limits.efficiency([5], [6], horizon=100)
+  assert one["efficiency_ci"] is one["oracle_delay_steps_ci"] is one["delay_steps_ci"] is None
   better = limits.efficiency([5, 5], [4, 4], horizon=100)
   assert better["efficiency"] == 6 / 5 and better["note"].startswith("above 1")
   with pytest.raises(UserError):

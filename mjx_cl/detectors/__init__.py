@@ -30,6 +30,7 @@ from mjx_cl.detectors.max_variables import max_variables
 from mjx_cl.detectors.mewma import mewma
 from mjx_cl.detectors.multichart import multichart
 from mjx_cl.detectors.rolling_sigma import rolling_sigma
+from mjx_cl.detectors.scan import scan
 from mjx_cl.detectors.surprise import surprise
 from mjx_cl.detectors.shiryaev_roberts import shiryaev_roberts
 from mjx_cl.detectors.z_score import z_score

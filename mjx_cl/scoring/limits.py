@@ -282,7 +282,7 @@ def closed_form(nominal, faulty, arl0: float, order: int = 8, lags: int = 20) ->
   Args:
     nominal, faulty: (T, S), as for `information`.
   Returns:
-    {optimal_delay_steps: samples or None, note: the reason for None, else None, ljung_box_p}.
+    {optimal_delay_steps: samples or None, optimal_delay_steps_ci: bootstrap over the faulty streams, note: the reason for None, else None, ljung_box_p}.
   """
   healthy = _healthy(nominal, order)
   if healthy.streams.shape[2] != 1:
@@ -298,7 +298,20 @@ def closed_form(nominal, faulty, arl0: float, order: int = 8, lags: int = 20) ->
     note = "no closed form: the fault does not show in this channel"
   elif not 0.8 <= shift ** 2 / 2 / rate <= 1.25:
     note = f"no closed form: the fault is no mere shift of the mean (which would carry {shift ** 2 / 2:.3g} of {rate:.3g} nats per step)"
-  return {"optimal_delay_steps": brownian(arl0, shift).delay if note is None else None, "note": note, "ljung_box_p": p}
+  known = {"optimal_delay_steps": None, "optimal_delay_steps_ci": None, "note": note, "ljung_box_p": p}
+  return known if note else known | {"optimal_delay_steps": brownian(arl0, shift).delay, "optimal_delay_steps_ci": _delays(arl0, innovations(faulty, healthy.model))}
+
+
+def _delays(arl0: float, e: np.ndarray) -> list[float | None]:
+  """Interval of the closed form's delay: the delays at the ends of the shift's own, a bootstrap over streams of innovations e (T, S) or (T, S, 1). An
+  end is None where no shift is among the likely ones, which no detector finds."""
+  e = e.reshape(len(e), -1)
+  count, total = np.isfinite(e).sum(0), np.nansum(e, 0)
+  w = bootstrap.weights(len(total), REPS)
+  (low, high), = bootstrap.ends(((w @ total) / (w @ count))[None])
+  if low > 0 or high < 0:
+    return [brownian(arl0, x).delay for x in sorted((low, high), key=abs, reverse=True)]
+  return [brownian(arl0, max(-low, high)).delay, None]
 
 
 def efficiency(oracle_latencies, detector_latencies, horizon: int, reps: int = REPS) -> dict:
@@ -309,17 +322,19 @@ def efficiency(oracle_latencies, detector_latencies, horizon: int, reps: int = R
   Args:
     oracle_latencies, detector_latencies: (S,) of the same seeds [control steps], None or inf or nan = missed. horizon: [control steps].
   Returns:
-    {efficiency, efficiency_ci: bootstrap over seeds, drawn in pairs, None for fewer than two; oracle_delay_steps, delay_steps: restricted means;
+    {efficiency; oracle_delay_steps, delay_steps: restricted means; each with its _ci, a bootstrap over seeds, drawn in pairs, None for fewer than two;
     note: a sentence where the efficiency is above 1, else None}.
   """
   sides = [np.array([np.inf if x is None else x for x in side], float) for side in (oracle_latencies, detector_latencies)]
   if len(sides[0]) != len(sides[1]) or not len(sides[0]):
     raise UserError(f"efficiency needs the same seeds of oracle and detector; got {len(sides[0])} and {len(sides[1])}")
   oracle, mine = (np.minimum(np.where(np.isnan(x), np.inf, x) + 1, horizon) for x in sides)
-  value, interval = float(oracle.mean() / mine.mean()), None
+  value, intervals = float(oracle.mean() / mine.mean()), [None, None, None]
   if len(mine) > 1:
     w = bootstrap.weights(len(mine), reps)
-    interval = bootstrap.ends(((w @ oracle) / (w @ mine))[None])[0]
+    theirs, own = w @ oracle, w @ mine
+    intervals = bootstrap.ends(np.stack([theirs / own, theirs, own]))
   note = ("above 1: the oracle is optimal only for the worst onset and for data of the Gaussian autoregression that was fitted to it; this detector "
           "was luckier, or uses what that model leaves out") if value > 1 else None
-  return {"efficiency": value, "efficiency_ci": interval, "oracle_delay_steps": float(oracle.mean()), "delay_steps": float(mine.mean()), "note": note}
+  values = {"efficiency": value, "oracle_delay_steps": float(oracle.mean()), "delay_steps": float(mine.mean())}
+  return values | {f"{k}_ci": ends for k, ends in zip(values, intervals)} | {"note": note}
