@@ -227,11 +227,13 @@ def check(part: Part, robots: Robots | None = None) -> None:
   """Refuses, before the suite starts, names and values that only the registries know: fault, target, detector, agent."""
   from mjx_cl import detectors, faults, run
   from mjx_cl.config import changes
+  from mjx_cl.scoring import stop
   c, robots = part.config, robots or Robots()
   try:
     detectors.make(c.detector, **c.settings)
     faults.build(changes(c), robots.make(becomes(c) or c.env, c.physics), c.onset)
     run.arm_agents(c, robots.make(c.env, c.physics))
+    stop.told(c)
   except UserError as e:
     raise UserError(f"part {part.name}: {e}") from None
 

@@ -77,6 +77,8 @@ class Run:
   """Act by the policy's mean instead of a sample."""
   snapshots: int = 0
   """Control steps of adaptation between two snapshots of arm oracle-budget, which the stop rule is scored against; 0: none."""
+  stops: str | None = None
+  """For arm oracle-stop: folder of a finished run of arm oracle-budget with --snapshots, of the same robot, fault and seeds."""
   keep: bool = False
   """Write what each stream has learnt as an agent, OUT/agents/ARM-SEED, for --agent of another run."""
   parts: bool = False

@@ -42,7 +42,7 @@ def do_run(args: Run) -> None:
       env=args.env, fault=args.fault, target=None if args.target == "random" else args.target, severity=args.severity, onset=args.onset,
       duration=args.duration, schedule=args.schedule, period=args.period, share=args.share, steps=args.steps, seeds=args.seeds, first_seed=args.first_seed, detector=args.detector, settings=settings(args.set),
       arms=args.arm, agent=args.agent, physics=args.physics, form=args.form, actions=args.actions, deterministic=args.deterministic, adapt=args.adapt,
-      snapshots=args.snapshots, keep=args.keep, parts=args.parts, residuals=args.residuals)
+      snapshots=args.snapshots, stops=args.stops, keep=args.keep, parts=args.parts, residuals=args.residuals)
   from mjx_cl import run
   with RunDisplay() as display:
     summary = run.execute(config, args.out, args.resume, args.overwrite, display, tell=say)

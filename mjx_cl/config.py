@@ -320,6 +320,8 @@ class RunConfig:
     deterministic: act by the policy's mean.
     snapshots: control steps of adaptation between two snapshots of the weights that act, in arms that never stop by themselves; 0: none.
       Each is evaluated on the broken robot once the run is over, see snapshots.py.
+    stops: folder of a finished run of the same robots with an arm that never stops by itself and snapshots: where arms that end at the oracle stop find it,
+      see scoring.stop.told.
     keep: what each stream has learnt is written as an agent, see run.Runner.keep.
     parts: trace.parquet also holds the residual of each part of the observation (monitor.watched), columns residual_NAME.
     residuals: residuals.parquet holds the residual of every observation variable, in its own unit.
@@ -346,6 +348,7 @@ class RunConfig:
   deterministic: bool = False
   adapt: AdaptConfig = AdaptConfig()
   snapshots: int = 0
+  stops: str | None = None
   keep: bool = False
   parts: bool = False
   residuals: bool = False
@@ -377,6 +380,13 @@ class RunConfig:
     if self.snapshots and not any(never_stops(ARMS[arm]) for arm in self.arms):
       endless = ", ".join(name for name, arm in ARMS.items() if never_stops(arm))
       raise UserError(f"snapshots={self.snapshots} needs an arm that never stops by itself: {endless}")
+    told = [arm for arm in self.arms if ARMS[arm].end.told]
+    if told and not self.stops:
+      raise UserError(f"arm {told[0]!r} needs stops: the folder of a run of the same seeds with arm oracle-budget and snapshots, which finds their oracle stops")
+    if self.stops and not told:
+      raise UserError(f"stops={self.stops} needs an arm that ends there: {', '.join(name for name, arm in ARMS.items() if arm.end.told)}")
+    if told and len(changes(self)) > 1:
+      raise UserError(f"arm {told[0]!r} takes a robot that changes once; {self.fault!r} changes it {len(changes(self))} times")
 
 
 def becomes(config: RunConfig) -> str | None:

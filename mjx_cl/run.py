@@ -91,6 +91,7 @@ class Runner:
     agent, self.repeat = self.trained.agent, int(self.trained.card.get("repeat", 1))
     self.others = arm_agents(config, self.env)
     self.changes = changes(config)
+    self.stops = stop.told(config)
     self.faults, plan, target = faults.build(self.changes, self.robots[-1], config.onset)
     robot = known_as(self.env)
     found = threshold_of(config)
@@ -209,7 +210,7 @@ class Runner:
     c = self.config
     onsets = tuple(c.onset + change.after for change in self.changes if change.fault != "none")
     moves = [()] * self.groups if self.other is None else [(int(step),) for step in np.asarray(streams.after.enter)[:, 0]]
-    return choices(self.labels, c.adapt, c.steps, [own + onsets for own in moves])
+    return choices(self.labels, c.adapt, c.steps, [own + onsets for own in moves], self.stops)
 
   def onsets(self) -> list[int | None]:
     """Each stream's onset; where the robot becomes another one: as far as it is known. None: not in this run, an arm whose robot is spared, or a
@@ -510,12 +511,13 @@ def clear(out: pathlib.Path) -> None:
 
 def identity(config: RunConfig) -> dict:
   """What makes a run what it is, as config.json holds it: its settings, `changes`, what a preset's name stood for when it began, the `threshold` that its
-  detector takes from the board, and the SHA-256 of the `files` that robot, fault or detector stand in."""
-  found = threshold_of(config)
+  detector takes from the board, `oracle_stops` that its arms are told, and the SHA-256 of the `files` that robot, fault or detector stand in."""
+  found, told = threshold_of(config), stop.told(config)
   sources = {name: plugins.file_of(name) for name in (config.env, config.detector, *(change.fault for change in changes(config)))}
   files = {name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in sources.items() if path is not None and path.is_file()}
   return json.loads(json.dumps({**dataclasses.asdict(config), "changes": [dataclasses.asdict(change) for change in changes(config)],
-                                **({"threshold": found._asdict()} if found else {}), **({"files": files} if files else {})}))
+                                **({"threshold": found._asdict()} if found else {}), **({"oracle_stops": told} if told else {}),
+                                **({"files": files} if files else {})}))
 
 
 def check_same(out: pathlib.Path, values: dict) -> None:

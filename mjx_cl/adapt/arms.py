@@ -35,9 +35,11 @@ class End:
 
   Attributes:
     rule: stop and abort rules of the phase machine are in force. limit: AdaptConfig -> most control steps of one adaptation.
+    told: it ends at the oracle stop of the stream's seed, which another run has found (RunConfig.stops), or at the limit if that comes first.
   """
   rule: bool
   limit: Callable[..., int]
+  told: bool = False
 
 
 @dataclass(frozen=True)
@@ -79,6 +81,7 @@ RULE = End(True, lambda adapt: adapt.budget)
 BUDGET = End(False, lambda adapt: adapt.budget)
 PERIOD_STEPS = End(False, lambda adapt: adapt.period_steps)
 RANDOM_STEPS = End(False, lambda adapt: adapt.random_steps)
+ORACLE_STOP = End(False, lambda adapt: adapt.budget, told=True)
 NO_END = End(False, lambda adapt: FOREVER)
 
 
@@ -103,6 +106,8 @@ ARMS: dict[str, Arm] = {
     "oracle": Arm("finetuning starts at the true onset, ends by the stop rule", ONSET, RULE),
     "oracle-budget": Arm("finetuning starts at the true onset, ends after --adapt.budget steps whatever the signals say: the run from which the best "
                          "stop is chosen afterwards", ONSET, BUDGET),
+    "oracle-stop": Arm("finetuning starts at the true onset and ends where it should: at the oracle stop of the same seed, found by an earlier run of "
+                       "oracle-budget with --snapshots, whose folder --stops names", ONSET, ORACLE_STOP),
     "scratch": Arm("at the true onset all parameters are drawn anew; ends by the stop rule", ONSET, RULE, fresh=True),
     "world-model": Arm("as detector, but the world model alone learns; actor and critic stay", ALARM, RULE, world_only=True),
     "randomised": Arm("no adaptation, an agent that was trained on randomised faults: ROBOT-randomised, or FOLDER-randomised beside an --agent FOLDER",

@@ -84,12 +84,13 @@ class Choices(NamedTuple):
   fresh: jax.Array | None
 
 
-def choices(labels, config: AdaptConfig, steps: int, onsets=None) -> Choices:
+def choices(labels, config: AdaptConfig, steps: int, onsets=None, stops: dict[int, int] | None = None) -> Choices:
   """Choices of streams.
 
   Args:
     labels: (arm, seed) of each. steps: of the run.
     onsets: true onsets of each robot, unless its arm spares it, as control steps, FOREVER: not known yet; None: no faults.
+    stops: seed -> control steps after which an arm that is told its oracle stop ends.
   Raises:
     UserError where an arm's schedule does not fit into the run.
   """
@@ -99,8 +100,9 @@ def choices(labels, config: AdaptConfig, steps: int, onsets=None) -> Choices:
   width = WIDTH * max(1, -(-max(map(len, at)) // WIDTH))
   at = [[step if step < steps else arms_lib.FOREVER for step in row] + [arms_lib.FOREVER] * (width - len(row)) for row in at]
   flags = lambda get: jnp.asarray([get(arm) for arm in arms], bool)
+  limits = [min(arm.end.limit(config), stops[seed]) if arm.end.told else arm.end.limit(config) for arm, (_, seed) in zip(arms, labels)]
   return Choices(flags(lambda a: a.trigger.listens), jnp.asarray(at, jnp.int32), flags(lambda a: a.end.rule),
-                 jnp.asarray([a.end.limit(config) for a in arms], jnp.int32), flags(lambda a: a.world_only),
+                 jnp.asarray(limits, jnp.int32), flags(lambda a: a.world_only),
                  flags(lambda a: a.fresh) if any(arm.fresh for arm in arms) else None)
 
 

@@ -260,6 +260,49 @@ def _relive(own, since, names, config):
   return dict(zip(own, np.asarray(decisions)))
 
 
+SAME = ("env", "fault", "target", "severity", "onset", "duration", "schedule", "period", "share", "agent", "deterministic", "repeat")
+LEARNS = ("ratio", "average", "start_windows", "lr", "policy_lr", "last_starts", "batch", "fresh_moments", "anchor")  # of AdaptConfig: what its weights depend on
+
+
+def told(config) -> dict[int, int]:
+  """Seed -> control steps from the true onset to the oracle stop, for the arms of a run that end there; {} where none does.
+
+  The run in `config.stops` lived the same lives with weights that never stopped, and its snapshots say which were the first that were good enough (`oracle`). A stop
+  at 0, where the weights of before were already, is one of a single step: a robot that adapts does so for a chunk at least.
+
+  Args:
+    config: RunConfig.
+  Raises:
+    FileError for a folder that holds no such run; UserError for one of another robot, fault, agent or way to learn, or without a seed of this run.
+  """
+  if not any(ARMS[arm].end.told for arm in config.arms):
+    return {}
+  folder = pathlib.Path(config.stops)
+  try:
+    theirs = json.loads((folder / "config.json").read_text())
+    adapt = theirs["adapt"]
+    differ = [k for k in SAME if k in theirs and hasattr(config, k) and theirs[k] != getattr(config, k)]
+    differ += [f"adapt.{k}" for k in LEARNS if k in adapt and adapt[k] != getattr(config.adapt, k)]
+  except (OSError, ValueError, KeyError, TypeError) as e:
+    raise FileError(f"stops: {folder} holds no run: {type(e).__name__}: {e}") from None
+  if differ:
+    raise UserError(f"stops: {folder} was run with another {', '.join(differ)}; its oracle stops are not those of this run")
+  if not (folder / "snapshots.parquet").exists():
+    raise FileError(f"stops: {folder} has no snapshots.parquet; run arm oracle-budget with --snapshots 1000 there")
+  curves: dict[int, list] = {}
+  for s in _read(folder, "snapshots"):
+    curves.setdefault(s["seed"], []).append((s["since_start"], s["reward_mean"]))
+  out = {}
+  for seed, points in curves.items():
+    age, reward = zip(*sorted(points))
+    out[seed] = max(1, int(age[oracle(age, reward)]))
+  seeds = range(config.first_seed, config.first_seed + config.seeds)
+  missing = [s for s in seeds if s not in out]
+  if missing:
+    raise UserError(f"stops: {folder} has no snapshots of seed {', '.join(map(str, missing))}; it has {', '.join(map(str, sorted(out)))}")
+  return {seed: out[seed] for seed in seeds}
+
+
 # ---- files ---------------------------------------------------------------------------------------------------------------------------
 
 def _table(folder, name, columns=None):
