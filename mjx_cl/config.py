@@ -385,8 +385,9 @@ class RunConfig:
       raise UserError(f"arm {told[0]!r} needs stops: the folder of a run of the same seeds with arm oracle-budget and snapshots, which finds their oracle stops")
     if self.stops and not told:
       raise UserError(f"stops={self.stops} needs an arm that ends there: {', '.join(name for name, arm in ARMS.items() if arm.end.told)}")
-    if told and len(changes(self)) > 1:
-      raise UserError(f"arm {told[0]!r} takes a robot that changes once; {self.fault!r} changes it {len(changes(self))} times")
+    moments = {c.after for c in changes(self)} | ({0} if becomes(self) else set())
+    if told and len(moments) > 1:
+      raise UserError(f"arm {told[0]!r} takes a robot that changes once; {self.fault!r} changes it {len(moments)} times")
 
 
 def becomes(config: RunConfig) -> str | None:

@@ -28,7 +28,7 @@ from mjx_cl.rollout import Row
 from mjx_cl.scoring import normalised, recovery
 
 FOUR = ("detector", "none", "oracle", "no-fault")  # as many streams as are computed alike to the last bit, see run.Runner
-NAMES = ("detector", "none", "always", "periodic", "random", "oracle", "oracle-budget", "scratch", "world-model", "randomised",
+NAMES = ("detector", "none", "always", "periodic", "random", "oracle", "oracle-budget", "oracle-stop", "scratch", "world-model", "randomised",
          "no-fault")
 
 
@@ -40,12 +40,12 @@ def test_the_table_is_what_is_tested_here():
 
 def test_choices_of_all_arms():
   c = AdaptConfig(warmup=1000, budget=777, period=400, period_steps=30, random_steps=60)
-  x = choices([(name, 5) for name in NAMES], c, 1500, [(700, 1200, FOREVER)] * len(NAMES))
+  x = choices([(name, 5) for name in NAMES], c, 1500, [(700, 1200, FOREVER)] * len(NAMES), {5: 333})
   rows = {name: jax.tree.map(lambda a: np.asarray(a)[i], x) for i, name in enumerate(NAMES)}
   at = {name: sorted(int(s) for s in row.at if s < FOREVER) for name, row in rows.items()}
   drawn = at.pop("random")
   assert at == {"detector": [], "none": [], "always": [1000], "periodic": [400, 800, 1200], "oracle": [1000, 1200],  # the warm-up comes first
-                "oracle-budget": [1000, 1200], "scratch": [1000, 1200], "world-model": [], "randomised": [], "no-fault": []}
+                "oracle-budget": [1000, 1200], "oracle-stop": [1000, 1200], "scratch": [1000, 1200], "world-model": [], "randomised": [], "no-fault": []}
   assert len(drawn) == 1 and 1000 <= drawn[0] <= 1440
   on = lambda field: {name for name, row in rows.items() if getattr(row, field)}
   assert on("listens") == {"detector", "world-model", "no-fault"} and on("world_only") == {"world-model"} and on("fresh") == {"scratch"}
@@ -54,7 +54,9 @@ def test_choices_of_all_arms():
   assert choices([("periodic", 0)], dataclasses.replace(c, period=100, warmup=100), 1500).at.shape == (1, 2 * WIDTH)
   assert on("rule") == {"detector", "oracle", "scratch", "world-model", "no-fault"}
   assert {name: int(row.limit) for name, row in rows.items()} == dict.fromkeys(NAMES, 777) | {
-      "none": FOREVER, "always": FOREVER, "randomised": FOREVER, "periodic": 30, "random": 60}
+      "none": FOREVER, "always": FOREVER, "randomised": FOREVER, "periodic": 30, "random": 60, "oracle-stop": 333}
+  late = choices([("oracle-stop", 5), ("oracle-stop", 6)], c, 1500, None, {5: 778, 6: 1})
+  assert late.limit.tolist() == [777, 1]  # no later than the budget
   assert [name for name, arm in ARMS.items() if not arm.breaks] == ["no-fault"]
 
 
@@ -73,7 +75,7 @@ def test_bad_settings_are_refused():
   for name in ("period", "period_steps", "random_steps"):
     with pytest.raises(UserError, match=name):
       AdaptConfig(**{name: 0})
-  with pytest.raises(UserError, match="unknown arm 'orcale'; choose from: always, detector, no-fault, none, oracle, oracle-budget, periodic"):
+  with pytest.raises(UserError, match="unknown arm 'orcale'; choose from: always, detector, no-fault, none, oracle, oracle-budget, oracle-stop, periodic"):
     RunConfig("walker", arms=("orcale",))
 
 
@@ -171,13 +173,14 @@ def story():
     return state._replace(detector=state.detector._replace(at=jnp.tile(jnp.array(ALARMS), (len(NAMES), 1))))
   copy = lambda tree: jax.tree.map(lambda x: np.array(x), tree)
   state, states, digests = begin(), [], []
-  chosen = choices(labels, EAGER, STEPS * CHUNKS, [(ONSET,)] * len(NAMES))
+  stops = {NAMES.index("oracle-stop"): 70}
+  chosen = choices(labels, EAGER, STEPS * CHUNKS, [(ONSET,)] * len(NAMES), stops)
   first = copy(state)
   for c in range(CHUNKS):
     state, digest = loop.digest(state, hand_rows(c * STEPS, len(NAMES)), jnp.int32((c + 1) * STEPS), chosen, keys)
     states.append(copy(state))
     digests.append(copy(digest))
-  other = choices(labels[::-1], EAGER, STEPS * CHUNKS, [(ONSET,)] * len(NAMES))
+  other = choices(labels[::-1], EAGER, STEPS * CHUNKS, [(ONSET,)] * len(NAMES), stops)
   loop.digest(begin(), hand_rows(0, len(NAMES)), jnp.int32(STEPS), other, keys)
   return Story(first, states, digests, chosen, keys, loop)
 
@@ -193,6 +196,7 @@ def spans(story):
   heard, true = [(37, 2, 6, STOP)], [(60, 3, 7, STOP)]  # the patience of 4 is full after four more chunks
   return {"detector": heard, "none": [], "always": [(20, 1, None, None)], "periodic": [(80, 5, 7, END), (160, 10, 12, END), (240, 15, None, None)],
           "random": [(drawn, drawn // STEPS, over, END)], "oracle": true, "oracle-budget": [(60, 3, 9, END)],
+          "oracle-stop": [(60, 3, 8, END)],  # 70 steps after step 60 lie in the chunk of 128 to 143
           "scratch": [(60, 3, 8, STOP)],  # first update in chunk 5, at learning rate 0 of its warm-up: fresh heads say 0 in 4, 5 and 6
           "world-model": heard, "randomised": [], "no-fault": heard}
 
@@ -297,12 +301,16 @@ def lived(tiny, tmp_path_factory):
   patch.setitem(envs.ENVS, "walker", Easy)
   agent = tmp_path_factory.mktemp("arms") / "agent"
   card = {"env": "walker", "preset": "tiny", "repeat": 1, "dreamer": dataclasses.asdict(tiny.config)}
+  stops = agent.with_name("stops")
+  stops.mkdir()
+  run.store.write_json(stops / "config.json", {"env": "walker", "onset": FAULT, "adapt": {}})
+  run.store.write_table(stops / "snapshots.parquet", {"seed": [SEED] * 3, "since_start": [20, 148, 212], "reward_mean": [0.1, 0.99, 1.0]})
   for path, seed in ((agent, 0), (agent.with_name("agent-randomised"), 1)):
     agents.save(path, jax.jit(tiny.init)(jax.random.key(seed)), card | {"seed": seed})
 
   @functools.cache
   def make(arms, cut=None, suffix=""):
-    out, config = tmp_path_factory.mktemp("arms") / "out", RunConfig(**CONFIG, arms=arms, agent=str(agent) + suffix)
+    out, config = tmp_path_factory.mktemp("arms") / "out", RunConfig(**CONFIG, arms=arms, agent=str(agent) + suffix, stops=str(stops) if "oracle-stop" in arms else None)
     if cut is not None:  # cut off after `cut` chunks
       runner = run.Runner(config, out)
       out.mkdir(exist_ok=True)
@@ -334,19 +342,22 @@ def test_events_say_what_started_and_ended_each_arm(lived):
   out = lived(NAMES)
   drawn = int(choices([("random", SEED)], CONFIG["adapt"], LIFE).at.min())
   want = {"always": ["end of the warm-up at step 100"], "periodic": ["schedule at step 250", "schedule at step 500"], "random": [f"random time at step {drawn}"],
-          "oracle": ["true onset at step 300"], "oracle-budget": ["true onset at step 300"], "scratch": ["true onset at step 300"], "none": [], "randomised": []}
+          "oracle": ["true onset at step 300"], "oracle-budget": ["true onset at step 300"],
+          "oracle-stop": ["true onset at step 300"], "scratch": ["true onset at step 300"], "none": [], "randomised": []}
   for name, reasons in want.items():
     assert [r for _, r in events(out, name, "start")] == reasons, name
   for name in ("detector", "world-model", "no-fault"):
     acted = [s for s, r in events(out, name, "alarm") if r.startswith("acted on")]
     assert acted and [r for _, r in events(out, name, "start")] == [f"alarm at step {s}" for s in acted], name
   over = "fixed number of steps over"
-  assert {name: [r for _, r in events(out, name, "stop", "abort")] for name in ("always", "periodic", "random", "oracle", "oracle-budget")} == {
-      "always": [], "periodic": [over, over], "random": [over], "oracle": ["all six signals settled, task acceptable"], "oracle-budget": [over]}
+  assert {name: [r for _, r in events(out, name, "stop", "abort")] for name in ("always", "periodic", "random", "oracle", "oracle-budget", "oracle-stop")} == {
+      "always": [], "periodic": [over, over], "random": [over], "oracle": ["all six signals settled, task acceptable"], "oracle-budget": [over],
+      "oracle-stop": [over]}
+  assert [s for s, _ in events(out, "oracle-stop", "stop")] == [447]  # the chunk that ends 148 steps after step 300
   outcome = dict(zip(*(columns(out, "runs")[k] for k in ("arm", "outcome"))))
-  assert {name: outcome[name] for name in ("none", "always", "periodic", "random", "oracle", "oracle-budget")} == {
-      "none": "nominal", "always": "adapting", "periodic": "ended", "random": "ended", "oracle": "converged", "oracle-budget": "ended"}
-  for name in ("always", "periodic", "random", "oracle", "oracle-budget", "scratch"):
+  assert {name: outcome[name] for name in ("none", "always", "periodic", "random", "oracle", "oracle-budget", "oracle-stop")} == {
+      "none": "nominal", "always": "adapting", "periodic": "ended", "random": "ended", "oracle": "converged", "oracle-budget": "ended", "oracle-stop": "ended"}
+  for name in ("always", "periodic", "random", "oracle", "oracle-budget", "oracle-stop", "scratch"):
     assert events(out, name, "alarm") and all("arm does not listen" in r for _, r in events(out, name, "alarm")), name
 
 

@@ -394,3 +394,49 @@ def test_a_fault_that_is_not_there_yet_is_not_evaluated(config, tmp_path):
   make = lambda **kw: Snapshots.severities.__get__(type("S", (), kw)())
   of = make(config=dataclasses.replace(config, onset=500), changes=run.changes(dataclasses.replace(config, duration=200)))
   assert [of(since) for since in (499, 500, 699, 700)] == [[0.0], [0.5], [0.5], [0.0]]
+
+
+# ---- an arm that is told its stop ---------------------------------------------------------------------------------------------------
+
+def test_told_is_the_oracle_stop_of_each_seed(tmp_path):
+  told = lambda **changes: stop.told(RunConfig(**dict(env="walker", arms=("oracle-stop", "none"), seeds=2, first_seed=4, stops=str(tmp_path)) | changes))
+  with pytest.raises(FileError, match="holds no run"):
+    told()
+  run.store.write_json(tmp_path / "config.json", {"env": "walker", "fault": "gear", "onset": 5000, "agent": None, "adapt": {"ratio": 16.0, "lr": 1e-4, "patience": 3}})
+  with pytest.raises(FileError, match="no snapshots.parquet; run arm oracle-budget"):
+    told()
+  run.store.write_table(tmp_path / "snapshots.parquet", {"seed": [4] * 3 + [5] * 3 + [9], "since_start": [3000, 24, 1000] * 2 + [24],
+                                                         "reward_mean": [1.0, 0.5, 0.96, 0.1, 0.99, 0.2, 1.0]})
+  assert told() == {4: 1000, 5: 24}  # the first of 95 % of the best; nothing gained from adapting
+  assert told(arms=("none",), stops=None) == {}
+  with pytest.raises(UserError, match="no snapshots of seed 6, 7; it has 4, 5, 9"):
+    told(seeds=4)
+  for wrong, text in ((dict(onset=4000), "another onset"), (dict(fault="slope"), "another fault"), (dict(agent="walker-plain"), "another agent"),
+                      (dict(adapt=AdaptConfig(ratio=64)), "another adapt.ratio")):
+    with pytest.raises(UserError, match=text):
+      told(**wrong)
+  assert told(adapt=AdaptConfig(budget=77, patience=5)) == told()  # what ends adaptation may differ
+
+
+def test_an_arm_that_is_told_needs_to_be(config):
+  for wrong, text in ((dict(stops=None), "needs stops"), (dict(arms=("oracle",)), "needs an arm that ends there: oracle-stop"),
+                      (dict(fault="car/transfer-then-socks", env="car", severity=None), "changes once")):
+    with pytest.raises(UserError, match=text):
+      dataclasses.replace(config, **dict(arms=("oracle-stop",), snapshots=0, stops="x") | wrong)
+  together = dataclasses.replace(config, arms=("oracle-stop",), snapshots=0, stops="x", fault="any/all-easy", severity=None)
+  assert len(run.changes(together)) > 1  # several faults at once are one change
+
+
+def test_it_lives_as_the_one_that_never_stops_until_then(lived, config, folder):
+  out, acted = lived
+  told = folder / "told"
+  run.execute(dataclasses.replace(config, arms=FOUR[:3] + ("oracle-stop",), snapshots=0, stops=str(out)), told)
+  end = json.loads((told / "config.json").read_text())["oracle_stops"][str(SEED)]
+  curve = table(out, "snapshots")
+  assert end == max(1, curve[stop.oracle([s["since_start"] for s in curve], [s["reward_mean"] for s in curve])]["since_start"])
+  ends = [(e["step"], e["reason"]) for e in table(told, "events") if e["arm"] == "oracle-stop" and e["kind"] == "stop"]
+  assert [step for step, _ in ends] == [next(c for c in range(383, LIFE, 64) if c + 1 - FAULT >= end)]  # it begins in the chunk before 383, and can end with the next
+  rows = lambda folder, arm: [(r["reward"], r["opr"], r["updates"]) for r in table(folder, "trace") if r["arm"] == arm]
+  mine, endless = rows(told, "oracle-stop"), rows(out, "oracle-budget")
+  assert mine[:ends[0][0] + 1] == endless[:ends[0][0] + 1] and rows(told, "none") == rows(out, "none")
+  assert mine[-1][2] == max(m[2] for m in mine[:ends[0][0] + 2]) and (mine != endless) == (ends[0][0] + 1 - FAULT < 320)
