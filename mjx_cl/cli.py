@@ -9,10 +9,10 @@ from __future__ import annotations
 import atexit
 import contextlib
 import io
+import os
 import re
 import signal
 import sys
-import threading
 from dataclasses import dataclass
 from typing import Annotated, Union
 
@@ -22,7 +22,7 @@ from mjx_cl import __version__, commands
 from mjx_cl.config import AdaptConfig
 from mjx_cl.display import apart, say
 from mjx_cl.errors import FileError, UserError
-from mjx_cl.interrupt import Lasting
+from mjx_cl.interrupt import Interruptible, Lasting, later
 
 Positional = tyro.conf.Positional
 
@@ -392,10 +392,8 @@ def parse(argv: list[str] | None):
 def attempt(do, again=lambda: "") -> int:
   """Exit status of `do()`; what goes wrong becomes one line on standard error, an interrupt one that ends in `again()`."""
   def stop(number, frame):
-    if frame is not None and frame.f_code.co_name == "_xla_gc_callback":  # JAX's; Python drops what is raised in there
-      threading.Timer(0.01, signal.raise_signal, (number,)).start()
-      return
-    raise KeyboardInterrupt
+    if not later(number, frame):
+      raise KeyboardInterrupt
   signal.signal(signal.SIGTERM, stop)
   if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
     signal.signal(signal.SIGINT, stop)
@@ -450,7 +448,13 @@ def main(argv: list[str] | None = None) -> int:
     kind = type(command) if command else None
     return "; what was saved can be resumed with --resume" if kind in (Run, Train) else \
            "; the same command goes on where it stopped" if kind in (Record, Bench) else ""
-  return attempt(do, again)
+  status = attempt(do, again)
+  if status == 130 and argv is None and Interruptible.again:  # a save that was broken off has threads that would complain of the interpreter's end
+    for stream in (sys.stdout, sys.stderr):
+      with contextlib.suppress(OSError, ValueError):
+        stream.flush()
+    os._exit(status)
+  return status
 
 
 if __name__ == "__main__":

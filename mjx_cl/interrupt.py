@@ -38,8 +38,21 @@ class Lasting:
     return getattr(self._stream, name)
 
 
+def later(number: int, frame) -> bool:
+  """Whether the signal came within JAX's hook of the collector, where Python drops what is raised; it is then sent once more, in a moment."""
+  if frame is None or frame.f_code.co_name != "_xla_gc_callback":
+    return False
+  threading.Timer(0.01, signal.raise_signal, (number,)).start()
+  return True
+
+
 class Interruptible:
-  """Context in which SIGINT and SIGTERM set a flag; `check()` raises KeyboardInterrupt once it is set. A second signal raises at once."""
+  """Context in which SIGINT and SIGTERM set a flag; `check()` raises KeyboardInterrupt once it is set. A second signal raises at once.
+
+  Attributes:
+    again: of the class, a second signal came. What it broke off, such as a save, may still be under way on other threads: the process should end without them.
+  """
+  again = False
 
   def __init__(self):
     self._set = False
@@ -55,8 +68,11 @@ class Interruptible:
     for number, old in self._old.items():
       signal.signal(number, old)
 
-  def _handle(self, *_):
+  def _handle(self, number, frame):
     if self._set:
+      if later(number, frame):
+        return
+      Interruptible.again = True
       raise KeyboardInterrupt
     self._set = True
     print("mjx-cl: stopping after this chunk, saving", file=sys.stderr, flush=True)

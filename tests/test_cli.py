@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -369,3 +370,29 @@ def test_a_pipe_that_closes_is_no_error(mjx, monkeypatch):
     raise BrokenPipeError(errno.EPIPE, os.strerror(errno.EPIPE))
   monkeypatch.setitem(cli.DO, cli.List, closed)
   assert mjx("list") == (0, "", "")
+
+
+def test_a_second_interrupt_ends_the_process_without_its_threads(tmp_path):
+  """A thread that goes on after the interrupt must neither hold the process up nor write to the terminal."""
+  code = f"""
+import sys, threading, time, os, signal
+from mjx_cl import cli, commands
+from mjx_cl.interrupt import Interruptible
+def slow():
+  time.sleep(30)
+  print("late")
+def do(args):
+  with Interruptible():
+    threading.Thread(target=slow).start()
+    for _ in range(2):
+      os.kill(os.getpid(), signal.SIGINT)
+    time.sleep(20)
+cli.DO[cli.Doctor] = do
+sys.argv = ["mjx-cl", "doctor"]
+sys.exit(cli.main())
+"""
+  signal_off = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # a shell ignores it for what it starts in the background
+  begin = time.monotonic()
+  out = subprocess.run([sys.executable, "-c", signal_off + code], capture_output=True, text=True, timeout=60)
+  assert out.returncode == 130 and time.monotonic() - begin < 25  # the thread sleeps for 30 s
+  assert out.stderr.splitlines() == ["mjx-cl: stopping after this chunk, saving", "mjx-cl: interrupted"] and "late" not in out.stdout
