@@ -1,4 +1,9 @@
 """Many streams through a detector: the shares of the cores are the streams one by one."""
+import pathlib
+import re
+import subprocess
+import sys
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -44,3 +49,13 @@ def test_what_is_no_set_of_streams_is_refused(xs):
 def test_no_core_is_refused():
   with pytest.raises(UserError, match="one core"):
     detectors.scan(detectors.cusum(), 0)
+
+
+def test_the_example_of_the_docs_finds_the_rise():
+  text = (pathlib.Path(__file__).parent.parent / "docs/detection.md").read_text()
+  code = re.search(r"```python\n(# many\.py.*?)```", text, re.DOTALL).group(1)
+  out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+  alarms, found, delay = (int(x) for x in re.fullmatch(r"false alarms (\d+), found (\d+) of 100, median delay (\d+) samples\n", out).groups())
+  # slack 0.5: a rise of one deviation gains 0.5 a sample, so some 20 samples to 10; without it a run to 10 has odds of about e^-10 a sample, and 300,000 samples
+  # are watched behind the warm-up
+  assert found == 100 and 14 <= delay <= 26 and alarms < 150

@@ -10,7 +10,7 @@ from mjx_cl.scoring import bootstrap
 
 LEAST = 0.1  # share of reward_pre that must lie between the reference and no adaptation; as `affected` asks for
 HALF = 0.5   # of normalised recovery: where no arm reaches it, the change counts as unrecoverable
-SAME = ("env", "fault", "target", "severity", "onset", "duration", "schedule", "period", "share", "steps", "agent", "physics", "deterministic")
+SAME = ("env", "fault", "target", "severity", "onset", "duration", "schedule", "period", "share", "agent", "physics", "deterministic")
 
 
 def normalise(final: float | None, none: float | None, reference: float | None, pre: float | None, least: float = LEAST) -> float | None:
