@@ -76,12 +76,12 @@ def folder(at, runs, **config):
 
 
 def test_from_folders(tmp_path):
-  own = folder(tmp_path / "own", run())
+  own = folder(tmp_path / "own", run(), steps=25_000)
   assert normalised.of_folders(own) == normalised.rows(run())
-  expert = folder(tmp_path / "expert", run({"always": FINAL["oracle"], "scratch": FINAL["oracle"], "oracle-budget": EXPERT}))
+  expert = folder(tmp_path / "expert", run({"always": FINAL["oracle"], "scratch": FINAL["oracle"], "oracle-budget": EXPERT}), steps=55_000)  # an expert may take longer
   assert by(normalised.of_folders(own, expert))["detector", 0]["normalised"] == pytest.approx(0.625)
   for name, runs, more, words in (("a", run(), {"severity": 0.7}, "another severity"), ("b", run({"none": FINAL["none"]}), {}, "no arm that starts")):
     with pytest.raises(UserError, match=words):
-      normalised.of_folders(own, folder(tmp_path / name, runs, **more))
+      normalised.of_folders(own, folder(tmp_path / name, runs, steps=25_000, **more))
   with pytest.raises(FileError, match="no finished run"):
     normalised.of_folders(tmp_path / "nowhere")
