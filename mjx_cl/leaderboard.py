@@ -154,11 +154,12 @@ def examine(one: Entry, data: Data, runner: passes.Runner, samples: passes.Sampl
     if counter is None or counter.sound and fired[data.count_from:, :tune].sum() == dict(tried).get(threshold, 0):
       break
   levels = [threshold] + [healthy.nearest(tried, counted, a) for a in CURVE if tried]
-  faults_fired, faults_score, us = runner.faults(np.asarray(levels, np.float32), samples)
+  faults_fired, faults_score, before, us = runner.faults(np.asarray(levels, np.float32), samples)
   alarms = dict(tried)
   first, shape = data.fault.onset, data.fault.residual.opr.shape
   pairs = [(alarms[t], _placed(f, first, shape, False)) for t, f in zip(levels, faults_fired) if t in alarms]
   own = _placed(faults_fired[0], first, shape, False), _placed(faults_score[0], first, shape, np.nan)
+  own[0][:len(before)] |= before
   return found(data, float(np.float32(threshold)) if one.calibrated else None, fired, score, *own, us, curve(pairs, data, counted))
 
 
@@ -328,7 +329,8 @@ def _guarded(one: Entry, data: Data, runner: passes.Runner, samples) -> Found:
 
 
 def _pages(data: Data, oracle: dict, alarms: dict) -> list[dict]:
-  """For each fault the streams of every scoring seed around the onset, thinned, and each detector's first alarm there; those of the first in twice the detail."""
+  """For each fault the streams of every scoring seed around the onset, thinned, and each detector's first alarm there, before the onset and from it on; those of the
+  first in twice the detail."""
   out, horizon = [], data.horizon
   for key, o in oracle.items():
     lives = []
@@ -340,11 +342,13 @@ def _pages(data: Data, oracle: dict, alarms: dict) -> list[dict]:
       channels = {c: getattr(data.fault.residual, c)[window, k] for c in ("opr", "rpr", "reward", "surprise")}
       values = {c: [None if not math.isfinite(v) else float(format(v, digits)) for v in x[::thin]] for c, x in channels.items()}
       lanes, first = {name: fired[:, k] for name, fired in alarms.items()} | ({ORACLES[1]: o.run.fired[:, j]} if o.run else {}), {}
+      early = {}
       for name, fired in lanes.items():
-        hit = np.flatnonzero(fired[onset:onset + horizon])
+        hit, ahead = np.flatnonzero(fired[onset:onset + horizon]), np.flatnonzero(fired[window.start:onset])
         first[name] = int(onset + hit[0]) if len(hit) else None
+        early |= {name: int(window.start + ahead[0])} if len(ahead) else {}
       lives.append({"target": data.fault.target[k], "seed": int(data.fault.seed[k]), "onset": onset, "first": window.start, "every": thin, "channels": values,
-                    "alarms": first})
+                    "alarms": first, "early": early})
     out.append({"robot": data.robot, "fault": key[0], "severity": key[1], "control_s": data.fault.control_s} | lives[0] | {"others": lives[1:]})
   return out
 

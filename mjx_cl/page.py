@@ -25,6 +25,7 @@ class Column(NamedTuple):
     key: of a row. label, help: of the header and its tooltip. kind: text, number, integer, share (shown in per cent), ratio or score.
     better: 1 where a higher figure is better, -1 where a lower one is, 0 where neither; the first click sorts the best to the top.
     core: shown before `all columns` is chosen. tables: `rows`, `overall` or both. few: flag of a row that marks the figure.
+    noted: a figure above it is marked, and the row's note told at the mark.
   """
   key: str
   label: str
@@ -34,6 +35,7 @@ class Column(NamedTuple):
   core: bool = False
   tables: tuple[str, ...] = ("rows",)
   few: str | None = None
+  noted: float | None = None
 
 
 BOTH = ("rows", "overall")
@@ -62,11 +64,12 @@ COLUMNS = (
   Column("episode_alarm_probability", "Alarm in a healthy episode", "share", -1, "Share of healthy episodes with an alarm", few="arl0_few"),
   Column("threshold", "Threshold", "number", 0, "Decision level after calibration", few="arl0_few"),
   Column("auroc", "AUROC", "ratio", 1, "Ranks scores sample by sample; says nothing about delay or false alarms in a row", True),
-  Column("efficiency", "Efficiency", "ratio", 1, "Delay of the likelihood-ratio oracle / delay of this detector, at equal ARL0", True),
+  Column("efficiency", "Efficiency", "ratio", 1, "Delay of the likelihood-ratio oracle / delay of this detector, at equal ARL0", True, noted=1.0),
   Column("oracle_delay_steps", "Oracle delay [steps]", "number", 0, "Delay of the likelihood-ratio test fitted on other seeds"),
   Column("optimal_delay_steps", "Optimal delay [steps]", "number", 0, "Closed form; printed only where its assumptions hold"),
   Column("information_nats_per_step", "Information [nats/step]", "number", 0, "Estimated divergence of faulty from healthy streams"),
-  Column("us_per_sample", "Time per sample [µs]", "number", -1, "Wall time of one update of one stream"),
+  Column("us_per_sample", "Time per sample [µs]", "number", -1, 
+         "Wall time of one update of one stream, beside the threads of other detectors on a shared machine; dash: not timed (oracles, files of scores)"),
   Column("streams", "Streams", "integer", 0, "Streams that the row rests on"),
   Column("note", "Note", "text", 0, "What is to be known about the row"),
 )
@@ -111,9 +114,10 @@ def write(path, rows: list[dict], overall: list[dict], curves: dict, faults: lis
       is arl0_few, which marks figures that rest on fewer than 50 alarms.
     overall: one dict per detector, with every key of COLUMNS for `overall`, key_ci likewise.
     curves: {detector: {robot: [point, ...]}}, a point has POINT_KEYS.
-    faults: dicts with FAULT_KEYS: onset [control steps], channels {name: values}, alarms {detector: control step or None}; value k of a channel
-      belongs to control step first + k * every (optional keys, 0 and 1 where absent). Optional are seed, target, and others: the streams of further seeds, dicts with
-      LIFE_KEYS, first, every and target likewise.
+    faults: dicts with FAULT_KEYS: onset [control steps], channels {name: values}, alarms {detector: control step or None}, the first from the onset
+      on; value k of a channel belongs to control step first + k * every (optional keys, 0 and 1 where absent). Optional are early, {detector: control
+      step} of the first alarm that is shown before the onset, seed, target, and others: the streams of further seeds, dicts with LIFE_KEYS, first,
+      every, early and target likewise.
     meta: printed at the foot as it is, save for critical_difference (of mean ranks, or None), references (names drawn in grey, instead of
       REFERENCES) and notes (text, or a list of texts).
   Raises:

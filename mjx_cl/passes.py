@@ -57,7 +57,7 @@ def room(streams, robots) -> Room:
     samples = max(samples, int(nominal.sum()) * longest + seeds * most + number * horizon + 1)
     pasts = max(pasts, seeds)
     for lanes, copies in ((LANES, LEVELS), (LANES_SHARED, 1)):
-      rows[lanes] = max(rows[lanes], longest, most + -(-copies * number // lanes) * horizon)
+      rows[lanes] = max(rows[lanes], longest, -(-copies * seeds // lanes) * most + -(-copies * number // lanes) * horizon)
   return Room(samples, rows, pasts)
 
 
@@ -195,7 +195,8 @@ class Runner:
     copies = 1 if self.together > 1 else LEVELS
     batches = lambda n: -(-n // self.lanes)
     pasts = max(len(data.past), self.room.pasts if self.room else 0)
-    rows = max(data.steps, int(data.onset.max(initial=0)) + batches(copies * len(data.fault)) * data.horizon, self.room.rows[self.lanes] if self.room else 0)
+    past = batches(copies * len(data.past)) * int(data.onset.max(initial=0))
+    rows = max(data.steps, past + batches(copies * len(data.fault)) * data.horizon, self.room.rows[self.lanes] if self.room else 0)
     shape = rows, 2 + copies * pasts, 1 + batches(copies * len(data.fault)) + copies * pasts, data.residual.opr.shape[0]
     if getattr(self, "shape", None) is None or any(have < want for have, want in zip(self.shape[:3], shape[:3])) or self.shape[3] != shape[3]:
       self.shape, self.compiled = shape, None
@@ -228,24 +229,30 @@ class Runner:
       for i in range(len(now)):
         yield fired[:, :data.steps, i].copy(), scores[:, :data.steps, i].copy()
 
-  def faults(self, levels: np.ndarray, data: Samples) -> tuple[np.ndarray, np.ndarray, float]:
-    """(fired bool (K, H, F), score float32 (K, H, F), us): from each onset on, at K = len(levels) <= LEVELS thresholds; us: microseconds per sample."""
+  def faults(self, levels: np.ndarray, data: Samples) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """(fired bool (K, H, F), score float32 (K, H, F), before bool (O, F), us): from each onset on, at K = len(levels) <= LEVELS thresholds.
+
+    before: alarms at levels[0] ahead of each onset, False from it on; O: the last onset. us: microseconds per sample of a stream, whose thresholds share
+    its computation where they can.
+    """
     self.prepare(data)
     apart = [levels[k:k + self.together] for k in range(0, len(levels), self.together)]
     vectors = np.stack([np.append(t, [t[-1]] * (self.together - len(t))) for t in apart]).astype(np.float32)  # (groups, K)
     groups, pasts = len(vectors), len(data.past)
-    stretches, done = [], 0
+    stretches, done, row, last, ahead = [], 0, 0, int(data.onset.max(initial=0)), []
     lanes = [(g, p) for g in range(groups) for p in range(pasts)]
     for at in range(0, len(lanes), self.lanes):
       g, p = np.asarray(lanes[at:at + self.lanes]).T
       begin, places = 0, 1 + at + np.arange(len(g))
       for end in np.unique(data.onset[p]):
         live = data.onset[p] >= end
-        stretches.append(Stretch(vectors[g].T, np.where(live, data.past[p] + begin, 0), int(end - begin), int(begin),
+        stretches.append(Stretch(vectors[g].T, np.where(live, data.past[p] + begin, 0), int(end - begin), int(row + begin),
                                  np.where(live & (begin > 0), places, 0), np.where(live, places, self.shape[1] - 1)))
         done += int(end - begin)
         begin = end
-    tails, row, where = [(g, f) for g in range(groups) for f in range(len(data.fault))], int(data.onset.max(initial=0)), []
+      ahead += [(row, i) for i in range(len(g))]
+      row += last
+    tails, where = [(g, f) for g in range(groups) for f in range(len(data.fault))], []
     for at in range(0, len(tails), self.lanes):
       g, f = np.asarray(tails[at:at + self.lanes]).T
       stretches.append(Stretch(vectors[g].T, data.fault[f], data.horizon, row, 1 + g * pasts + data.owner[f], np.full(len(g), self.shape[1] - 1)))
@@ -253,14 +260,18 @@ class Runner:
       row, done = row + data.horizon, done + data.horizon
     begin = time.perf_counter()
     fired, scores = self._call(stretches, data)
-    us = (time.perf_counter() - begin) / (done * self.lanes * self.together) * 1e6
+    us = (time.perf_counter() - begin) / (done * self.lanes) * 1e6
     shape = groups, len(data.fault), self.together, data.horizon
     out_fired, out_score = np.zeros(shape, bool), np.full(shape, np.nan, np.float32)
     for (g, f), (row, i) in zip(tails, where):
       out_fired[g, f] = fired[:, row:row + data.horizon, i]
       out_score[g, f] = strongest(scores[:, row:row + data.horizon, i])
+    before = np.zeros((last, len(data.fault)), bool)
+    for f, p in enumerate(data.owner):
+      row, i = ahead[p]
+      before[:data.onset[p], f] = fired[0, row:row + data.onset[p], i]
     together = lambda x: np.moveaxis(x, 1, 3).reshape(groups * self.together, data.horizon, len(data.fault))[:len(levels)]
-    return together(out_fired), together(out_score), us
+    return together(out_fired), together(out_score), before, us
 
 
 def strongest(scores: np.ndarray) -> np.ndarray:

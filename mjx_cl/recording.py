@@ -275,9 +275,10 @@ def record(suite_: Suite, out, robots=(), physics: str = "auto", agent: str | No
   table = [row for row in table if kind_of.get(row["prefix"]) != "nominal"]  # probes of healthy streams are numbered anew, behind all others
   kept = {r: None for r in old["suite"]["robots"] if r not in robots} if old else {}
   rows, free = [row for row in table if row["robot"] in kept], 1 + max((row["stream"] for row in table), default=-1)
-  steps_of, speed, details = {}, {}, {}
+  steps_of, speed, details, who_acts = {}, {}, {}, {}
   for robot, (env, trained) in ready.items():
     weights = _digest(trained.train.params)
+    who_acts[robot] = {"name": pathlib.Path(trained.path).name, "crc32": weights}
     parts, seconds, lived = {}, 0.0, 0
     for split in ("score", "tune"):
       seeds = suite_.numbers(split)
@@ -311,9 +312,10 @@ def record(suite_: Suite, out, robots=(), physics: str = "auto", agent: str | No
   if old:
     made = {k: old[k] for k in MADE}
     kept = {r: old.get("kept", {}).get(r, made) for r in kept}
-    details, steps_of = ({r: old[name][r] for r in kept} | new for name, new in (("details", details), ("stream_steps", steps_of)))
+    tables = (("details", details), ("stream_steps", steps_of), ("agents", who_acts))
+    details, steps_of, who_acts = ({r: old[name][r] for r in kept if r in old.get(name, ())} | new for name, new in tables)
   config = {"version": VERSION, "suite": _plain(suite_, [r for r in suite_.robots if r in {*ready, *kept}]), "command": command, "schema": SCHEMA, "meta": META,
-            "details": details, "stream_steps": steps_of, **store.provenance()}
+            "agents": who_acts, "details": details, "stream_steps": steps_of, **store.provenance()}
   store.write_json(staged / "config.json", config | ({"kept": kept} if kept else {}))
   _publish(staged, out)
   size = sum(p.stat().st_size for p in out.glob("*.parquet"))
@@ -350,7 +352,7 @@ def write_meta(out, rows: list[dict]) -> None:
 
 
 def _digest(params) -> int:
-  """Tells agents apart."""
+  """CRC-32 of an agent's weights, which tells agents apart; config.json of a set holds it for each robot's."""
   import jax
   return zlib.crc32(b"".join(np.asarray(x).tobytes() for x in jax.tree.leaves(params)))
 

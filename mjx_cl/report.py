@@ -748,7 +748,29 @@ def gap(results: pathlib.Path) -> str:
   return grid(("item", "unit", "`car`", "`car_real`", "leaf", "source"), [(f"`{name}`", i.unit, value(i.simulator), value(i.real), f"`{i.leaf}`", i.source) for name, i in GAP.items()])
 
 
-CODE = {"faults": catalogue, "gap": gap}  # blocks that are written from the code, by modules that need JAX
+def schema(results: pathlib.Path) -> str:
+  """The columns of a recorded set."""
+  from mjx_cl.streams import LATENT, META, SCHEMA
+  files = [("ROBOT.parquet", SCHEMA), ("ROBOT_latents.parquet", {"stream, step": "as above", f"z0 .. z{LATENT - 1}": "float32, a fixed projection of the world model's latent"}), ("streams.parquet", META)]
+  rows = []
+  for name, columns in files:
+    groups = [k for k in columns if k.startswith("group_")]
+    for k, (column, text) in enumerate(columns.items()):
+      if column not in groups[1:]:
+        kind, _, what = text.partition(", ")
+        typed = re.fullmatch(r"u?int\d+|float\d+|bool|string", kind)
+        rows.append((f"`{name}`" if not k else "", f"`{column} .. {groups[-1]}`" if column in groups else f"`{column}`", *(x.replace("|", "\\|") for x in ((kind, what) if typed else ("", text)))))
+  return grid(("file", "column", "type", "what"), rows)
+
+
+def sizes_table(results: pathlib.Path) -> str:
+  """Parameters and bytes of every size, as `mjx-cl list sizes` has them."""
+  from mjx_cl import memory
+  rows = [(f"`{name}`", *(part.removesuffix(" with slow critic and moments") for part in text.split("; "))) for name, text in memory.table().items()]
+  return grid(("size", "on the walker", "weights, slow critic and moments", "replay"), rows)
+
+
+CODE = {"faults": catalogue, "gap": gap, "schema": schema, "sizes": sizes_table}  # blocks that are written from the code, by modules that need JAX
 
 
 # ---- pages -----------------------------------------------------------------------------------------------------------------------

@@ -34,38 +34,77 @@ class Learner(NamedTuple):
   key: jax.Array
 
 
-def make_learn(agent: Agent, batch: int, length: int, mesh=None):
+def seeds_by() -> str:
+  """How the seeds of a device share a program: `map`, one after another, on a CPU; `vmap`, all in each product, elsewhere.
+
+  On CPUs both take the same time: ten seeds of size1m 0.93 and 0.91 of ten times one (results/dreamer_update_xeon.json), 0.98 and 1.02
+  (results/dreamer_update.json); `map` needs the scratch memory of one seed. A GPU is not filled by one seed; there `vmap` is a choice by expectation, not measured.
+  """
+  return "map" if jax.default_backend() == "cpu" else "vmap"
+
+
+def make_learn(agent: Agent, batch: int, length: int, mesh=None, *, how: str | None = None):
   """(train, replay, key, weights, active (seeds,), updates) -> (train, replay, metrics (seeds,), means over the updates, culprit (seeds,)), seeds leading, jitted.
 
   `culprit` is the index into agent.CAUSES of the term at fault, -1 for none: with the update at fault, which changes no weights, the seed's updates end.
 
-  Seeds run one after another inside the program (`lax.map`): on a CPU that is as fast as vmap or faster, and needs the memory of one. A seed
-  that is not active is passed over. With a `mesh` each of its devices does its own share of the seeds: `mjx-cl train` on a CPU makes as many devices of
+  A seed that is not active is passed over. With a `mesh` each of its devices does its own share of the seeds: `mjx-cl train` on a CPU makes as many devices of
   the cores as share the seeds evenly (runtime.sharing).
+
+  Args:
+    how: `map` or `vmap` over the seeds of a device; None: as `seeds_by` says. The arithmetic is the same, so results agree but for float32 rounding.
   """
+  how = how or seeds_by()
+
+  def step(train, replay, key, weights):
+    key_sample, key_update = jax.random.split(key)
+    replay, data, address = replay_lib.sample(replay, key_sample, batch, length + 1)
+    train, metrics, latents = agent.update(train, data, key_update, weights)
+    return train, replay, metrics, address, latents
+
   def one_seed(train, replay, key, weights, updates):
     keys = jax.random.split(key, updates)
 
-    def step(train, replay, key):
-      key_sample, key_update = jax.random.split(key)
-      replay, data, address = replay_lib.sample(replay, key_sample, batch, length + 1)
-      train, metrics, latents = agent.update(train, data, key_update, weights)
+    def one_update(train, replay, key):
+      train, replay, metrics, address, latents = step(train, replay, key, weights)
       return train, replay_lib.refresh(replay, address, latents), metrics
 
     def body(state):
       i, train, replay, sums, _ = state
-      train, replay, metrics = step(train, replay, keys[i])
+      train, replay, metrics = one_update(train, replay, keys[i])
       return i + 1, train, replay, jax.tree.map(jnp.add, sums, metrics), culprit(metrics)
-    zero = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(step, train, replay, key)[2])
+    zero = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(one_update, train, replay, key)[2])
     more = lambda state: (state[0] < updates) & (state[-1] < 0)
     i, train, replay, sums, bad = jax.lax.while_loop(more, body, (jnp.int32(0), train, replay, zero, jnp.int32(-1)))
     return train, replay, jax.tree.map(lambda x: x / i, sums), bad
 
-  def every(train, replay, keys, weights, active, updates):
+  def by_map(train, replay, keys, weights, active, updates):
     run = lambda train, replay, key: one_seed(train, replay, key, weights, updates)
     shapes = jax.eval_shape(run, *jax.tree.map(lambda x: x[0], (train, replay, keys)))[2]
     rest = lambda train, replay, key: (train, replay, jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes), jnp.int32(-1))
     return jax.lax.map(lambda x: jax.lax.cond(x[3], run, rest, *x[:3]), (train, replay, keys, active))
+
+  def by_vmap(train, replay, keys, weights, active, updates):
+    keys = jax.vmap(lambda key: jax.random.split(key, updates), out_axes=1)(keys)
+
+    def one_update(train, replay, key, live):  # vmap of `one_seed` would hold a second replay: what a loop carries is kept or replaced as a whole
+      new, sampled, metrics, (stream, begin), latents = step(train, replay, key, weights)
+      kept = lambda a, b: jax.tree.map(lambda a, b: jnp.where(live, a, b), a, b)
+      sampled = sampled._replace(queue=kept(sampled.queue, replay.queue))
+      replay = replay_lib.refresh(sampled, (stream, jnp.where(live, begin, -2**30)), latents)  # long evicted: nothing is written
+      return kept(new, train), replay, kept(metrics, jax.tree.map(jnp.zeros_like, metrics)), jnp.where(live, culprit(metrics), -1)
+
+    def body(state):
+      i, count, train, replay, sums, bad = state
+      live = active & (bad < 0)
+      train, replay, metrics, found = jax.vmap(one_update)(train, replay, keys[i], live)
+      return i + 1, count + live, train, replay, jax.tree.map(jnp.add, sums, metrics), jnp.where(live, found, bad)
+    none = jnp.zeros(active.shape, jnp.int32)
+    shapes = jax.eval_shape(jax.vmap(one_update), train, replay, keys[0], active)[2]
+    zero = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    more = lambda state: (state[0] < updates) & jnp.any(active & (state[-1] < 0))
+    _, count, train, replay, sums, bad = jax.lax.while_loop(more, body, (jnp.int32(0), none, train, replay, zero, none - 1))
+    return train, replay, jax.tree.map(lambda x: x / jnp.maximum(1, count), sums), bad
 
   @functools.partial(jax.jit, static_argnames=("updates",), donate_argnums=(0, 1))
   def learn(train, replay, key, weights, active, updates):
@@ -73,7 +112,7 @@ def make_learn(agent: Agent, batch: int, length: int, mesh=None):
     if seeds == 1:  # no copy of the replay
       out = one_seed(*jax.tree.map(lambda x: x[0], (train, replay)), key, weights, updates)
       return jax.tree.map(lambda x: x[None], out)
-    body = functools.partial(every, updates=updates)
+    body = functools.partial({"map": by_map, "vmap": by_vmap}[how], updates=updates)
     if mesh is not None:
       mine, all_ = jax.sharding.PartitionSpec("seeds"), jax.sharding.PartitionSpec()
       body = jax.shard_map(body, mesh=mesh, in_specs=(mine, mine, mine, all_, mine), out_specs=mine, check_vma=False)
@@ -139,12 +178,17 @@ def faults_of(env, config: TrainConfig):
 
 
 def check(env, dreamer: DreamerConfig, config: TrainConfig, agent_name: str | None = None) -> None:
-  """Refuses a replay that can never hold one update's windows, and an agent that sees or acts otherwise than this training would have it.
+  """Refuses actions whose bounds are not -1 and 1, a replay that can never hold one update's windows, and an agent that sees or acts otherwise than this training
+  would have it.
 
   Raises:
     UserError. Size, bins and obs_scale decide what weights mean, repeat what an action does; what else differs a training may change.
   """
   from mjx_cl import agents
+  for var in env.spec.act:
+    if (var.low, var.high) != (-1, 1):
+      raise UserError(f"action {var.name!r} of robot {env.spec.name!r} has bounds {var.low:g} and {var.high:g}; the policy acts in -1 to 1: declare these bounds "
+                      f"(Var(..., -1, 1)) and scale in the environment's `step`")
   least = max(2 * CHUNK, dreamer.length + -(-dreamer.batch * dreamer.length // config.envs))
   if config.capacity < least:
     raise UserError(f"capacity={config.capacity} records of each of {config.envs} robots never hold the {dreamer.batch} x {dreamer.length} steps of an update; "
@@ -399,17 +443,28 @@ class Trainer:
       os.replace(tmp, self.out / "metrics.parquet")
 
   def resume(self) -> None:
-    """Goes on from the newest checkpoint."""
-    import pyarrow.parquet
-    state, meta = self.checkpoints.load(self.state)
-    self.state = self._place(state)
-    self.failed = {int(g): why for g, why in meta.get("failed", {}).items()}
-    self.phase, self.phase_start, self.owed, self.own = meta["phase"], meta["phase_start"], meta["owed"], meta["own"]
-    self.expert_return, self.returns.sums, self.seconds = meta["expert_return"], np.asarray(meta["sums"]), meta["seconds"]
-    self.chunks = self.checkpoints.latest()
+    """Goes on from the newest checkpoint.
+
+    Raises:
+      FileError where no checkpoint can be read, or it or metrics.parquet is not a training's; the trainer is as before then.
+    """
+    from mjx_cl import store
     path = self.out / "metrics.parquet"
-    if path.exists():
-      self.rows = pyarrow.parquet.read_table(path).to_pylist()[:self.chunks]
+    rows = store.read_arrow(path).to_pylist() if path.exists() else []
+    state, meta = self.checkpoints.load(self.state)
+    chunks = self.checkpoints.latest()
+    try:
+      failed = {int(g): str(why) for g, why in meta.get("failed", {}).items()}
+      phase, phase_start, owed, own = str(meta["phase"]), int(meta["phase_start"]), float(meta["owed"]), [float(x) for x in meta["own"]]
+      expert_return, sums, seconds = float(meta["expert_return"]), np.asarray(meta["sums"], float), float(meta["seconds"])
+      if phase not in self.collect or sums.shape != self.returns.sums.shape:
+        raise ValueError(f"phase {phase!r}, returns of {sums.shape}")
+    except (AttributeError, KeyError, TypeError, ValueError) as e:
+      why = f"no {e}" if isinstance(e, KeyError) else e
+      raise FileError(f"checkpoint {chunks} in {self.checkpoints.folder} is not a training's ({why}): --overwrite begins anew") from None
+    self.state, self.rows, self.chunks, self.failed = self._place(state), rows[:chunks], chunks, failed
+    self.phase, self.phase_start, self.owed, self.own = phase, phase_start, owed, own
+    self.expert_return, self.returns.sums, self.seconds = expert_return, sums, seconds
 
 
 def build(env, dreamer: DreamerConfig, config: TrainConfig, out, seed: int, seeds: int, demonstrator_name: str | None, agent_name: str | None,

@@ -440,7 +440,18 @@ def test_never_and_always():
 def test_periodic_fires_every_so_many_known_rows(interval):
   known = np.random.default_rng(0).uniform(size=700) > 0.3
   fired = np.asarray(scan(periodic(np.log(interval)), rows((700,), valid=known)).fired)
-  np.testing.assert_array_equal(np.flatnonzero(fired), np.flatnonzero(known)[interval - 1::interval])
+  first = np.flatnonzero(fired)[0]
+  at = int(known[:first].sum())  # of the known rows, the one that fires first
+  assert at < interval
+  np.testing.assert_array_equal(np.flatnonzero(fired), np.flatnonzero(known)[at::interval])
+
+
+def test_periodic_streams_begin_anywhere_and_keep_the_rate_where_they_are_short():
+  """400 streams of 60 rows at an interval of 100: 60 % fire once, at a uniform row."""
+  alarms = simulate(periodic(np.log(100)), 400, 60)
+  once = alarms.fired.sum(0)
+  assert once.max() == 1 and abs(once.mean() - 0.6) < 4 * np.sqrt(0.24 / 400)  # binomial
+  assert scipy.stats.kstest((alarms.fired.argmax(0)[once == 1] + 0.5) / 60, "uniform").pvalue > 0.01
 
 
 def test_random_has_its_rate_in_streams_that_differ():

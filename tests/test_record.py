@@ -130,6 +130,7 @@ def test_one_robot_of_a_set_is_recorded_anew(two, tmp_path, capsys):
   again, config = record("set", ("walker",), 1)
   assert {name for name in whole if whole[name] != again[name]} == {"walker.parquet"}  # its latents are 0 in both
   assert config["command"] == "record 1" and config["kept"]["car"]["command"] == "record 0" and set(config["kept"]) == {"car"}
+  assert set(config["agents"]) == {"walker", "car"} and all(set(a) == {"name", "crc32"} for a in config["agents"].values())
   assert set(config["details"]) == set(config["stream_steps"]) == set(config["suite"]["robots"]) == {"walker", "car"}
   assert record("set", ("walker",), 0)[0] == whole and record("set", ("car",), 2)[1]["kept"]["walker"]["command"] == "record 0"
   assert cli.main(["record", str(tmp_path / "two.toml"), "--out", str(tmp_path / "set"), "--robot", "car", "--overwrite", "--physics", "native"]) == 0

@@ -5,7 +5,7 @@
   const data = JSON.parse(document.getElementById("data").textContent);
   const SVG = document.querySelector("svg").namespaceURI;  // not spelled out, so that the file names no address at all
   const DASH = "\u2013";
-  const FEW = "\u2020";
+  const FEW = "\u2020", NOTED = "\u2021";
   const FIRST_ROWS = 100;  // a long table is drawn in full on request only
   const BEST = 7;          // curves shown at first: as many as there are colours
   const SHAPES = 4;
@@ -203,13 +203,19 @@
       pin ? swatch(row.detector, 14) : null,
       el("span", {class: "v"}, linked ? el("a", {href: pathOf([row.robot, row.fault, row.severity])}, text) : text),
       column.few && row[column.few] ? el("sup", {class: "mark", title: "rests on fewer than 50 alarms"}, FEW) : null,
+      isNoted(column, row) ? el("sup", {class: "mark", title: row.note}, NOTED) : null,
       ci ? el("span", {class: "ci"}, ci) : null);
   }
+
+  /** Whether the row's note is about this figure. */
+  const isNoted = (column, row) => !isNull(column.noted) && row[column.key] > column.noted && Boolean(row.note);
 
   const FOOTNOTE = `${FEW} rests on fewer than 50 alarms of healthy robots: an order of magnitude rather than a figure. `;
 
   function footnotes(list) {
+    const noted = columns.rows.find(column => list.some(row => isNoted(column, row)));
     return el("p", {class: "foot"}, list.some(row => row.few || row.arl0_few) ? el("span", {class: "few"}, FOOTNOTE) : null,
+      noted ? el("span", {class: "noted"}, `${NOTED} ${noted.label.toLowerCase()} above ${noted.noted}: the row's note, shown by pointing at the mark, tells why. `) : null,
       `Small figures are 95 % intervals. ${DASH}: undefined. Grey rows are references that look at nothing, or at the truth, and are not ranked.`);
   }
 
@@ -432,19 +438,22 @@
       el("h2", null, title), el("p", {class: "summary"}, summary(fault, alarms)),
       el("section", null, el("div", {class: "bar"}, span(""), span("near"), lives.length < 2 ? null : el("span", {id: "seeds", role: "group", "aria-label": "seed"}, "Seed ", lives.map(seed))),
         el("div", {id: "streams"}), el("div", {id: "alarms"}),
-        el("p", {class: "foot"}, `${which} The upright line is the onset; marks are first alarms, hollow where they came before the onset`
+        el("p", {class: "foot"}, `${which} The upright line is the onset; marks are the first alarms from it on, hollow ones the first in the stretch before it`
           + `${others.length ? ", faint and small those of the other seeds" : ""}.`)),
       el("section", null, el("h3", null, "All seeds"), el("div", {class: "scroll", id: "own"},
         table("sort", columns.rows.filter(c => chosen(c) && !Object.hasOwn(choices, c.key)), sorted(own, order), order)), footnotes(own)));
     showStreams(fault, alarms, others);
   }
 
+  /** First alarm of a detector in the stretch that is drawn before the onset, null without one. */
+  const earlyOf = (life, name) => Object.hasOwn(life.early || {}, name) ? life.early[name] : null;
+
   function summary(fault, alarms) {
-    const real = alarms.filter(([name]) => !references.has(name)), known = real.filter(([, step]) => !isNull(step));
-    const after = known.filter(([, step]) => step >= fault.onset).sort((a, b) => a[1] - b[1]), early = known.length - after.length;
+    const real = alarms.filter(([name]) => !references.has(name)), after = real.filter(([, step]) => !isNull(step)).sort((a, b) => a[1] - b[1]);
+    const early = real.filter(([name]) => earlyOf(fault, name) !== null).length;
     const first = after.length ? `; the first is ${after[0][0]}, ${figure((after[0][1] - fault.onset) * fault.control_s, "number")} s after it` : "";
     return `The fault begins at step ${figure(fault.onset, "integer")} (${figure(fault.onset * fault.control_s, "number")} s). `
-      + `In this seed ${after.length} of ${real.length} detectors alarm after the onset${first}.${early ? ` ${early} had alarmed before.` : ""}`;
+      + `In this seed ${after.length} of ${real.length} detectors alarm after the onset${first}.${early ? ` ${early} had alarmed in the stretch before it.` : ""}`;
   }
 
   function showStreams(fault, alarms, others) {
@@ -482,28 +491,30 @@
 
   /** One lane per detector under the streams, on the same time axis; the earliest alarm after the onset first. */
   function alarmLanes(fault, alarms, others, {w, left, right, low, high, x, inside, time}) {
-    const place = step => isNull(step) ? Number.MAX_VALUE : step < fault.onset ? 1e12 + step : step;
-    const list = [...alarms].sort((a, b) => place(a[1]) - place(b[1]));
+    const place = ([name, step]) => step ?? (earlyOf(fault, name) === null ? Number.MAX_VALUE : 1e12);
+    const list = [...alarms].sort((a, b) => place(a) - place(b));
     const row = 20, top = 6, bottom = top + row * list.length;
     const svg = draw("svg", {width: w, height: bottom + 36, role: "group", "aria-label": "first alarm of each detector"});
     gridX(svg, ticks(low, high, Math.max(3, Math.floor((right - left) / 80))), x, top, bottom);
     svg.append(line(left, bottom, right, bottom, "axis"), label((left + right) / 2, bottom + 31, "seconds after the onset", "tick", "middle"));
     if (inside(0)) svg.append(line(x(0), 0, x(0), bottom, "onset"));
     list.forEach(([name, step], i) => {
-      const at = top + row * (i + 0.5), t = isNull(step) ? null : time(step), text = t === null ? "no alarm" : seconds(t);
+      const at = top + row * (i + 0.5), early = earlyOf(fault, name), known = step ?? early, text = isNull(known) ? "no alarm" : seconds(time(known));
       const g = draw("g", {class: `lane${references.has(name) ? " reference" : ""}`, "data-name": name},
         label(left - 8, at + 4, shorten(name, Math.floor((left - 8) / 6.6)), "name", "end"), line(left, at, right, at, "rail"),
-        label(right + 8, at + 4, text, t === null || t < 0 ? "tick" : "name"));
+        label(right + 8, at + 4, text, isNull(step) ? "tick" : "name"));
       for (const one of others) {
-        const step = Object.hasOwn(one.alarms, name) ? one.alarms[name] : null, late = isNull(step) ? null : (step - one.onset) * fault.control_s;
-        if (late !== null && inside(late)) {
-          g.append(draw("circle", {cx: x(late), cy: at, r: 2.5, class: "other", "aria-hidden": "true", style: `fill:${look(name).color}`}));
+        for (const [step, ink] of [[earlyOf(one, name), "fill:none;stroke"], [Object.hasOwn(one.alarms, name) ? one.alarms[name] : null, "fill"]]) {
+          const late = isNull(step) ? null : (step - one.onset) * fault.control_s;
+          if (late !== null && inside(late)) {
+            g.append(draw("circle", {cx: x(late), cy: at, r: 2.5, class: "other", "aria-hidden": "true", style: `${ink}:${look(name).color}`}));
+          }
         }
       }
-      if (t !== null && inside(t)) {
-        const dot = fill(marker(name, x(t), at, 4.5, t < 0), {class: "alarm"}, []);
-        const when = t < 0 ? `${text}: before the onset, false` : `${text} after the onset`;
-        g.append(tip(dot, [name, `first alarm at step ${figure(step, "integer")}`, when], true));
+      for (const [step, kind, when] of [[early, "early", "before the onset, false"], [list[i][1], "alarm", "after the onset"]]) {
+        if (isNull(step) || !inside(time(step))) continue;
+        const dot = fill(marker(name, x(time(step)), at, 4.5, kind === "early"), {class: kind}, []);
+        g.append(tip(dot, [name, `first alarm at step ${figure(step, "integer")}`, `${seconds(time(step))}: ${when}`], true));
       }
       svg.append(g);
     });

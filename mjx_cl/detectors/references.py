@@ -46,11 +46,20 @@ def always() -> Detector:
   return _constant(True)
 
 
+class PeriodicState(NamedTuple):
+  """Attributes: count: int32 (), known rows since the last alarm. begun: float32 (), share of the interval that was over when the stream began; negative: not drawn yet."""
+  count: jax.Array
+  begun: jax.Array
+
+
 @reference
 def periodic(threshold: float = math.log(10_000)) -> Detector:
   """Fires every round(exp(threshold)) known rows, whatever they hold.
 
-    n = known rows since the last alarm, this one included;  score = ln(n + 1/2);  fired = score > threshold; then n = 0
+    n = known rows since the last alarm, this one included;  score = ln(n + 1/2 + b exp(threshold));  fired = score > threshold; then n = b = 0
+
+  A stream comes upon the clock anywhere: b is a uniform draw of the bits of OPR and reward of the first known row. Streams in step would all alarm at once, and streams
+  shorter than the interval never.
 
   Printed beside every score because where changes are frequent, or the tolerance after them long, a clock finds many of them: half a period is its
   mean delay. The threshold is ln of the interval, so calibration to an ARL0 works on it. float32 holds the interval to a row up to about 10^6 rows.
@@ -63,12 +72,21 @@ def periodic(threshold: float = math.log(10_000)) -> Detector:
   demand("periodic", threshold=(threshold, above(threshold, -1e-9), "at least 0, the logarithm of an interval in steps"))
 
   def update(state, residual):
-    count = state + residual.valid
-    score = jnp.log(count.astype(jnp.float32) + 0.5)
-    fired = residual.valid & (score > threshold)
-    return jnp.where(fired, 0, count), Alarm(fired, jnp.where(residual.valid, score, jnp.nan))
+    known = residual.valid
+    begun = jnp.where(known & (state.begun < 0), drawn(_told_apart(jnp.zeros(2, jnp.uint32), residual)), state.begun)
+    count = state.count + known
+    score = jnp.logaddexp(jnp.log(count.astype(jnp.float32) + 0.5), jnp.log(jnp.maximum(begun, 0.0)) + threshold)
+    fired = known & (score > threshold)
+    return PeriodicState(jnp.where(fired, 0, count), jnp.where(fired, 0.0, begun)), Alarm(fired, jnp.where(known, score, jnp.nan))
 
-  return Detector(lambda: jnp.int32(0), update)
+  drawn = lambda key: jax.random.uniform(key, minval=jnp.finfo(jnp.float32).tiny)
+  return Detector(lambda: PeriodicState(jnp.int32(0), jnp.float32(-1)), update)
+
+
+def _told_apart(seed: jax.Array, residual) -> jax.Array:
+  """A key of seed, uint32 (2,), and the bits of a row: streams start from one state, and would otherwise all draw the same."""
+  bits = jax.lax.bitcast_convert_type(jnp.stack([residual.opr, residual.reward]), jnp.uint32)
+  return jax.random.wrap_key_data(seed + bits, impl="threefry2x32")  # modulo 2^32; the cipher spreads what is near
 
 
 class RandomState(NamedTuple):
@@ -101,9 +119,7 @@ def random(threshold: float = math.log(10_000), seed: int = 0) -> Detector:
     return RandomState(jnp.int32(0), jax.random.key_data(jax.random.key(seed, impl="threefry2x32")))
 
   def update(state, residual):
-    bits = jax.lax.bitcast_convert_type(jnp.stack([residual.opr, residual.reward]), jnp.uint32)
-    key = jax.random.wrap_key_data(state.seed + bits, impl="threefry2x32")  # modulo 2^32; the cipher spreads what is near
-    u = jax.random.uniform(jax.random.fold_in(key, state.count), minval=jnp.finfo(jnp.float32).tiny)
+    u = jax.random.uniform(jax.random.fold_in(_told_apart(state.seed, residual), state.count), minval=jnp.finfo(jnp.float32).tiny)
     score = -jnp.log(u)
     known = residual.valid
     return RandomState(state.count + known, state.seed), Alarm(known & (score > threshold), jnp.where(known, score, jnp.nan))
