@@ -58,7 +58,7 @@ def main() -> None:
     then = {c: then[c][rows] for c in columns if c in then}
     store.write_table(out / "then.parquet", then)
   fig, axes = plt.subplots(1, 3, figsize=(13, 3.8), sharey=True, constrained_layout=True)
-  scales = (("updates", 1.0, "updates of each seed"), ("records", 1e6, "records of each seed [million control steps]"), ("seconds", 3600, "wall time [h]"))
+  scales = (("updates", 1.0, "updates of each seed"), ("records", 1e6, "records of each seed [million]"), ("seconds", 3600, "wall time [h]"))
   smooth = lambda values: np.convolve(np.pad(values, (3, 3), mode="edge"), np.ones(7) / 7, "valid")
   for axis, (name, unit, label) in zip(axes, scales):
     x = table[name].astype(float) / unit
@@ -92,7 +92,7 @@ def main() -> None:
     axis.set_xlabel(label)
     axis.grid(alpha=0.3)
   axes[0].set_ylabel("return of the training's own episodes")
-  axes[1].legend(loc="lower right", fontsize=7)
+  fig.legend(*axes[1].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=7)  # axes[1] has every kind of line; below them it covers none
   fig.savefig(out / "curve.png", dpi=110)
   fig.clear()
 

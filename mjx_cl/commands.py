@@ -255,11 +255,7 @@ def do_leaderboard(args: Leaderboard) -> None:
     raise UserError(f"--out {args.out} is a file")
   if os.path.exists(os.path.join(args.out, "leaderboard.json")) and not args.overwrite:
     raise UserError(f"{args.out} holds a leaderboard; give --overwrite to replace it, or another --out")
-  known, extra = leaderboard.variants(), []
-  for name in args.detector:
-    if name != "none":
-      choose("detector", name, known)
-  entries = [leaderboard.entry(n, s) for n, s in known.items() if not args.detector or n in args.detector]
+  entries, extra = leaderboard.chosen(args.detector, robots[0]), []
   if args.add:
     from mjx_cl.detectors import host
     build = lambda value: host.load(args.add, settings(args.set) | ({args.threshold: value} if args.threshold else {}), args.name, args.channel, args.log)
@@ -268,7 +264,7 @@ def do_leaderboard(args: Leaderboard) -> None:
   if args.submit:
     scores = submissions.read_submission(args.submit, held, robots)
     extra.append((args.name or os.path.basename(args.submit).removesuffix(".parquet"), submissions.from_scores(scores)))
-  taken = {*known, *leaderboard.ORACLES}
+  taken = {*leaderboard.variants(), *(one.name for one in entries), *leaderboard.ORACLES}
   for name, _ in extra:
     if name in taken:
       raise UserError(f"the board has a detector {name!r} already; give --name")

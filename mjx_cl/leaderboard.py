@@ -95,7 +95,7 @@ def entry(name: str, settings: dict) -> Entry:
   """An Entry from settings {use, ...}."""
   settings = dict(settings)
   use = settings.pop("use", name)
-  factory = choose("detector", use.partition("@")[0], detectors_lib.DETECTORS)
+  factory = detectors_lib.factory(use)
   parameters = inspect.signature(factory).parameters
   calibrated = "threshold" in parameters or any(p.kind is p.VAR_KEYWORD for p in parameters.values())
   about = (inspect.getdoc(factory) or "").split("\n")[0]
@@ -106,6 +106,27 @@ def entry(name: str, settings: dict) -> Entry:
   elif "robot" in parameters:
     own = lambda robot: lambda threshold: build(threshold, robot=robot)
   return Entry(name, build, calibrated, bool(getattr(factory, "reference", False)), about, own)
+
+
+def chosen(names, robot: str) -> list[Entry]:
+  """Entries of these names on the board, in its order, all where there is none; behind them those that `detectors.make` takes beside: name@channel,
+  path/to/file.py:factory, module:factory. The name `none` stands for no detector.
+
+  Args:
+    robot: on which the latter are built once, since what is wrong with one is to be said before others are run.
+  Raises:
+    UserError, one line: no such detector, file, factory or channel.
+  """
+  known, more = variants(), []
+  for name in dict.fromkeys(names):
+    if name == "none" or name in known:
+      continue
+    if name == detectors_lib.split(name)[0] and ":" not in name:
+      choose("detector", name, known)
+    one = entry(name, {"use": name})
+    _one_line(one, lambda: (one.own(robot) if one.own else one.build)(1.0).init())
+    more.append(one)
+  return [entry(n, s) for n, s in known.items() if not names or n in names] + more
 
 
 def load(streams: StreamSet, robot: str) -> Data:
@@ -228,15 +249,27 @@ def _row(name, reference, data, key, alarms, oracle, threshold=None, arl0=None, 
           **row, "us_per_sample": us, **known, **share, "note": "; ".join(notes) or None}
 
 
+def _episodes(fired: np.ndarray, data: Data) -> dict:
+  """metrics.episode_alarm_probability of alarms on the healthy streams that score, which `healthy.by_seed` has put one after the other."""
+  seeds, episode = data.score.seed, data.score.episode
+  order = np.concatenate([np.flatnonzero(seeds == seed) for seed in dict.fromkeys(seeds.tolist())])
+  apart = np.zeros(episode.shape, bool)  # stream by stream again; what came before `count_from` counts nowhere
+  apart[data.count_from:] = fired[data.count_from:].T.reshape(len(order), -1).T
+  return metrics.episode_alarm_probability(apart, episode[:, order], data.count_from)
+
+
 def oracle_rows(data: Data, oracle: dict) -> list[dict]:
-  """Rows of the two oracles: the true onset, and the likelihood-ratio CUSUM where it could be fitted."""
+  """Rows of the two oracles: the true onset, and the likelihood-ratio CUSUM where it could be fitted.
+
+  Their `us_per_sample` is None: the one reads the label, the other is a NumPy loop over all streams of all faults at once, whose time is no detector's.
+  """
   out = []
   onset_name, ratio_name = ORACLES
   steps, nominal = data.fault.residual.opr.shape[0], healthy.by_seed(np.zeros(data.score.episode.shape, bool), data.score.seed, data.count_from)
   for key, o in oracle.items():
     if o.run:
       alarms = o.run.fired, o.run.score, o.run.nominal_fired, o.run.nominal_score
-      out.append(_row(ratio_name, True, data, key, alarms, o, o.run.threshold, o.run.arl0))
+      out.append(_row(ratio_name, True, data, key, alarms, o, o.run.threshold, o.run.arl0, _episodes(o.run.nominal_fired, data)))
     since = np.arange(steps)[:, None] - data.fault.onset[data.own(key)]
     out.append(_row(onset_name, True, data, key, (since == 0, (since >= 0).astype(float), nominal, nominal.astype(float)), o))
   return out
@@ -315,10 +348,15 @@ def _workers():
 
 
 def _guarded(one: Entry, data: Data, runner: passes.Runner, samples) -> Found:
-  """`examine`; whatever goes wrong inside a detector, which may be anybody's, becomes one line that names it."""
+  """`examine`, see `_one_line`."""
+  return _one_line(one, lambda: examine(one, data, runner, samples))
+
+
+def _one_line(one: Entry, run: Callable[[], Any]):
+  """run(); whatever goes wrong inside a detector, which may be anybody's, becomes one line that names it."""
   import jax
   try:
-    return examine(one, data, runner, samples)
+    return run()
   except UserError:
     raise
   except jax.errors.ConcretizationTypeError as e:
@@ -329,8 +367,8 @@ def _guarded(one: Entry, data: Data, runner: passes.Runner, samples) -> Found:
 
 
 def _pages(data: Data, oracle: dict, alarms: dict) -> list[dict]:
-  """For each fault the streams of every scoring seed around the onset, thinned, and each detector's first alarm there, before the onset and from it on; those of the
-  first in twice the detail."""
+  """For each fault the streams of every scoring seed around the onset, thinned, and each detector's first alarms there, before the onset and from it
+  on; those of the first in twice the detail."""
   out, horizon = [], data.horizon
   for key, o in oracle.items():
     lives = []
@@ -341,8 +379,8 @@ def _pages(data: Data, oracle: dict, alarms: dict) -> list[dict]:
       thin = max(1, (window.stop - window.start) // points)
       channels = {c: getattr(data.fault.residual, c)[window, k] for c in ("opr", "rpr", "reward", "surprise")}
       values = {c: [None if not math.isfinite(v) else float(format(v, digits)) for v in x[::thin]] for c, x in channels.items()}
-      lanes, first = {name: fired[:, k] for name, fired in alarms.items()} | ({ORACLES[1]: o.run.fired[:, j]} if o.run else {}), {}
-      early = {}
+      lanes = {name: fired[:, k] for name, fired in alarms.items()} | ({ORACLES[1]: o.run.fired[:, j]} if o.run else {})
+      first, early = {}, {}
       for name, fired in lanes.items():
         hit, ahead = np.flatnonzero(fired[onset:onset + horizon]), np.flatnonzero(fired[window.start:onset])
         first[name] = int(onset + hit[0]) if len(hit) else None

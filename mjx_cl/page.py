@@ -68,7 +68,7 @@ COLUMNS = (
   Column("oracle_delay_steps", "Oracle delay [steps]", "number", 0, "Delay of the likelihood-ratio test fitted on other seeds"),
   Column("optimal_delay_steps", "Optimal delay [steps]", "number", 0, "Closed form; printed only where its assumptions hold"),
   Column("information_nats_per_step", "Information [nats/step]", "number", 0, "Estimated divergence of faulty from healthy streams"),
-  Column("us_per_sample", "Time per sample [µs]", "number", -1, 
+  Column("us_per_sample", "Time per sample [µs]", "number", -1,
          "Wall time of one update of one stream, beside the threads of other detectors on a shared machine; dash: not timed (oracles, files of scores)"),
   Column("streams", "Streams", "integer", 0, "Streams that the row rests on"),
   Column("note", "Note", "text", 0, "What is to be known about the row"),

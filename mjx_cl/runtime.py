@@ -47,7 +47,8 @@ def keep_memory() -> bool:
 
   XLA takes the scratch memory of a program anew at each call. Through mmap every call then touches fresh pages, and the page faults
   make a size1m update 1.2 to 1.4 times as long (row `update size1m, default allocator / kept memory` of results/dreamer_update_xeon.json and
-  results/dreamer_update.json). The process stays as large as its peak. A user who has set MALLOC_MMAP_MAX_, MALLOC_MMAP_THRESHOLD_ or MALLOC_TRIM_THRESHOLD_ is left alone; so is every other C library.
+  results/dreamer_update.json). The process stays as large as its peak. A user who has set MALLOC_MMAP_MAX_, MALLOC_MMAP_THRESHOLD_ or
+  MALLOC_TRIM_THRESHOLD_ is left alone; so is every other C library.
   """
   if sys.platform != "linux" or any(name in os.environ for name in ("MALLOC_MMAP_MAX_", "MALLOC_MMAP_THRESHOLD_", "MALLOC_TRIM_THRESHOLD_")):
     return False

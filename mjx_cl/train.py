@@ -18,7 +18,7 @@ import numpy as np
 from mjx_cl import checkpoint, demonstrator, fault_presets, faults, memory, replay as replay_lib
 from mjx_cl.config import CHUNK, DreamerConfig, TrainConfig
 from mjx_cl.dreamer.agent import CAUSES, EXPLODED, Agent, TrainState, Weights, culprit
-from mjx_cl.errors import FileError, UserError
+from mjx_cl.errors import FileError, UserError, choose
 from mjx_cl.interrupt import Interruptible
 from mjx_cl.rollout import Rollout, Stream, nest, records, start
 
@@ -54,8 +54,6 @@ def make_learn(agent: Agent, batch: int, length: int, mesh=None, *, how: str | N
   Args:
     how: `map` or `vmap` over the seeds of a device; None: as `seeds_by` says. The arithmetic is the same, so results agree but for float32 rounding.
   """
-  how = how or seeds_by()
-
   def step(train, replay, key, weights):
     key_sample, key_update = jax.random.split(key)
     replay, data, address = replay_lib.sample(replay, key_sample, batch, length + 1)
@@ -106,13 +104,15 @@ def make_learn(agent: Agent, batch: int, length: int, mesh=None, *, how: str | N
     _, count, train, replay, sums, bad = jax.lax.while_loop(more, body, (jnp.int32(0), none, train, replay, zero, none - 1))
     return train, replay, jax.tree.map(lambda x: x / jnp.maximum(1, count), sums), bad
 
+  over_seeds = choose("how", how or seeds_by(), {"map": by_map, "vmap": by_vmap})
+
   @functools.partial(jax.jit, static_argnames=("updates",), donate_argnums=(0, 1))
   def learn(train, replay, key, weights, active, updates):
     seeds = train.updates.shape[0]
     if seeds == 1:  # no copy of the replay
       out = one_seed(*jax.tree.map(lambda x: x[0], (train, replay)), key, weights, updates)
       return jax.tree.map(lambda x: x[None], out)
-    body = functools.partial({"map": by_map, "vmap": by_vmap}[how], updates=updates)
+    body = functools.partial(over_seeds, updates=updates)
     if mesh is not None:
       mine, all_ = jax.sharding.PartitionSpec("seeds"), jax.sharding.PartitionSpec()
       body = jax.shard_map(body, mesh=mesh, in_specs=(mine, mine, mine, all_, mine), out_specs=mine, check_vma=False)

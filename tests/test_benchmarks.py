@@ -259,3 +259,46 @@ def test_host_call_measures_both_forms(monkeypatch):
   times = bench.measure(make, 1)
   assert ways == [False, True] and list(times) == list(bench.FORMS) and min(times.values()) > 0 and by_name.registered is asked
   del nothing
+
+
+def test_gpu_rows_are_measured_where_there_is_one(monkeypatch):
+  bench, asked = load("dreamer_update"), []
+  clock = types.SimpleNamespace(measure=lambda variants, rounds: asked.append(variants) or {"one": 0.02, "ten": 0.1})
+  monkeypatch.setattr(bench, "updater", lambda size, **options: (size, options))
+  assert bench.on_gpu(clock) == (None, None) and not asked  # on a CPU nothing is guessed
+  monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+  np.testing.assert_allclose(bench.on_gpu(clock), (20, 10))
+  assert asked == [{"one": ("size12m", {}), "ten": ("size12m", {"seeds": 10, "how": "vmap"})}]
+
+
+@pytest.mark.parametrize("seeds", [1, 3])
+def test_learning_curve_names_its_axes_and_covers_no_line(tmp_path, monkeypatch, seeds):
+  """Two folders in, tables and a figure out: the rows in which episodes ended, the second training's after the first's, the legend apart from the axes."""
+  from matplotlib.figure import Figure
+  curve, rng, chunks = load("learning_curve"), np.random.default_rng(0), 40
+  row = lambda k: {"updates": 8 * k, "records": 64 * k, "seconds": 2.0 * k, "phase": "pure", "return": None if k % 2 else float(k)} | (
+      {f"return/{g}": None if k % 2 else float(k + rng.normal()) for g in range(seeds)} if seeds > 1 else {})
+  for name in ("first", "then"):
+    (tmp_path / name).mkdir()
+    rows = [row(k) for k in range(1, chunks + 1)]
+    if name == "then":
+      rows = [{k: v for k, v in r.items() if "/" not in k} for r in rows]
+    store.write_table(tmp_path / name / "metrics.parquet", {k: np.array([r[k] for r in rows], str if k == "phase" else float) for k in rows[0]})
+  seen = []
+
+  def saved(self, path, **kwargs):
+    self.canvas.draw()
+    (legend,) = self.legends
+    boxes = [x.get_window_extent() for x in self.axes]
+    seen.append(([x.get_xlabel() for x in self.axes], [t.get_text() for t in legend.get_texts()], any(legend.get_window_extent().overlaps(b) for b in boxes)))
+  monkeypatch.setattr(Figure, "savefig", saved)
+  monkeypatch.setattr(sys, "argv", ["learning_curve.py", str(tmp_path / "first"), str(tmp_path / "out"), "--published", "--then", str(tmp_path / "then")])
+  curve.main()
+  ((labels, lines, covers),) = seen
+  assert labels == ["updates of each seed", "records of each seed [million]", "wall time [h]"] and not covers
+  # each seed; mean and interval of several; what went on; the published curve
+  assert len(lines) == len(set(lines)) == {1: 1 + 2, 3: 3 + 2 + 2}[seeds]
+  table, then = (store.read_table(tmp_path / "out" / f"{name}.parquet") for name in ("curve", "then"))
+  np.testing.assert_array_equal(table["updates"], 8 * np.arange(2, chunks + 1, 2))
+  np.testing.assert_array_equal(then["records"], 64 * (chunks + np.arange(2, chunks + 1, 2)))
+  np.testing.assert_array_equal(then["seconds"], 2 * (chunks / seeds + np.arange(2, chunks + 1, 2)))

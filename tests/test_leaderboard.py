@@ -2,17 +2,21 @@
 import dataclasses
 import json
 import pathlib
+import re
+import shlex
+import types
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pyarrow.parquet
 import pytest
+from test_cli import mjx, refused  # noqa: F401  fixtures
 
 from mjx_cl import detectors, leaderboard, oracles, passes, recording, store, streams, submissions
 from mjx_cl.detectors.host import HostDetector
 from mjx_cl.errors import FileError, UserError
-from mjx_cl.scoring import healthy, limits
+from mjx_cl.scoring import healthy, limits, metrics
 
 CONTROL_S, SEEDS = 0.5, 4
 SUITE = streams.Suite("small", 400.0, 200, (260, 300), 20.0, {"score": (0, SEEDS - 1), "tune": (100, 99 + SEEDS)},
@@ -236,8 +240,59 @@ def test_pages_hold_the_stream_of_every_seed_and_its_alarms(small, board):
     assert sum(one["alarms"]["cusum"] is None for one in lives) == round(row["miss_probability"] * len(lives))
     for k, one in zip(own, lives):
       assert (one["onset"], one["alarms"]["always"], one["alarms"]["never"]) == (data.fault.onset[k], data.fault.onset[k], None)
+      assert one["early"]["always"] == one["first"] == one["onset"] - data.horizon // 2 and "never" not in one["early"]
       reward = np.asarray(one["channels"]["reward"], float)
       np.testing.assert_allclose(reward, data.fault.residual.reward[one["first"]::one["every"], k][:len(reward)], rtol=5e-3)  # three digits
+
+
+def test_pages_hold_the_alarms_before_the_onset(small, board):
+  """Those of a threshold so low that some come, against the plain scan over whole streams."""
+  data = leaderboard.load(small[0], "walker")
+  one = leaderboard.entry("cusum", {"warmup": 150})
+  low = one._replace(build=lambda threshold: one.build(2.0), calibrated=False)
+  fired = np.asarray(program(low.build)(np.float32([0]), data.fault.residual)[0])[0]
+  early = {}
+  for found in leaderboard.score(small[0], [low]).faults:
+    for k, life in zip(data.own((found["fault"], found["severity"])), [found] + found["others"]):
+      ahead, after = (np.flatnonzero(fired[a:b, k]) + a for a, b in ((life["first"], life["onset"]), (life["onset"], life["onset"] + data.horizon)))
+      assert life["early"].get("cusum") == (ahead[0] if len(ahead) else None)
+      assert life["alarms"]["cusum"] == (after[0] if len(after) else None)
+      early[int(k)] = life["early"].get("cusum")
+  assert None in early.values() and len(set(early.values())) > 2
+
+
+def test_a_longer_stream_changes_no_number(small, tmp_path, monkeypatch):
+  """Rows, curves and pages are the same where each fault stream goes on for another 150 steps, in which whatever alarms is to count nowhere."""
+  kept, after = SUITE.after(CONTROL_S), streams.Suite.after
+  with monkeypatch.context() as patch:
+    patch.setattr(streams.Suite, "after", lambda self, control_s: after(self, control_s) + 150)
+    make_set(tmp_path / "longer")
+  longer = streams.StreamSet(tmp_path / "longer")
+  assert longer.extent("walker") == (small[0].extent("walker")[0] + 150, small[0].extent("walker")[1]) and SUITE.after(CONTROL_S) == kept
+  a, b = (leaderboard.load(held, "walker").fault for held in (small[0], longer))
+  np.testing.assert_array_equal(b.residual.opr[:a.onset.min() + kept], a.residual.opr[:a.onset.min() + kept])
+  assert np.isfinite(b.residual.opr[a.onset.max() + kept:]).any()
+  entries = [leaderboard.entry("cusum", {"warmup": 150}), leaderboard.entry("rolling_sigma_plain", {"window": 150, "warmup": 100})]
+  extra = [("above", submissions.from_host(HostDetector(lambda: Above(2.5), "above", "opr", False)))]
+  a, b = (leaderboard.score(held, entries, extra=extra) for held in (small[0], longer))
+  untimed = lambda rows: [{k: v for k, v in r.items() if k != "us_per_sample"} for r in rows]
+  assert len(a.rows) > 12 and untimed(a.rows) == untimed(b.rows)
+  assert a.overall == b.overall and a.curves == b.curves and a.faults == b.faults
+
+
+def test_the_oracles_episodes_are_those_of_its_healthy_runs(board):
+  """Streams that `by_seed` puts together are told apart again, whatever the order of their seeds and the ends of their episodes."""
+  rng = np.random.default_rng(0)
+  seeds, fired = np.array([3, 0, 3, 1, 0, 1]), rng.random((90, 6)) < 0.05
+  episode = np.cumsum(rng.random((90, 6)) < 0.1, 0)
+  data = types.SimpleNamespace(score=types.SimpleNamespace(seed=seeds, episode=episode), count_from=20)
+  want = metrics.episode_alarm_probability(fired, episode, 20)
+  assert leaderboard._episodes(healthy.by_seed(fired, seeds, 20), data) == want and 0.2 < want["episode_alarm_probability"] < 0.8
+  for row in pick(board, detector="likelihood_ratio (oracle)"):
+    # eight whole episodes of 100 steps in each of 8 streams, at an ARL0 of 400 about one in five with an alarm
+    assert row["episode_alarm_probability"] * 64 == pytest.approx(round(row["episode_alarm_probability"] * 64)) and row["us_per_sample"] is None
+    assert 0 < row["episode_alarm_probability"] < 0.5 and row["episode_alarm_probability_ci"]
+  assert len(pick(board, detector="likelihood_ratio (oracle)")) == 3
 
 
 def test_information_of_the_channel_is_that_of_the_shift(board):
@@ -319,12 +374,38 @@ def test_passes_equal_whole_streams_at_every_threshold(small, name, settings, to
     np.testing.assert_array_equal(counter.count(levels, 0.0), alarms)
   assert sum(ran) < 3 * 4 * tune // together or together > 1 and ran[2] == 0  # above all scores nothing need be run
   levels = np.quantile(spread, [0.9, 0.99, 0.999]).astype(np.float32)
-  fired, score, _ = runner.faults(levels, known)
+  fired, score, before, _ = runner.faults(levels, known)
   whole = [np.asarray(x) for x in plain(levels, data.fault.residual)]
   after = [np.stack([x[:, k:k + horizon, s] for s, k in enumerate(onset)], 2) for x in whole]
   np.testing.assert_array_equal(fired, after[0])
+  np.testing.assert_array_equal(before, np.where(np.arange(len(before))[:, None] < onset, whole[0][0, :onset.max()], False))
   assert fired.any() or name == "knn"
   np.testing.assert_allclose(score, after[1], rtol=1e-4, atol=1e-5)
+
+
+def test_more_pasts_than_lanes(small, monkeypatch):
+  """Each batch of pasts keeps rows of its own."""
+  data = leaderboard.load(small[0], "walker")
+  known = passes.samples(leaderboard.joined(data.tune.residual, data.score.residual), data.fault.residual, data.fault.onset, data.fault.seed, data.horizon)
+  one = leaderboard.entry("rolling_sigma_plain", {"window": 150, "warmup": 100})
+  found = []
+  for lanes in (20, 3):
+    monkeypatch.setattr(passes, "LANES_SHARED", lanes)
+    found.append(passes.Runner(one.build, passes.room(small[0], ["walker"])).faults(np.float32([2.0, 3.0]), known)[:3])
+  for a, b in zip(*found):
+    np.testing.assert_array_equal(a, b)
+  assert found[0][2].any()
+
+
+@pytest.mark.parametrize("name, settings, lanes", [("cusum", {"warmup": 150}, passes.LANES),
+                                                   ("rolling_sigma_plain", {"window": 150, "warmup": 100}, passes.LANES_SHARED)])
+def test_time_per_sample_counts_an_update_once(small, monkeypatch, name, settings, lanes):
+  """One second for all lanes of the longest past and of one horizon; eight thresholds that share a score are one update."""
+  data = leaderboard.load(small[0], "walker")
+  known = passes.samples(leaderboard.joined(data.tune.residual, data.score.residual), data.fault.residual, data.fault.onset, data.fault.seed, data.horizon)
+  monkeypatch.setattr(passes, "time", types.SimpleNamespace(perf_counter=iter([5.0, 6.0]).__next__))
+  us = passes.Runner(leaderboard.entry(name, settings).build).faults(np.float32([3.0]), known)[-1]
+  assert us == pytest.approx(1e6 / (lanes * (data.fault.onset.max() + data.horizon)))
 
 
 def test_other_pasts_are_not_shared(small):
@@ -436,6 +517,79 @@ def test_the_scores_of_the_example(small, tmp_path, monkeypatch):
   assert np.isnan(scores[n][:99]).all() and np.isfinite(scores[n][99:]).all()
 
 
+@pytest.fixture(scope="module")
+def late(tmp_path_factory):
+  """A set of two robots whose faults begin behind a warm-up of 500 steps."""
+  folder, robots = tmp_path_factory.mktemp("late"), ("walker", "car")
+  make_set(folder, dataclasses.replace(SUITE, onset=(620, 660), robots={r: SUITE.robots["walker"] for r in robots}), robots)
+  return folder
+
+
+def shown(page, part):
+  """The one command `mjx-cl leaderboard ...` with `part` in it that a page of the documentation shows, as arguments."""
+  text = (pathlib.Path(__file__).parent.parent / page).read_text()
+  (line,) = [one for one in re.findall(r"mjx-cl (leaderboard [^`\n]*)", text) if part in one]
+  return shlex.split(line, comments=True)
+
+
+def test_the_pair_of_the_documentation_by_its_command(late, tmp_path, monkeypatch, mjx):  # noqa: F811
+  from test_detect import example
+  monkeypatch.chdir(tmp_path)
+  pathlib.Path("level.py").write_text(example("level.py"))
+  command, *more = shown("docs/detection.md", "level.py:level")
+  code, out, err = mjx(command, late, *more, "--json")
+  assert code == 0, err
+  rows = json.loads(out)
+  assert {r["detector"] for r in rows} == {"level.py:level", *leaderboard.ORACLES} and {r["robot"] for r in rows} == {"walker", "car"}
+  for row in (r for r in rows if r["detector"] == "level.py:level"):
+    assert 35 <= row["arl0_alarms"] <= 16 * 824 / 400 and row["threshold"] > 0 or row["arl0_alarms"] > 25
+    assert row["fault"] != "bias" or row["miss_probability"] == 0 and row["latency_median_steps"] <= 2  # four deviations
+
+
+def test_detectors_by_channel_and_from_files_stand_beside_the_others(late, tmp_path, monkeypatch):
+  """In the board's order, one's own behind; each name once."""
+  from test_detect import example
+  monkeypatch.chdir(tmp_path)
+  pathlib.Path("level.py").write_text(example("level.py"))
+  names = [e.name for e in leaderboard.chosen(("level.py:level@opr", "never", "cusum@opr+reward", "cusum@opr", "never", "cusum@opr+reward"), "walker")]
+  assert names == ["never", "cusum@opr", "level.py:level@opr", "cusum@opr+reward"] or names == ["cusum@opr", "never", "level.py:level@opr", "cusum@opr+reward"]
+  assert leaderboard.chosen(("none",), "walker") == [] and [e.name for e in leaderboard.chosen((), "walker")] == list(leaderboard.variants())
+  one = leaderboard.chosen(("level.py:level@opr",), "walker")[0]
+  assert one.calibrated and not one.reference and one.about.startswith("A sample more than")
+
+
+def test_what_is_no_detector_gets_one_line(refused, late, tmp_path, monkeypatch):  # noqa: F811
+  monkeypatch.chdir(tmp_path)
+  pathlib.Path("odd.py").write_text("class Plain:\n  def update(self, x):\n    return False\ndef broken(threshold=1.0):\n  return {}['x']\n")
+  say = lambda code, *names: refused(code, "leaderboard", late, "--out", "board", "--detector", *names)
+  assert "no file none.py" in say(1, "none.py:level")
+  assert "nothing of the name 'level'" in say(2, "odd.py:level")
+  assert "mjx-cl leaderboard --add" in say(2, "never", "odd.py:Plain")
+  assert "detector 'odd.py:broken' failed: KeyError" in say(2, "odd.py:broken")
+  assert "unknown detector 'cusm'" in say(2, "cusm@opr") and "unknown detector 'x'" in say(2, "x")
+  assert "'nothing'" in say(2, "cusum@nothing") and "channels of its own" in say(2, "hotelling@opr")
+  assert not pathlib.Path("board").exists()
+
+
+@pytest.mark.parametrize("part, name, others", [("mine.py:Mine", "Mine", set()), ("river.drift:PageHinkley", "PageHinkley", {"cusum@opr"})])
+def test_the_readmes_commands(late, tmp_path, monkeypatch, mjx, part, name, others):  # noqa: F811
+  """A class out of a file and a river detector, calibrated to the asked rate; both see the fault of four deviations."""
+  if part.startswith("river"):
+    pytest.importorskip("river")
+  monkeypatch.chdir(tmp_path)
+  (block,) = [b for b in re.findall(r"^```python\n(.*?)^```", (pathlib.Path(__file__).parent.parent / "README.md").read_text(), re.S | re.M) if "# mine.py" in b]
+  pathlib.Path("mine.py").write_text(block)
+  command, *more = shown("README.md", part)
+  code, out, err = mjx(command, late, *more, "--json")
+  assert code == 0, err
+  rows = json.loads(out)
+  assert {r["detector"] for r in rows} == {name, *others, *leaderboard.ORACLES} and {r["robot"] for r in rows} == {"car"}
+  assert (pathlib.Path(more[more.index("--out") + 1]) / "leaderboard.html").exists()
+  (row,) = [r for r in rows if r["detector"] == name and r["fault"] == "bias"]
+  assert row["threshold"] > 0 and 0 < row["arl0_alarms"] <= 16 * 824 / 400
+  assert row["miss_probability"] == 0 and row["us_per_sample"] > 0
+
+
 class Above:
   """A detector as a newcomer writes it."""
 
@@ -487,6 +641,8 @@ def test_files(small, board, tmp_path):
   table = store.read_table(tmp_path / "leaderboard.parquet")
   assert len(table["detector"]) == len(board.rows) and {"cost_standard_low", "cost_standard_high", "auroc"} <= set(table)
   assert "cusum" in (tmp_path / "leaderboard.html").read_text()
+  above = [r for r in board.rows if r["efficiency"] is not None and r["efficiency"] > 1]
+  assert above and all(r["note"].startswith("above 1: ") for r in above)  # what the page tells at such a figure
 
 
 def test_every_entry_of_the_default_board_is_built():

@@ -88,6 +88,45 @@ def test_a_process_takes_more_than_its_replays(need, measured):
   assert measured * 2**30 <= memory.resident(int(need * 2**30)) <= 1.6 * measured * 2**30
 
 
+GIB = 2**30
+V2 = {"memory.max": 8 * GIB, "memory.current": 5 * GIB, "memory.stat": f"anon {GIB}\nfile {4 * GIB}\nactive_file {GIB}\ninactive_file {3 * GIB}\n"}
+V1 = {"memory.limit_in_bytes": 8 * GIB, "memory.usage_in_bytes": 5 * GIB, "memory.stat": f"inactive_file {GIB}\ntotal_inactive_file {3 * GIB}\n"}
+
+
+@pytest.mark.parametrize("mount, path, sign, files, left", [
+    ("", "", "0::/", V2, 6 * GIB), ("memory", "", "9:memory:/", V1, 6 * GIB), ("", "job/7", "0::/job/7", V2, 6 * GIB), ("memory", "job/7", "4:memory:/job/7", V1, 6 * GIB),
+    ("", "", "0::/elsewhere", V2, 6 * GIB),  # as a container without a namespace of its own sees it
+    ("", "", "0::/", V2 | {"memory.max": "max"}, None), ("memory", "", "9:memory:/", V1 | {"memory.limit_in_bytes": 9223372036854771712}, None),
+    ("", "", "0::/", V2 | {"memory.stat": ""}, 3 * GIB), ("memory", "", "9:memory:/", V1 | {"memory.stat": f"inactive_file {GIB}\n"}, 4 * GIB),
+    ("", "", "0::/", V2 | {"memory.current": 9 * GIB, "memory.stat": ""}, 0), ("", "", "0::/", {"memory.max": "garbage", "memory.current": ""}, None),
+    ("", "", "", {}, None), ("", "", "", V2, 6 * GIB)])
+def test_a_containers_limit(tmp_path, mount, path, sign, files, left):
+  """Limit less what is used, the page cache that can be reclaimed apart."""
+  folder = tmp_path / "cgroup" / mount / path
+  folder.mkdir(parents=True)
+  for name, value in files.items():
+    (folder / name).write_text(f"{value}\n")
+  (tmp_path / "self").write_text(f"3:cpu,cpuacct:/x\n{sign}\n" if sign else "")
+  assert memory.container(tmp_path / "cgroup", tmp_path / "self") == left
+
+
+def test_a_limit_around_the_group_binds_too(tmp_path):
+  for folder, limit in ((tmp_path / "job", 4 * GIB), (tmp_path / "job/7", 8 * GIB)):
+    folder.mkdir()
+    for name, value in (V2 | {"memory.max": limit}).items():
+      (folder / name).write_text(str(value))
+  (tmp_path / "self").write_text("0::/job/7\n")
+  assert memory.container(tmp_path, tmp_path / "self") == 2 * GIB
+
+
+def test_what_is_free_is_the_less_of_machine_and_container(monkeypatch):
+  import psutil
+  monkeypatch.setattr(psutil, "virtual_memory", lambda: type("Memory", (), {"available": 10 * GIB}))
+  for limited, least in ((None, 10), (3 * GIB, 3), (20 * GIB, 10)):
+    monkeypatch.setattr(memory, "container", lambda: limited)
+    assert memory.free() == least * GIB
+
+
 def test_what_is_held_already_need_not_be_free(monkeypatch):
   need = memory.resident(memory.need("size1m", OBS, ACT, 1000).total(1))
   ask = lambda: memory.check("size1m", OBS, ACT, 1000, 1, ("capacity", lambda n: n))

@@ -211,18 +211,3 @@ def test_the_leaderboard_refuses(refused, recorded, tmp_path):
   assert "has no robot 'car'; choose from: walker" in refused(2, "leaderboard", recorded[0], "--detector", "never", "--robot", "car")
   assert "holds no recorded streams" in refused(1, "leaderboard", tmp_path)
   assert "the board has a detector 'never' already" in refused(2, "leaderboard", recorded[0], "--detector", "never", "--add", "river.drift:PageHinkley", "--name", "never")
-
-
-@pytest.mark.parametrize("name", sorted(leaderboard.variants()))
-def test_pure_detectors_do_not_look_ahead(recorded, name):
-  """Every entry of the board on a stream and on the same stream with another end: equal up to there, in alarms and scores."""
-  import jax
-  held = streams.StreamSet(recorded[0])
-  x = jax.tree.map(lambda x: x[:300, 0], held.get("walker", held.find("walker", "nominal", "score")).residual)
-  ends = lambda x: np.stack([x, np.concatenate([x[:200], x[200:][::-1]])])
-  assert (ends(x.opr)[0, 200:] != ends(x.opr)[1, 200:]).any()
-  detector = leaderboard.entry(name, leaderboard.variants()[name]).build(3.0)
-  run = jax.jit(jax.vmap(lambda xs: jax.lax.scan(passes.updates(detector), detector.init(), xs)[1]))
-  fired, scores = (np.asarray(r) for r in run(jax.tree.map(ends, x)))
-  np.testing.assert_array_equal(fired[0, :200], fired[1, :200])
-  np.testing.assert_array_equal(scores[0, :200], scores[1, :200])

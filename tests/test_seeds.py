@@ -11,8 +11,8 @@ import pytest
 
 from mjx_cl import train
 from mjx_cl.config import PRESETS, TrainConfig, replace
-from mjx_cl.dreamer.agent import Weights
-from mjx_cl.errors import FileError
+from mjx_cl.dreamer.agent import CAUSES, Weights, culprit
+from mjx_cl.errors import FileError, UserError
 
 DREAMER = replace(PRESETS["tiny"].dreamer, batch=4, length=8, imagine=4)
 CONFIG = TrainConfig(envs=4, updates=10_000, ratio=0.25, capacity=256)  # 2 updates a chunk
@@ -49,18 +49,64 @@ def test_seeds_in_one_program_are_a_loop_over_them(short_walker, tmp_path):
   assert np.abs(first[0] - first[1]).max() > 1e-3  # they are different seeds
 
 
-def test_a_seed_that_fails_stops_alone_and_is_named(short_walker, tmp_path, same, capfd, monkeypatch):
+def poisoned(state, g, value):
+  """The state with one weight of seed g's reward head put to `value`: NaN gives a loss that is NaN, 1e8 one that is about 1e8."""
+  params = state.train.params
+  bias = params["rew"]["out"]["bias"].at[g, 0].set(value)
+  params = {**params, "rew": {**params["rew"], "out": {**params["rew"]["out"], "bias": bias}}}
+  return state._replace(train=state.train._replace(params=params))
+
+
+def test_by_vmap_is_by_map(short_walker, tmp_path):
+  """Both ways over the seeds give the same weights, replay, metrics and culprits: one seed sound, one that fails in its first update, one that is not active."""
+  trainer = make_trainer(short_walker, tmp_path)
+  for _ in range(2):
+    trainer.step()
+  state, active = poisoned(trainer.state, 1, 1e8), np.array([True, True, False])
+  copy = lambda: jax.tree.map(jnp.copy, (state.train, state.replay))
+  assert train.seeds_by() == "map"  # on a CPU
+  by_map = trainer.learn["pure"](*copy(), jax.random.key(5), Weights(), active, 2)
+  by_vmap = train.make_learn(trainer.plain, DREAMER.batch, DREAMER.length, how="vmap")(*copy(), jax.random.key(5), Weights(), active, 2)
+  assert list(by_map[3]) == list(by_vmap[3]) == [-1, CAUSES.index("loss/rew"), -1]
+  assert [int(x) - int(y) for x, y in zip(by_vmap[0].updates, state.train.updates)] == [2, 0, 0]
+  moved = lambda out: np.abs(np.asarray(jax.tree.leaves(out[0].params)[0]) - np.asarray(jax.tree.leaves(state.train.params)[0])).max(1)
+  assert moved(by_vmap)[0] > 0 and not moved(by_vmap)[1:].any()
+  assert jax.tree.structure(by_map) == jax.tree.structure(by_vmap)
+  for (path, a), b in zip(jax.tree.leaves_with_path(by_map), jax.tree.leaves(by_vmap)):
+    assert (a.shape, a.dtype) == (b.shape, b.dtype), jax.tree_util.keystr(path)
+    a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
+    # two programs of the same arithmetic; after 2 updates they differ by float32 rounding, latents by that of float16
+    np.testing.assert_allclose(a, b, rtol=2e-3, atol=2e-4 * max(1.0, np.abs(a[0]).max()), err_msg=jax.tree_util.keystr(path))
+  with pytest.raises(UserError, match="unknown how 'pmap'; choose from: map, vmap"):
+    train.make_learn(trainer.plain, DREAMER.batch, DREAMER.length, how="pmap")
+
+
+@pytest.mark.parametrize("value, at_fault", [(1e6, False), (1.01e6, True), (-1.01e6, True), (3e38, True), (np.inf, True), (np.nan, True)])
+def test_a_loss_beyond_the_bound_is_at_fault(value, at_fault):
+  metrics = {k: jnp.float32(1.0) for k in CAUSES if k != "loss/anchor"}
+  assert int(culprit(metrics | {"loss/value": jnp.float32(value)})) == (CAUSES.index("loss/value") if at_fault else -1)
+  assert int(culprit(metrics | {"opt/grad_norm": jnp.float32(value)})) == (-1 if np.isfinite(value) else CAUSES.index("opt/grad_norm"))
+
+
+@pytest.mark.parametrize("value", [np.nan, 1e8], ids=["nan", "exploded"])
+def test_a_seed_that_fails_stops_alone_and_is_named(short_walker, tmp_path, same, capfd, monkeypatch, value):
   monkeypatch.chdir(tmp_path)  # MuJoCo logs actions that are not finite into the working folder
   sound, hurt = make_trainer(short_walker, tmp_path / "sound"), make_trainer(short_walker, tmp_path / "hurt")
   for trainer in (sound, hurt):
     trainer.step()
-  params = hurt.state.train.params
-  bias = params["rew"]["out"]["bias"].at[1, 0].set(jnp.nan)
-  params = {**params, "rew": {**params["rew"], "out": {**params["rew"]["out"], "bias": bias}}}
-  hurt.state = hurt.state._replace(train=hurt.state.train._replace(params=params))
+  hurt.state = poisoned(hurt.state, 1, value)
   at = int(hurt.state.train.updates[1])
   frozen = jax.tree.map(jnp.copy, seed(hurt.state.train, 1))
+  rows, learn, metrics = [], hurt.learn, []
+
+  def watched(*args):
+    out = learn["pure"](*args)
+    metrics.append(np.asarray(out[2]["loss/rew"]))
+    return out
+  hurt.learn = {"pure": watched}
   rows = [hurt.step() for _ in range(2)]
+  hurt.learn = learn
+  assert np.isnan(metrics[0][1]) if np.isnan(value) else 1e6 < metrics[0][1] < np.inf
   for _ in range(2):
     sound.step()
   assert list(hurt.failed) == [1] and hurt.failed[1] == f"loss/rew is not finite, or above 1e+06, in update {at + 1}"
@@ -100,7 +146,7 @@ import jax, numpy as np
 assert len(jax.devices()) == {devices}
 sys.path.insert(0, {tests!r})
 import test_seeds
-from mjx_cl import envs, train
+from mjx_cl import checkpoint, envs, train
 env = envs.make("walker", "native")
 env.spec = env.spec._replace(episode_steps=12)
 trainer = train.Trainer(env, test_seeds.DREAMER, test_seeds.CONFIG, {out!r}, seeds=2)
@@ -115,14 +161,27 @@ second = train.Trainer(env, test_seeds.DREAMER, test_seeds.CONFIG, {out!r}, seed
 second.resume()
 leaves = [np.asarray(x) for x in jax.tree.leaves(second.state.train)]
 np.savez({out!r} + "/state.npz", *leaves)
+bits = lambda t: [(jax.tree_util.keystr(p), np.asarray(x).tobytes()) for p, x in jax.tree.leaves_with_path(checkpoint.pack(t.state))]
 at = second.updates
-second.step()
+for _ in range(2):
+  trainer.step()
+  second.step()
 assert second.updates > at  # what was read meets what is spread over devices
+assert bits(second) == bits(trainer)  # N updates, save, load, M updates are N + M in one go
+second.state = second._place(test_seeds.poisoned(second.state, 1, 1e8))
+frozen = [np.asarray(x[1]) for x in jax.tree.leaves(second.state.train)]
+trainer.step()
+row = second.step()
+one = lambda t, g: [np.asarray(x[g]) for x in jax.tree.leaves(t.state.train)]
+assert list(second.failed) == [1] and second.failed[1].startswith("loss/rew is not finite, or above 1e+06") and row["failed_seeds"] == 1
+assert all(map(np.array_equal, frozen, one(second, 1))) and all(map(np.array_equal, one(trainer, 0), one(second, 0)))
 """
 
 
 def test_two_devices_equal_one(tmp_path):
-  """The same training on one and on two host devices, through a checkpoint; the programs differ, so bits may."""
+  """The same training on one and on two host devices, through a checkpoint; the programs differ, so bits may.
+
+  On either: going on from the checkpoint gives the bits of never having stopped, and a seed whose loss explodes leaves the other's bits alone."""
   out = {}
   for devices in (1, 2):
     folder = tmp_path / str(devices)

@@ -504,17 +504,17 @@
         label(left - 8, at + 4, shorten(name, Math.floor((left - 8) / 6.6)), "name", "end"), line(left, at, right, at, "rail"),
         label(right + 8, at + 4, text, isNull(step) ? "tick" : "name"));
       for (const one of others) {
-        for (const [step, ink] of [[earlyOf(one, name), "fill:none;stroke"], [Object.hasOwn(one.alarms, name) ? one.alarms[name] : null, "fill"]]) {
-          const late = isNull(step) ? null : (step - one.onset) * fault.control_s;
+        for (const [first, ink] of [[earlyOf(one, name), "fill:none;stroke"], [Object.hasOwn(one.alarms, name) ? one.alarms[name] : null, "fill"]]) {
+          const late = isNull(first) ? null : (first - one.onset) * fault.control_s;
           if (late !== null && inside(late)) {
             g.append(draw("circle", {cx: x(late), cy: at, r: 2.5, class: "other", "aria-hidden": "true", style: `${ink}:${look(name).color}`}));
           }
         }
       }
-      for (const [step, kind, when] of [[early, "early", "before the onset, false"], [list[i][1], "alarm", "after the onset"]]) {
-        if (isNull(step) || !inside(time(step))) continue;
-        const dot = fill(marker(name, x(time(step)), at, 4.5, kind === "early"), {class: kind}, []);
-        g.append(tip(dot, [name, `first alarm at step ${figure(step, "integer")}`, `${seconds(time(step))}: ${when}`], true));
+      for (const [first, kind, side] of [[early, "early", "before the onset, false"], [step, "alarm", "after the onset"]]) {
+        if (isNull(first) || !inside(time(first))) continue;
+        const dot = fill(marker(name, x(time(first)), at, 4.5, kind === "early"), {class: kind}, []);
+        g.append(tip(dot, [name, `first alarm at step ${figure(first, "integer")}`, `${seconds(time(first))} ${side}`], true));
       }
       svg.append(g);
     });

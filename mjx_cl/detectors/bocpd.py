@@ -10,13 +10,13 @@ import numpy as np
 
 from mjx_cl.detectors.base import Alarm, Detector, Warm, above, cold, demand, scalar, standardise
 
-FLOOR = 1e-30  # least probability of a possible run length: float32 ends at 1e-38, and a run length that underflows could never return
-FAR = 1e3  # samples are cut here [warm-up std]; beyond it the density of every run length would underflow
+FAR = 1e3  # samples are cut here [warm-up std]
+LEAST = -1e4  # log-probability of what no run length stands for [nats]
 
 
 class BocpdState(NamedTuple):
   """Attributes:
-    warm: scale of the stream. weight: float32 (max_run,), probability of each run length. mean, spread: float32 (max_run,), posterior location m
+    warm: scale of the stream. weight: float32 (max_run,), log-probability of each run length, -inf: impossible. mean, spread: float32 (max_run,), posterior location m
     and scale b of each. tail_kappa, tail_alpha: float32 (), the counts of the last cell. since: int32 (), samples since the restart.
   """
   warm: Warm
@@ -50,7 +50,7 @@ def bocpd(threshold: float = 1.0, hazard: float = 1e-3, recent: int = 50, max_ru
   Run lengths from max_run - 1 on share one cell. What enters it is merged by weighted mean of the natural parameters, so the cell holds the longest
   level, and one that joins it from below replaces it in proportion to its probability. The score is exact until max_run - 1 samples after a
   restart; later the older levels are one mixture instead of many, which moved the score by 0.02 to 0.13 nats with 200 to 40 cells.
-  Probabilities end at 1e-30, so the score is cut at about +-69, and samples are cut at +-1,000 deviations.
+  Probabilities are logarithms, so that the score has no bound that one swing of a gait reaches; samples are cut at +-1,000 deviations, the score at +-10,000 nats.
 
   Args:
     threshold: decision level [nats]; 0 is as likely as not, 1 had one alarm in 15,000 independent Gaussian samples. May be traced.
@@ -76,7 +76,7 @@ def bocpd(threshold: float = 1.0, hazard: float = 1e-3, recent: int = 50, max_ru
   tail = run == last
 
   def start(warm):
-    return BocpdState(warm, jnp.asarray(run == 0, jnp.float32), jnp.zeros(max_run), jnp.full(max_run, beta, jnp.float32),
+    return BocpdState(warm, jnp.where(run == 0, 0.0, -jnp.inf).astype(jnp.float32), jnp.zeros(max_run), jnp.full(max_run, beta, jnp.float32),
                       jnp.float32(k_fixed[last]), jnp.float32(a_fixed[last]), jnp.int32(0))
 
   def update(state, x):
@@ -87,19 +87,20 @@ def bocpd(threshold: float = 1.0, hazard: float = 1e-3, recent: int = 50, max_ru
     g = jnp.where(tail, gamma_ratio(state.tail_alpha), g_fixed)
     square = jnp.square(z - state.mean)
     width = 2 * state.spread * (k + 1) / k
-    density = g * jax.lax.rsqrt(math.pi * width) * jnp.exp(-(a + 0.5) * jnp.log(1 + square / width))
+    density = jnp.log(g * jax.lax.rsqrt(math.pi * width)) - (a + 0.5) * jnp.log(1 + square / width)
 
-    joint = state.weight * density
-    joint = joint / jnp.sum(joint)
+    joint = state.weight + density
+    joint = joint - jax.nn.logsumexp(joint)
     since = state.since + 1
-    grown = (1 - hazard) * joint
+    grown = math.log1p(-hazard) + joint
     low, high = grown[last - 1], grown[last]  # both become the last cell
-    weight = jnp.concatenate([jnp.full(1, hazard), grown[:-1]]).at[last].add(high)
-    weight = jnp.where(run <= since, jnp.maximum(weight, FLOOR), 0.0)
+    together = jnp.logaddexp(low, high)
+    weight = jnp.concatenate([jnp.full(1, math.log(hazard)), grown[:-1]]).at[last].set(together)
+    weight = jnp.where(run <= since, weight, -jnp.inf)
 
     mean = (k * state.mean + z) / (k + 1)
     spread = state.spread + k * square / (2 * (k + 1))
-    share = jnp.where(high > 0, low / jnp.maximum(low + high, FLOOR), 1.0)
+    share = jnp.where(high > -jnp.inf, jnp.exp(low - together), 1.0)
     k_low, k_high = share * (k_fixed[last - 1] + 1), (1 - share) * (state.tail_kappa + 1)
     k_tail = k_low + k_high
     mean_tail = (k_low * mean[last - 1] + k_high * mean[last]) / k_tail
@@ -109,9 +110,10 @@ def bocpd(threshold: float = 1.0, hazard: float = 1e-3, recent: int = 50, max_ru
     shift = lambda prior, old, end: jnp.concatenate([jnp.full(1, prior, jnp.float32), old[:-2], end[None]])
     new = BocpdState(warm, weight, shift(0.0, mean, mean_tail), shift(beta, spread, spread_tail), k_tail, a_tail, jnp.minimum(since, 2 ** 30))
 
-    changed = (run >= 1) & (run <= recent) & (run < since)
-    odds = lambda which: jnp.log(jnp.maximum(jnp.sum(jnp.where(which, weight, 0.0)), FLOOR))
-    score = odds(changed) - odds((run >= 1) & ~changed)
+    near, inside = weight[1:recent + 1], run[1:recent + 1]
+    began = jnp.max(jnp.where(inside == since, near, -jnp.inf))  # the run that the restart began stands on the other side
+    total = lambda x: jnp.maximum(jax.nn.logsumexp(x), LEAST)
+    score = total(jnp.where(inside < since, near, -jnp.inf)) - jnp.logaddexp(total(weight[recent + 1:]), began)
     fired = ready & (score > threshold)
     new = jax.tree.map(lambda a, b: jnp.where(ready & ~fired, a, b), new, start(warm))
     return new, Alarm(fired, jnp.where(ready, score, jnp.nan))
