@@ -289,7 +289,7 @@ def test_bocpd_equals_the_exact_posterior(settings):
 
 
 def test_bocpd_has_no_bound_that_a_large_step_reaches():
-  settings = dict(threshold=1e9, hazard=0.002, recent=20, kappa=0.1, alpha=1.0, beta=1.0)
+  settings = dict(threshold=1e9, hazard=0.002, recent=60, kappa=0.1, alpha=1.0, beta=1.0)
   xs = levels(np.random.default_rng(5), [260, 19], [0.0, 15.0], [1.0, 1.0])
   score, want = run(bocpd(max_run=300, warmup=0, **settings), xs)[1], exact_bocpd(xs.astype(float), **settings)[1]
   assert want[-1] > 90 and want[-1] > want[-2] > want[-3]  # where probabilities end at 1e-30 it stops at 69
