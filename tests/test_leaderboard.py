@@ -542,7 +542,7 @@ def test_the_pair_of_the_documentation_by_its_command(late, tmp_path, monkeypatc
   rows = json.loads(out)
   assert {r["detector"] for r in rows} == {"level.py:level", *leaderboard.ORACLES} and {r["robot"] for r in rows} == {"walker", "car"}
   for row in (r for r in rows if r["detector"] == "level.py:level"):
-    assert 35 <= row["arl0_alarms"] <= 16 * 824 / 400 and row["threshold"] > 0 or row["arl0_alarms"] > 25
+    assert 16 * 824 / 400 - 4 < row["arl0_alarms"] <= 16 * 824 / 400 and row["threshold"] > 0
     assert row["fault"] != "bias" or row["miss_probability"] == 0 and row["latency_median_steps"] <= 2  # four deviations
 
 
@@ -552,7 +552,7 @@ def test_detectors_by_channel_and_from_files_stand_beside_the_others(late, tmp_p
   monkeypatch.chdir(tmp_path)
   pathlib.Path("level.py").write_text(example("level.py"))
   names = [e.name for e in leaderboard.chosen(("level.py:level@opr", "never", "cusum@opr+reward", "cusum@opr", "never", "cusum@opr+reward"), "walker")]
-  assert names == ["never", "cusum@opr", "level.py:level@opr", "cusum@opr+reward"] or names == ["cusum@opr", "never", "level.py:level@opr", "cusum@opr+reward"]
+  assert names == ["never", "cusum@opr", "level.py:level@opr", "cusum@opr+reward"]
   assert leaderboard.chosen(("none",), "walker") == [] and [e.name for e in leaderboard.chosen((), "walker")] == list(leaderboard.variants())
   one = leaderboard.chosen(("level.py:level@opr",), "walker")[0]
   assert one.calibrated and not one.reference and one.about.startswith("A sample more than")

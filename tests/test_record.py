@@ -10,7 +10,7 @@ from test_cli import mjx, refused  # noqa: F401  fixtures
 from test_leaderboard import submission, trailing
 from test_run import saved  # noqa: F401  a fixture
 
-from mjx_cl import cli, leaderboard, passes, recording, store, streams
+from mjx_cl import cli, recording, store, streams
 from mjx_cl.errors import FileError, UserError
 
 SUITE = """
