@@ -119,7 +119,7 @@ class Checkpoints:
     if not all(jax.tree.leaves(same)):
       raise FileError(f"checkpoint {number} in {self.folder} belongs to another size or robot")
     for path, dtype in _dtypes(packed).items():
-      if stored[path] != dtype:  # orbax has cast it
+      if stored.get(path, dtype) != dtype:  # orbax has cast it
         raise FileError(f"checkpoint {number} in {self.folder} belongs to another version: {'.'.join(path)} is {stored[path]} there, {dtype} here")
     if first:
       self._set_aside(numbers[:numbers.index(number)])

@@ -187,7 +187,7 @@ class Leaderboard:
   robot: tuple[str, ...] = ()
   """Only these robots of the set."""
   detector: tuple[str, ...] = ()
-  """Only these detectors, by their names on the board; `none`: only the oracles and one's own. Default: all."""
+  """Only these detectors, by their names on the board, or name@channel, path/to/file.py:factory, module:factory; `none`: only the oracles and one's own. Default: all."""
   add: str | None = None
   """module:Class or file.py:Class, a Python class with update(x) -> bool; a river detector works unchanged."""
   set: tuple[str, ...] = ()

@@ -7,6 +7,7 @@ import pathlib
 from collections.abc import Callable
 from typing import NamedTuple
 
+from mjx_cl import runtime
 from mjx_cl.dreamer.sizes import SIZES
 from mjx_cl.errors import UserError
 
@@ -33,9 +34,9 @@ class Need(NamedTuple):
   weights: int
   replay: int
 
-  def total(self, seeds: int) -> int:
-    """Of `seeds` seeds; an update holds one more copy of the weights of the seed at work."""
-    return seeds * (self.weights + self.replay) + self.weights
+  def total(self, seeds: int, at_once: int = 1) -> int:
+    """Of `seeds` seeds; an update holds one more copy of the weights of the seeds at work, `at_once` of them."""
+    return seeds * (self.weights + self.replay) + at_once * self.weights
 
 
 @functools.lru_cache
@@ -119,7 +120,7 @@ def check(size: str, obs_size: int, act_size: int, records: int, seeds: int, wha
   setting, records_of = what
   wanted = need(size, obs_size, act_size, records, bins)
   here = -(-seeds // shards)
-  space, grown = int(MARGIN * free()) + held(), resident(wanted.total(here))
+  space, grown = int(MARGIN * free()) + held(), resident(wanted.total(here, here if runtime.seeds_by() == "vmap" else 1))
   if grown > space:
     each = (resident(2**40) - resident(0)) / 2**40  # bytes of the process for a byte of replay
     room = int((space - grown) / each + here * wanted.replay) // here // wanted.record

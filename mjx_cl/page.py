@@ -111,7 +111,7 @@ def write(path, rows: list[dict], overall: list[dict], curves: dict, faults: lis
 
   Args:
     rows: one dict per detector x robot x fault x severity, with every key of COLUMNS for `rows`; key_ci [low, high] or None is optional, and so
-      is arl0_few, which marks figures that rest on fewer than 50 alarms.
+      is arl0_few, which marks figures that rest on fewer than 50 alarms; a figure above Column.noted needs a note.
     overall: one dict per detector, with every key of COLUMNS for `overall`, key_ci likewise.
     curves: {detector: {robot: [point, ...]}}, a point has POINT_KEYS.
     faults: dicts with FAULT_KEYS: onset [control steps], channels {name: values}, alarms {detector: control step or None}, the first from the onset
@@ -121,11 +121,14 @@ def write(path, rows: list[dict], overall: list[dict], curves: dict, faults: lis
     meta: printed at the foot as it is, save for critical_difference (of mean ranks, or None), references (names drawn in grey, instead of
       REFERENCES) and notes (text, or a list of texts).
   Raises:
-    UserError where a key is missing or a figure is infinite; FileError where the file cannot be written.
+    UserError where a key or a note is missing or a figure is infinite; FileError where the file cannot be written.
   """
   for name, table, keys in (("row", rows, _keys("rows")), ("overall", overall, _keys("overall")), ("fault", faults, FAULT_KEYS)):
     for i, row in enumerate(table):
       _demand(f"{name} {i}", row, keys)
+      for c in COLUMNS if name == "row" else ():
+        if c.noted is not None and (row[c.key] or 0) > c.noted and not row["note"]:
+          raise UserError(f"page: row {i} of {row['detector']}: its {c.key} is above {c.noted:g}, and no note says why")
       for j, life in enumerate(row.get("others", ()) if name == "fault" else ()):
         _demand(f"{name} {i}, other stream {j}", life, LIFE_KEYS)
   for detector, robots in curves.items():

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_cl import checkpoint, demonstrator, fault_presets, faults, memory, replay as replay_lib
+from mjx_cl import checkpoint, demonstrator, fault_presets, faults, memory, replay as replay_lib, runtime
 from mjx_cl.config import CHUNK, DreamerConfig, TrainConfig
 from mjx_cl.dreamer.agent import CAUSES, EXPLODED, Agent, TrainState, Weights, culprit
 from mjx_cl.errors import FileError, UserError, choose
@@ -34,15 +34,6 @@ class Learner(NamedTuple):
   key: jax.Array
 
 
-def seeds_by() -> str:
-  """How the seeds of a device share a program: `map`, one after another, on a CPU; `vmap`, all in each product, elsewhere.
-
-  On CPUs both take the same time: ten seeds of size1m 0.93 and 0.91 of ten times one (results/dreamer_update_xeon.json), 0.98 and 1.02
-  (results/dreamer_update.json); `map` needs the scratch memory of one seed. A GPU is not filled by one seed; there `vmap` is a choice by expectation, not measured.
-  """
-  return "map" if jax.default_backend() == "cpu" else "vmap"
-
-
 def make_learn(agent: Agent, batch: int, length: int, mesh=None, *, how: str | None = None):
   """(train, replay, key, weights, active (seeds,), updates) -> (train, replay, metrics (seeds,), means over the updates, culprit (seeds,)), seeds leading, jitted.
 
@@ -52,7 +43,7 @@ def make_learn(agent: Agent, batch: int, length: int, mesh=None, *, how: str | N
   the cores as share the seeds evenly (runtime.sharing).
 
   Args:
-    how: `map` or `vmap` over the seeds of a device; None: as `seeds_by` says. The arithmetic is the same, so results agree but for float32 rounding.
+    how: `map` or `vmap` over the seeds of a device; None: as runtime.seeds_by says. The arithmetic is the same, so results agree but for float32 rounding.
   """
   def step(train, replay, key, weights):
     key_sample, key_update = jax.random.split(key)
@@ -104,7 +95,7 @@ def make_learn(agent: Agent, batch: int, length: int, mesh=None, *, how: str | N
     _, count, train, replay, sums, bad = jax.lax.while_loop(more, body, (jnp.int32(0), none, train, replay, zero, none - 1))
     return train, replay, jax.tree.map(lambda x: x / jnp.maximum(1, count), sums), bad
 
-  over_seeds = choose("how", how or seeds_by(), {"map": by_map, "vmap": by_vmap})
+  over_seeds = choose("how", how or runtime.seeds_by(), {"map": by_map, "vmap": by_vmap})
 
   @functools.partial(jax.jit, static_argnames=("updates",), donate_argnums=(0, 1))
   def learn(train, replay, key, weights, active, updates):

@@ -246,10 +246,10 @@ def test_pages_hold_the_stream_of_every_seed_and_its_alarms(small, board):
 
 
 def test_pages_hold_the_alarms_before_the_onset(small, board):
-  """Those of a threshold so low that some come, against the plain scan over whole streams."""
+  """Those of a threshold so low that some streams have one, against the plain scan over whole streams."""
   data = leaderboard.load(small[0], "walker")
   one = leaderboard.entry("cusum", {"warmup": 150})
-  low = one._replace(build=lambda threshold: one.build(2.0), calibrated=False)
+  low = one._replace(build=lambda threshold: one.build(3.5), calibrated=False)
   fired = np.asarray(program(low.build)(np.float32([0]), data.fault.residual)[0])[0]
   early = {}
   for found in leaderboard.score(small[0], [low]).faults:
@@ -258,7 +258,7 @@ def test_pages_hold_the_alarms_before_the_onset(small, board):
       assert life["early"].get("cusum") == (ahead[0] if len(ahead) else None)
       assert life["alarms"]["cusum"] == (after[0] if len(after) else None)
       early[int(k)] = life["early"].get("cusum")
-  assert None in early.values() and len(set(early.values())) > 2
+  assert None in early.values() and len(set(early.values())) > 1
 
 
 def test_a_longer_stream_changes_no_number(small, tmp_path, monkeypatch):
@@ -289,9 +289,8 @@ def test_the_oracles_episodes_are_those_of_its_healthy_runs(board):
   want = metrics.episode_alarm_probability(fired, episode, 20)
   assert leaderboard._episodes(healthy.by_seed(fired, seeds, 20), data) == want and 0.2 < want["episode_alarm_probability"] < 0.8
   for row in pick(board, detector="likelihood_ratio (oracle)"):
-    # eight whole episodes of 100 steps in each of 8 streams, at an ARL0 of 400 about one in five with an alarm
-    assert row["episode_alarm_probability"] * 64 == pytest.approx(round(row["episode_alarm_probability"] * 64)) and row["us_per_sample"] is None
-    assert 0 < row["episode_alarm_probability"] < 0.5 and row["episode_alarm_probability_ci"]
+    hits, alarms = row["episode_alarm_probability"] * 64, sum(row["stream_healthy_alarms"])  # eight whole episodes of 100 steps in each of 8 streams
+    assert hits == round(hits) <= alarms and (hits > 0) == (alarms > 0) == (row["fault"] == "gear") and row["us_per_sample"] is None
   assert len(pick(board, detector="likelihood_ratio (oracle)")) == 3
 
 

@@ -4,7 +4,7 @@ import re
 import jax
 import pytest
 
-from mjx_cl import memory, replay
+from mjx_cl import memory, replay, runtime
 from mjx_cl.config import PRESETS, RunConfig, TrainConfig
 from mjx_cl.dreamer.agent import Agent
 from mjx_cl.errors import UserError
@@ -55,6 +55,16 @@ def test_an_accelerator_holds_weights_and_replays_alone(monkeypatch):
   assert memory.resident(2**30) == memory.PROCESS + int(memory.GROWTH * 2**30)
   monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
   assert memory.resident(2**30) == 2**30
+  assert runtime.seeds_by() == "vmap"
+  need = memory.need("size1m", OBS, ACT, 1000)
+  for short in (0, 2):  # all seeds are at work at once: twice the weights of each
+    monkeypatch.setattr(memory, "free", lambda: int((3 * (2 * need.weights + need.replay) - short) / memory.MARGIN) + 1)
+    ask = lambda: memory.check("size1m", OBS, ACT, 1000, 3, ("capacity", lambda n: n))
+    if short:
+      with pytest.raises(UserError):
+        ask()
+    else:
+      ask()
   monkeypatch.setattr(memory, "free", lambda: 200 * 2**20)
   with pytest.raises(UserError) as e:
     memory.check("size1m", OBS, ACT, 10**7, 3, ("capacity", lambda n: n))

@@ -76,9 +76,9 @@ def synthetic(seed=0, detectors=REAL + page.REFERENCES, robots=ROBOTS, faults=FA
                     "reward": 0.9 - 0.3 * after * severity + 0.05 * rng.normal(size=t.size), "surprise": rng.gamma(4, 1 + after, t.size)}
         channels["opr"][100:104] = np.nan
         alarms = {d: None if rng.uniform() > 0.3 + 0.7 * skill[d] else int(1200 + rng.integers(2, 900) * (1.05 - skill[d])) for d in detectors}
-        alarms |= {"always": 0, "never": None, "oracle": 1200}
+        alarms |= {"always": 1200, "never": None, "oracle": 1200, "periodic": None}
         pages.append({"robot": robot, "fault": fault, "severity": severity, "onset": 1200, "control_s": control_s, "every": every,
-                      "channels": channels, "alarms": alarms})
+                      "channels": channels, "alarms": alarms, "early": {d: k for d, k in (("always", 0), ("periodic", 800)) if d in alarms}})
   pages[0] |= {"seed": 0, "target": "left_hip"}
   pages[0]["others"] = [{"seed": k, "target": "right_knee", "onset": 1200 + 40 * k, "first": 40 * k, "every": 8, "alarms": {d: 1240 + 60 * k for d in detectors[:3]},
                          "channels": {c: v[k::2] for c, v in pages[0]["channels"].items()}} for k in (1, 2)]
@@ -138,6 +138,24 @@ def test_every_figure_is_embedded(board, file):
   assert data["overall"][0]["detector"] == "cusum" and data["meta"]["command"] == "mjx-cl leaderboard --seeds 10"
   assert data["curves"]["glr"]["walker"][3]["detected"] == pytest.approx(board["curves"]["glr"]["walker"][3]["detected"], rel=1e-5)
   assert data["faults"][0]["channels"]["opr"][100:104] == [None] * 4  # nan
+
+
+def noted(board, **edit):
+  """The board with an efficiency above 1, and its reason, in the row of the last detector but the references on the first fault."""
+  row = next(r for r in board["rows"] if r["detector"] == "knn")
+  return board | {"rows": [r | {"efficiency": 1.25, "note": "above 1: it was luckier"} | edit if r is row else r for r in board["rows"]]}
+
+
+def test_an_efficiency_above_one_holds_its_note(board, tmp_path):
+  """The column says from where on a figure wants the note, and the script reads that."""
+  page.write(tmp_path / "x.html", **noted(board))
+  data = embedded(tmp_path / "x.html")
+  (column,) = [c for c in data["columns"] if c["noted"] is not None]
+  assert column["key"] == "efficiency" and column["noted"] == 1 and column["core"] and "column.noted" in (page.ASSETS / "leaderboard.js").read_text()
+  rows = [dict(zip(data["keys"], values)) for values in data["rows"]]
+  assert [r["note"] for r in rows if r["efficiency"] > column["noted"]] == ["above 1: it was luckier"]
+  with pytest.raises(UserError, match="page: row .* of knn: its efficiency is above 1, and no note says why"):
+    page.write(tmp_path / "y.html", **noted(board, note=None))
 
 
 def test_file_loads_nothing(file):
@@ -396,6 +414,15 @@ def test_intervals_few_alarms_and_all_columns(browser, file, board):
   assert set(marked) == few and 0 < len(few) < 20 and "fewer than 50 alarms" in browser.one("#overall-foot").text
 
 
+def test_an_efficiency_above_one_is_marked(browser, file, board, tmp_path):
+  page.write(tmp_path / "x.html", **noted(board))
+  browser.open(tmp_path / "x.html", "#q=knn")
+  marks = browser.js("return [...document.querySelectorAll(\"#full td[data-key='efficiency'] sup.mark\")].map(n => [n.textContent, n.title])")
+  assert marks == [["‡", "above 1: it was luckier"]] and "efficiency above 1" in browser.one("#full-foot").text
+  browser.open(file)
+  assert not browser.all("#full td[data-key='efficiency'] sup.mark") and "efficiency above" not in browser.one("#full-foot").text
+
+
 def test_curves_and_intervals_are_drawn_and_toggle(browser, file, board):
   from selenium.webdriver.common.action_chains import ActionChains
   from selenium.webdriver.support.ui import WebDriverWait
@@ -466,11 +493,15 @@ def test_fault_page_draws_streams_and_alarms(browser, file, board):
   assert len(known) == sum(v is not None for v in fault["alarms"].values()) == len(browser.all("#alarms .alarm"))
   slope = np.polyfit(*zip(*known), 1)[0]
   assert slope > 0 and max(abs(onset + slope * (step - 1200) - x) for step, x in known) < 0.5  # pixels
-  assert all("no alarm" in text for n, x, text in lanes if x is None)
+  assert all(("no alarm" in text) == (n not in fault["early"]) for n, x, text in lanes if x is None)
   steps = [fault["alarms"][n] for n, _, _ in lanes]
-  groups = [0 if s is not None and s >= 1200 else 1 if s is not None else 2 for s in steps]  # alarms, false alarms, none; the earliest first
+  groups = [0 if s is not None else 1 if n in fault["early"] else 2 for s, (n, _, _) in zip(steps, lanes)]  # alarms, false alarms, none; the earliest first
   assert groups == sorted(groups) and steps[:groups.count(0)] == sorted(steps[:groups.count(0)]) and set(groups) == {0, 1, 2}
-  assert "before the onset" in browser.one("#alarms g.lane[data-name='always'] .alarm").get_attribute("aria-label")
+  early = browser.js("""return [...document.querySelectorAll('#alarms .early')].map(n => [n.parentNode.dataset.name, (b => b.x + b.width / 2)(n.getBBox()),
+    n.getAttribute('aria-label')])""")
+  assert {n for n, _, _ in early} == {"always", "periodic"} and all("before the onset, false" in text for _, _, text in early)
+  assert max(abs(onset + slope * (fault["early"][n] - 1200) - x) for n, x, _ in early) < 0.5
+  assert "after the onset" in browser.one("#alarms g.lane[data-name='always'] .alarm").get_attribute("aria-label")
   assert len(browser.all("#own tbody tr")) == 20
   browser.js("[...document.querySelectorAll('#page .bar button')][1].click()")
   assert browser.hash() == "#fault/walker/gear/0.5?span=near"

@@ -34,6 +34,7 @@ SOURCES = {
     "arms": ("paper/bench.json",),
     "other-arms": ("arms/bench.json",),
     "stop-rule": ("stop/bench.json",),
+    "oracle-stop": ("oracle_stop/suite.json", "oracle_stop/bench.json", "oracle_stop/damping/runs.parquet", "oracle_stop/payload/runs.parquet"),
     "again": ("again/bench.json",),
     "study": ("study/bench.json", "study/suite.json", "study/bench.parquet"),
     "size": ("size/bench.json", "size/suite.json", "size/less/config.json"),
@@ -321,6 +322,7 @@ CONSTANTS = {  # what a block says of itself: windows of the definitions, sizes 
              | {"16", "12", "4", "05"},  # the authors' batch, size and learning rate
     "arms": {"95", "1", "2,000", "10,000"},
     "other-arms": {"95", "1", "2,000", "10,000"},
+    "oracle-stop": {"95", "2,000", "0"},
     "stop-rule": {"95", "1", "768", "1,536", "3,072"},
     "again": {"95", "2,000"},
     "study": {"1", "2,000"},

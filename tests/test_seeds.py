@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_cl import train
+from mjx_cl import runtime, train
 from mjx_cl.config import PRESETS, TrainConfig, replace
 from mjx_cl.dreamer.agent import CAUSES, Weights, culprit
 from mjx_cl.errors import FileError, UserError
@@ -64,7 +64,7 @@ def test_by_vmap_is_by_map(short_walker, tmp_path):
     trainer.step()
   state, active = poisoned(trainer.state, 1, 1e8), np.array([True, True, False])
   copy = lambda: jax.tree.map(jnp.copy, (state.train, state.replay))
-  assert train.seeds_by() == "map"  # on a CPU
+  assert runtime.seeds_by() == "map"  # on a CPU
   by_map = trainer.learn["pure"](*copy(), jax.random.key(5), Weights(), active, 2)
   by_vmap = train.make_learn(trainer.plain, DREAMER.batch, DREAMER.length, how="vmap")(*copy(), jax.random.key(5), Weights(), active, 2)
   assert list(by_map[3]) == list(by_vmap[3]) == [-1, CAUSES.index("loss/rew"), -1]
