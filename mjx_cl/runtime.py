@@ -85,7 +85,7 @@ def sharing(seeds: int) -> int:
 def seeds_by() -> str:
   """How the seeds of a device share a program of updates (train.make_learn): `map`, one after another, on a CPU; `vmap`, all in each product, elsewhere.
 
-  On CPUs both take the same time: ten seeds of size1m 0.93 and 0.91 of ten times one (results/dreamer_update_xeon.json), 0.98 and 1.02
+  On CPUs both take the same time: ten seeds of size1m 0.96 and 0.95 of ten times one (results/dreamer_update_xeon.json), 0.98 and 1.02
   (results/dreamer_update.json); `map` needs the scratch memory of one seed. A GPU is not filled by one seed; there `vmap` is a choice by expectation, not measured.
   """
   import jax
@@ -97,7 +97,7 @@ def setup(devices: int = 1) -> None:
 
   Args:
     devices: as how many devices a CPU counts. A program that is sharded over them keeps the cores busy with a share each, which a single program does only within its
-      larger products: ten seeds of a training take 0.58 to 0.75 of ten times one (results/dreamer_update_xeon.json), 0.93 on one device. What is not sharded stays on the
+      larger products: ten seeds of a training take 0.59 to 0.73 of ten times one (results/dreamer_update_xeon.json), 0.96 on one device. What is not sharded stays on the
       first device and has all cores as before. A count in the user's own XLA_FLAGS or JAX_NUM_CPU_DEVICES is left as it is.
 
   Synchronous dispatch: a jax.pure_callback converts its arguments on a thread of the CPU client, and with asynchronous dispatch that conversion can wait for itself
