@@ -47,40 +47,45 @@ def always() -> Detector:
 
 
 class PeriodicState(NamedTuple):
-  """Attributes: count: int32 (), known rows since the last alarm. begun: float32 (), share of the interval that was over when the stream began; negative: not drawn yet."""
+  """Attributes: count: uint32 (), known rows. phase: uint32 (), where on the clock the stream began. begun: bool (), it has been drawn."""
   count: jax.Array
+  phase: jax.Array
   begun: jax.Array
+
+
+GOLDEN = 2_654_435_769  # 2^32 over the golden ratio
 
 
 @reference
 def periodic(threshold: float = math.log(10_000)) -> Detector:
-  """Fires every round(exp(threshold)) known rows, whatever they hold.
+  """Fires every exp(threshold) known rows, whatever they hold, as regularly as a clock can that does not know its period.
 
-    n = known rows since the last alarm, this one included;  score = ln(n + 1/2 + b exp(threshold));  fired = score > threshold; then n = b = 0
+    x = (phase + GOLDEN n) mod 2^32, n = number of the known row;  u = (x + 1/2) / 2^32;  score = -ln u;  fired = score > threshold
 
-  A stream comes upon the clock anywhere: b is a uniform draw of the bits of OPR and reward of the first known row. Streams in step would all alarm at once, and streams
-  shorter than the interval never.
+  Multiples of the golden ratio are spread over the unit interval as evenly as can be: of N rows N exp(-threshold) fire, up to a few, and the intervals between them have
+  three lengths at most, all near exp(threshold). So a score that is free of the threshold has the rate that is asked for, and calibration to an ARL0 works on it. A stream comes upon
+  the clock anywhere: its phase is a uniform draw of the bits of OPR and reward of its first known row; in step, streams would all alarm at once.
 
   Printed beside every score because where changes are frequent, or the tolerance after them long, a clock finds many of them: half a period is its
-  mean delay. The threshold is ln of the interval, so calibration to an ARL0 works on it. float32 holds the interval to a row up to about 10^6 rows.
+  mean delay.
 
   Args:
-    threshold: ln of the interval [ln control steps], at least 0.
+    threshold: ln of the mean interval [ln control steps], at least 0.
   Blind to: everything.
-  Example: _, out = jax.lax.scan(det.update, det.init(), residuals)
+  Reference: Sos 1958, Ann. Univ. Sci. Budapest 1, 127-134 (three lengths).   Example: _, out = jax.lax.scan(det.update, det.init(), residuals)
   """
   demand("periodic", threshold=(threshold, above(threshold, -1e-9), "at least 0, the logarithm of an interval in steps"))
 
   def update(state, residual):
     known = residual.valid
-    begun = jnp.where(known & (state.begun < 0), drawn(_told_apart(jnp.zeros(2, jnp.uint32), residual)), state.begun)
-    count = state.count + known
-    score = jnp.logaddexp(jnp.log(count.astype(jnp.float32) + 0.5), jnp.log(jnp.maximum(begun, 0.0)) + threshold)
-    fired = known & (score > threshold)
-    return PeriodicState(jnp.where(fired, 0, count), jnp.where(fired, 0.0, begun)), Alarm(fired, jnp.where(known, score, jnp.nan))
+    drawn = jax.random.bits(_told_apart(jnp.zeros(2, jnp.uint32), residual))
+    phase = jnp.where(known & ~state.begun, drawn, state.phase)
+    u = ((phase + jnp.uint32(GOLDEN) * state.count).astype(jnp.float32) + 0.5) * 2.0 ** -32
+    score = -jnp.log(jnp.minimum(u, 1 - 2.0 ** -24))  # float32 would round the largest to 1, which fires at no threshold
+    new = PeriodicState(state.count + known.astype(jnp.uint32), phase, state.begun | known)
+    return new, Alarm(known & (score > threshold), jnp.where(known, score, jnp.nan))
 
-  drawn = lambda key: jax.random.uniform(key, minval=jnp.finfo(jnp.float32).tiny)
-  return Detector(lambda: PeriodicState(jnp.int32(0), jnp.float32(-1)), update)
+  return Detector(lambda: PeriodicState(jnp.uint32(0), jnp.uint32(0), jnp.bool_(False)), update)
 
 
 def _told_apart(seed: jax.Array, residual) -> jax.Array:
