@@ -170,7 +170,7 @@ def test_updates_of_the_plan():
   c = RunConfig("walker", steps=5000, onset=2000, seeds=3, arms=("always",), adapt=AdaptConfig(warmup=1000, start_windows=1024, ratio=16, batch=4))
   assert bench.estimate(bench.Part("a", c), 1e11).updates == pytest.approx(3 * (5000 - 1000 - 1024 - 64) * 16 / (4 * 64))
   for arm in ARMS:
-    own = RunConfig("walker", steps=20_000, onset=2000, seeds=1, arms=(arm,))
+    own = RunConfig("walker", steps=20_000, onset=2000, seeds=1, arms=(arm,), stops="told" if ARMS[arm].end.told else None)
     steps = bench.adapting_steps(own, arm)
     assert 0 <= steps <= 19_000 and (steps == 0) == (ARMS[arm].trigger is NEVER or not ARMS[arm].breaks)
   slow, quick = (bench.estimate(bench.Part("a", c), rate).seconds - bench.COMPILE_S for rate in (1e11, 2e11))
