@@ -600,3 +600,16 @@ def test_phone_needs_no_sideways_scroll(browser, file):
       assert browser.js("return [window.innerWidth, document.documentElement.scrollWidth]") == [375, 375]
   finally:
     browser.driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+
+
+def test_the_published_page_opens_sorts_and_filters(browser):
+  import pathlib
+  browser.open(pathlib.Path(__file__).parent.parent / "results/leaderboard.html")
+  scores = numbers(browser.column("overall", "cost_standard"))
+  assert len(scores) > 30 and in_order(scores, True)
+  browser.sort("overall", "miss_probability")
+  assert in_order(numbers(browser.column("overall", "miss_probability")), False)
+  browser.choose("robot", "walker")
+  assert set(browser.column("full", "robot")) == {"walker"} and browser.all("#curves path")
+  browser.js("location.hash = document.querySelector(\"a[href^='#fault']\").getAttribute('href')")
+  assert "walker: bias, severity 0.25" in [h.text for h in browser.all("h2")] and len(browser.all("svg text")) > 100
