@@ -417,18 +417,30 @@ def redraw(results) -> list[pathlib.Path]:
   """The figures of every suite that is published in a subfolder of `results`, drawn anew from its files. Returns them.
 
   Raises:
-    FileError where a folder with a bench.json is broken or of a suite that this package does not have.
+    FileError where a folder with a bench.json is broken, or of a suite that this package does not have and without its suite.json.
   """
   out = []
   for folder in sorted(p.parent for p in pathlib.Path(results).glob("*/bench.json")):
     try:
       value = json.loads((folder / "bench.json").read_text())
-      out += draw(folder, suite(value["suite"]), value)
+      out += draw(folder, _published(folder, value["suite"]), value)
     except (OSError, ValueError, KeyError, TypeError) as e:
       raise FileError(f"cannot draw the figures of {folder}: {type(e).__name__}: {e}") from None
     except UserError as e:
       raise FileError(f"cannot draw the figures of {folder}: {e}") from None
   return out
+
+
+def _published(folder: pathlib.Path, name: str) -> Suite:
+  """The suite of a published folder: the shipped one of that name, or a user's own as suite.json holds it."""
+  if name in shipped():
+    return suite(name)
+  try:
+    parts = store.read_json(folder / "suite.json")["parts"]
+  except FileError as e:
+    raise UserError(f"suite {name!r} is none of this package's, and {e}") from None
+  config = lambda c: RunConfig(**c | {"arms": tuple(c["arms"]), "adapt": AdaptConfig(**c["adapt"])})
+  return Suite(name, "", tuple(Part(part, config(c)) for part, c in parts.items()))
 
 
 def _points(part: Part, scores_: dict) -> list[dict]:

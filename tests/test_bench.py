@@ -409,6 +409,9 @@ def test_published_figures_are_drawn_anew(tmp_path, mjx):  # noqa: F811
   assert all((tmp_path / "study" / name).stat().st_size > 10_000 for name in ("recovery.png", "ratio.png"))
   assert mjx("report", "--results", tmp_path, "--page", tmp_path / "page.md", "--figures", "--check")[0] == 2
   value = json.loads((tmp_path / "study/bench.json").read_text())
+  (tmp_path / "study/bench.json").write_text(json.dumps(value | {"suite": "nobody"}))  # a suite of one's own is read from its folder
+  assert [p.name for p in bench.redraw(tmp_path)] == ["recovery.png", "ratio.png"]
+  (tmp_path / "study/suite.json").unlink()
   for text, word in (("{", "JSONDecodeError"), (json.dumps(value | {"suite": "nobody"}), "nobody"), (json.dumps({"suite": "study"}), "KeyError")):
     (tmp_path / "study/bench.json").write_text(text)
     with pytest.raises(FileError, match=f"^cannot draw the figures of .*{word}"):
