@@ -89,6 +89,12 @@ def few(values: dict, name: str, n: int, digits: int = 0) -> str:
   return f"{text}, {n} seed{'s' * (n != 1)}"
 
 
+def averaged(values, digits: int = 0) -> str:
+  """Mean of a value of each stream with its bootstrap interval; a dash for fewer than two."""
+  from mjx_cl.scoring import bootstrap
+  return f"{number(statistics.mean(values), digits)} {span(bootstrap.interval(values, lambda x, axis=-1: x.mean(axis)), digits)}" if len(values) > 1 else "-"
+
+
 def alarmed(own: dict) -> str:
   """Streams of an arm's summary that alarm after the change, of those whose finetuning was not under way when it came."""
   return f"{own['alarms']} of {own['seeds'] - own.get('adapting_at_onset', 0)}"
@@ -466,8 +472,6 @@ def oracle_stop(results: pathlib.Path) -> str:
   """Finetuning that ended by the rule beside finetuning that ended at the oracle stop, both lived to the end of the run."""
   from mjx_cl.scoring import bootstrap
   rows, told = [], "oracle-stop"
-  average = lambda x, axis=-1: x.mean(axis)
-  mean = lambda values, digits=0: f"{number(statistics.mean(values), digits)} {span(bootstrap.interval(values, average), digits)}"
   plan, entries = (load(results / "oracle_stop" / name) for name in ("suite.json", "bench.json"))
   for part, entry in entries["entries"].items():
     own = {(r["arm"], r["seed"]): r for r in table(results / "oracle_stop" / part / "runs.parquet")}
@@ -478,8 +482,8 @@ def oracle_stop(results: pathlib.Path) -> str:
       adapted = [own[arm, seed]["adapted_steps"] for seed in seeds]
       less = [(got[told, seed] - got[arm, seed]) / got[told, seed] for seed in seeds]
       rows.append((f"`{part}`" if not k else "", f"`{arm}`", "-" if arm == "none" else f"{number(bootstrap.censored_median(adapted))} {span(bootstrap.interval(adapted, bootstrap.censored_median))}",
-                   number(summary["updates_mean"]), f"{summary['recovered']} of {summary['affected']}", both(summary, "reward_final", 2), mean([own[arm, seed]["return_lost"] for seed in seeds]),
-                   "-" if arm == told else f"{mean([100 * x for x in less], 1)} %"))
+                   number(summary["updates_mean"]), f"{summary['recovered']} of {summary['affected']}", both(summary, "reward_final", 2), averaged([own[arm, seed]["return_lost"] for seed in seeds]),
+                   "-" if arm == told else f"{averaged([100 * x for x in less], 1)} %"))
   text = fill(f"""
       `mjx-cl bench benchmarks/oracle_stop.toml`: both arms finetune from the true onset; `oracle` ends by the rule, `oracle-stop` at the oracle stop that suite `stop` found for the same seed. Control steps of finetuning, median; updates a
       stream; affected streams that recover before the run ends; reward a step over the last 2,000 steps (interquartile mean); return lost from the onset to the end of the run, {number(lived)} steps, a stream's mean; and how much less return than `oracle-stop` an
@@ -605,7 +609,6 @@ def full(results: pathlib.Path) -> str:
 
 def in_loop(results: pathlib.Path) -> str:
   """The same robots, faults and seeds with one detector or another in the loop: what an earlier alarm is worth."""
-  from mjx_cl.scoring import bootstrap
   folder = results / "loop"
   plan, entries = load(folder / "suite.json")["parts"], load(folder / "bench.json")["entries"]
   parts = [p for p in plan if p in entries]  # in the order of the suite; the first of a robot is what its others are set against
@@ -618,7 +621,6 @@ def in_loop(results: pathlib.Path) -> str:
       if None not in (r["return_lost"], r["reward_pre"], still):
         lost.setdefault((part, arm), {})[seed] = r["return_lost"] + (still - r["reward_pre"]) * (plan[part]["steps"] - r["onset"])
     begun[part] = sum(e["kind"] == "start" for e in table(folder / part / "events.parquet") if e["arm"] == "detector")
-  mean = lambda values: f"{number(statistics.mean(values))} {span(bootstrap.interval(values, lambda x, axis: x.mean(axis)))}" if len(values) > 1 else "-"
   for part in parts:
     one, own, worth = plan[part], entries[part]["arms"]["detector"], (entries[part]["scores"]["normalised"] or {}).get("detector")
     new, mine = one["env"] not in base, lost.get((part, "detector"), {})
@@ -626,10 +628,10 @@ def in_loop(results: pathlib.Path) -> str:
     if new:  # arm `none` lives the same life whatever watches it
       none = entries[part]["arms"]["none"]
       rows.append((f"`{one['env']}`", "none", "", "", "", "", of(none, "recovered"), of(none, "recovered_within_10000"), "",
-                   mean([*lost.get((part, "none"), {}).values()]), "", "", "", ""))
+                   averaged([*lost.get((part, "none"), {}).values()]), "", "", "", ""))
     rows.append(("", f"`{one['detector']}`", str(own["false_alarm_streams"]), alarmed(own), soon(own), both(own, "latency_median_steps"),
-                 of(own, "recovered"), of(own, "recovered_within_10000"), few(worth, "normalised", worth["seeds"], 2) if worth and worth["seeds"] else "-", mean([*mine.values()]),
-                 "" if new else mean([first[seed] - mine[seed] for seed in first if seed in mine]),
+                 of(own, "recovered"), of(own, "recovered_within_10000"), few(worth, "normalised", worth["seeds"], 2) if worth and worth["seeds"] else "-", averaged([*mine.values()]),
+                 "" if new else averaged([first[seed] - mine[seed] for seed in first if seed in mine]),
                  str(begun[part]), f"{own['converged']} / {own['aborted_by_rule'] + own['aborted_by_budget']} / {own['adapting']}", number(own["updates_mean"])))
   robots = {one["env"]: one for one in plan.values()}.values()
   seeds = sorted({(one["first_seed"], one["first_seed"] + one["seeds"] - 1) for one in plan.values()})
@@ -680,7 +682,6 @@ def gradient(results: pathlib.Path) -> str:
 
 def quadruped(results: pathlib.Path) -> str:
   """What finetuning gives the quadruped, beside an agent that had the faulty robot to itself."""
-  from mjx_cl.scoring import bootstrap
   folder, rows = results / "quadruped_agent" / "finetuning", []
 
   def read(name):
@@ -696,7 +697,7 @@ def quadruped(results: pathlib.Path) -> str:
     if name != "expert":
       adapt, (arm,) = load(folder / name / "config.json")["adapt"], load(folder / name / "summary.json")["arms"].values()
       how = number(adapt["ratio"]), f"{adapt['lr']:g}", f"{adapt['average']:g}", number(arm["updates_mean"])
-    rows.append((what, *how[:3], number(statistics.mean(reward), 3), f"{number(statistics.mean(more), 3)} {span(bootstrap.interval(more, lambda x, axis: x.mean(axis)), 3)}",
+    rows.append((what, *how[:3], number(statistics.mean(reward), 3), averaged(more, 3),
                  number(falls), how[3]))
   config = load(folder / "none" / "config.json")
   text = fill(f"""

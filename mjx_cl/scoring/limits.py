@@ -289,7 +289,8 @@ def closed_form(nominal, faulty, arl0: float, order: int = 8, lags: int = 20) ->
     raise UserError(f"closed_form takes one channel; got {healthy.streams.shape[2]}")
   order = healthy.order
   _, p = ljung_box(healthy.white, lags, order)
-  shift = float(np.nanmean(innovations(faulty, healthy.model)))
+  after = innovations(faulty, healthy.model)
+  shift = float(np.nanmean(after))
   rate = information(healthy, faulty, order)["information_nats_per_step"]
   note = None
   if p < WHITE:
@@ -299,7 +300,7 @@ def closed_form(nominal, faulty, arl0: float, order: int = 8, lags: int = 20) ->
   elif not 0.8 <= shift ** 2 / 2 / rate <= 1.25:
     note = f"no closed form: the fault is no mere shift of the mean (which would carry {shift ** 2 / 2:.3g} of {rate:.3g} nats per step)"
   known = {"optimal_delay_steps": None, "optimal_delay_steps_ci": None, "note": note, "ljung_box_p": p}
-  return known if note else known | {"optimal_delay_steps": brownian(arl0, shift).delay, "optimal_delay_steps_ci": _delays(arl0, innovations(faulty, healthy.model))}
+  return known if note else known | {"optimal_delay_steps": brownian(arl0, shift).delay, "optimal_delay_steps_ci": _delays(arl0, after)}
 
 
 def _delays(arl0: float, e: np.ndarray) -> list[float | None]:

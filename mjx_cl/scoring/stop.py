@@ -10,6 +10,7 @@ import pathlib
 
 import numpy as np
 
+from mjx_cl import store
 from mjx_cl.adapt.arms import ARMS, never_stops, stops
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.scoring import bootstrap, normalised
@@ -260,7 +261,7 @@ def _relive(own, since, names, config):
   return dict(zip(own, np.asarray(decisions)))
 
 
-SAME = ("env", "fault", "target", "severity", "onset", "duration", "schedule", "period", "share", "agent", "deterministic", "repeat")
+SAME = ("env", "fault", "target", "severity", "onset", "duration", "schedule", "period", "share", "agent", "deterministic")
 LEARNS = ("ratio", "average", "start_windows", "lr", "policy_lr", "last_starts", "batch", "fresh_moments", "anchor")  # of AdaptConfig: what its weights depend on
 
 
@@ -279,12 +280,13 @@ def told(config) -> dict[int, int]:
     return {}
   folder = pathlib.Path(config.stops)
   try:
-    theirs = json.loads((folder / "config.json").read_text())
-    adapt = theirs["adapt"]
-    differ = [k for k in SAME if k in theirs and hasattr(config, k) and theirs[k] != getattr(config, k)]
-    differ += [f"adapt.{k}" for k in LEARNS if k in adapt and adapt[k] != getattr(config.adapt, k)]
-  except (OSError, ValueError, KeyError, TypeError) as e:
-    raise FileError(f"stops: {folder} holds no run: {type(e).__name__}: {e}") from None
+    theirs = store.read_json(folder / "config.json")
+  except FileError as e:
+    raise FileError(f"stops: {folder} holds no run: {e}") from None
+  if not isinstance(adapt := theirs.get("adapt"), dict):
+    raise FileError(f"stops: {folder} holds no run: its config.json has no settings of adaptation")
+  differ = [k for k in SAME if k in theirs and theirs[k] != getattr(config, k)]
+  differ += [f"adapt.{k}" for k in LEARNS if k in adapt and adapt[k] != getattr(config.adapt, k)]
   if differ:
     raise UserError(f"stops: {folder} was run with another {', '.join(differ)}; its oracle stops are not those of this run")
   if not (folder / "snapshots.parquet").exists():
