@@ -95,7 +95,7 @@ class Ledger(NamedTuple):
             "acceptance": flat(trace["acceptance"]), "least_posture": np.full(chunks * groups, least, np.float32)}
 
   def events(self, trace) -> list[dict]:
-    """Every onset, alarm, start, stop, abort and repair, with its reason."""
+    """Every onset, alarm, start, stop, abort, rollback and repair, with its reason."""
     c, events = self.config, []
     for g, ((arm, seed), onset) in enumerate(zip(self.labels, self.onsets)):
       healthy = "on a healthy robot" if onset is None else "before onset"
@@ -130,6 +130,8 @@ class Ledger(NamedTuple):
         decision = int(decisions[i])
         kind = {phase_lib.START: "start", phase_lib.STOP: "stop", phase_lib.END: "stop"}.get(decision, "abort")
         add(end, kind, phase_lib.REASONS[decision] if decision != phase_lib.START else f"{trigger.why} at step {int(trace['since'][i, g])}")
+        if "back" in trace and trace["back"][i, g]:
+          add(end, "rollback", f"the weights of before earned {trace['earned'][i, g]:.3f} a step, those of now {trace['earns'][i, g]:.3f}")
     return sorted(events, key=lambda e: (e["stream"], e["step"]))
 
   def rows(self, trace, events) -> list[dict]:

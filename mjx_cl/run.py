@@ -71,6 +71,11 @@ def capacity(steps: int, episode: int, repeat: int = 1) -> int:
   return replay.room((chunks + 2) * CHUNK + steps // episode)
 
 
+def held(state: LoopState) -> dict:
+  """Its fields by name, without those that this run has no use for: a checkpoint of a version that did not know them yet goes on."""
+  return {name: value for name, value in state._asdict().items() if value is not None}
+
+
 class Runner:
   """Runs one RunConfig into the folder `out`.
 
@@ -119,7 +124,7 @@ class Runner:
     keys = jnp.stack([jax.random.key(seed) for _, seed in self.labels])[:, None]
     self.keys = jax.vmap(lambda k: jax.random.fold_in(k, 7))(keys[:, 0])
     trains = [self.others[arm].train if arm in self.others else self.trained.train for arm, _ in self.labels]
-    self.state = State(nest(begin, (0, 0), (0, None))(keys, jnp.asarray(self.breaks)), self.crew.init(trains))
+    self.state = State(nest(begin, (0, 0), (0, None))(keys, jnp.asarray(self.breaks)), self.crew.init(trains, any(ARMS[arm].rollback for arm in config.arms)))
     self.acting = self.crew.acting(self.state.loop)
     self.choices = self._choices(self.state.streams)
     self.done_chunks = 0
@@ -239,7 +244,8 @@ class Runner:
         "updates": np.broadcast_to(self._updates.astype(np.int32), rewards.shape).copy(),
         **({"parts": at_end(digest.residual.groups)} if self.config.parts else {}),
         **({"variables": at_end(digest.residual.variables)} if self.config.residuals else {}),
-        "signals": digest.signals[None], "decision": digest.decision[None], "since": digest.since[None], "settled": digest.settled[None]}
+        "signals": digest.signals[None], "decision": digest.decision[None], "since": digest.since[None], "settled": digest.settled[None],
+        **({"back": digest.back[None], "earned": digest.earned[None], "earns": digest.earns[None]} if digest.back is not None else {})}
     if self.endless:  # what the stop rule reads besides the signals
       now = (self.done_chunks + 1) * self.chunk_steps
       level = self._acceptance(self.state.streams, now) if self.config.adapt.acceptance is None else self.config.adapt.acceptance
@@ -267,7 +273,7 @@ class Runner:
     self.seconds["other"] += time.perf_counter() - begin
     meta = {"seconds": self.seconds, "quiet": self.quiet, "stream_seconds": self.stream_seconds.tolist(), "updates": self._updates.tolist(),
             "alarms": self._alarms.tolist(), "phase": self._phase.tolist()}
-    self.checkpoints.save(number, State(self.state.streams, self.crew.join(self.state.loop)), meta)
+    self.checkpoints.save(number, State(self.state.streams, held(self.crew.join(self.state.loop))), meta)
     runtime.give_back()
     for old in sorted(self.work.glob("trace-*.npz"))[:-2]:
       old.unlink()
@@ -279,11 +285,11 @@ class Runner:
     """Goes on from the newest checkpoint; without one, from the start."""
     if self.checkpoints.latest() is None:
       return
-    like = State(self.state.streams, self.crew.shapes(self.state.loop))
+    like = State(self.state.streams, held(self.crew.shapes(self.state.loop)))
     self.state = self.acting = None  # what the run began with need not lie beside what it goes on with
     (streams, loop), meta = self.checkpoints.load(like)
     number = self.checkpoints.latest()
-    self.state = State(streams, self.crew.split(loop))
+    self.state = State(streams, self.crew.split(LoopState(**loop)))
     self.acting = self.crew.acting(self.state.loop)
     self.parts = [store.read_arrays(self.work / f"trace-{number:06d}.npz")]
     self.done_chunks = number

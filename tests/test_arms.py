@@ -28,7 +28,7 @@ from mjx_cl.rollout import Row
 from mjx_cl.scoring import normalised, recovery
 
 FOUR = ("detector", "none", "oracle", "no-fault")  # as many streams as are computed alike to the last bit, see run.Runner
-NAMES = ("detector", "none", "always", "periodic", "random", "oracle", "oracle-budget", "oracle-stop", "scratch", "world-model", "randomised",
+NAMES = ("detector", "rollback", "none", "always", "periodic", "random", "oracle", "oracle-budget", "oracle-stop", "scratch", "world-model", "randomised",
          "no-fault")
 
 
@@ -45,14 +45,15 @@ def test_choices_of_all_arms():
   at = {name: sorted(int(s) for s in row.at if s < FOREVER) for name, row in rows.items()}
   drawn = at.pop("random")
   assert at == {"detector": [], "none": [], "always": [1000], "periodic": [400, 800, 1200], "oracle": [1000, 1200],  # the warm-up comes first
-                "oracle-budget": [1000, 1200], "oracle-stop": [1000, 1200], "scratch": [1000, 1200], "world-model": [], "randomised": [], "no-fault": []}
+                "oracle-budget": [1000, 1200], "oracle-stop": [1000, 1200], "scratch": [1000, 1200], "world-model": [], "rollback": [], "randomised": [], "no-fault": []}
   assert len(drawn) == 1 and 1000 <= drawn[0] <= 1440
   on = lambda field: {name for name, row in rows.items() if getattr(row, field)}
-  assert on("listens") == {"detector", "world-model", "no-fault"} and on("world_only") == {"world-model"} and on("fresh") == {"scratch"}
+  assert on("listens") == {"detector", "rollback", "world-model", "no-fault"}
+  assert on("world_only") == {"world-model"} and on("fresh") == {"scratch"} and on("rollback") == {"rollback"}
   few = choices([("detector", 0), ("none", 0)], c, 1500)
-  assert few.fresh is None and few.at.shape[1] == x.at.shape[1] == WIDTH  # one program
+  assert few.fresh is None and few.rollback is None and few.at.shape[1] == x.at.shape[1] == WIDTH  # one program
   assert choices([("periodic", 0)], dataclasses.replace(c, period=100, warmup=100), 1500).at.shape == (1, 2 * WIDTH)
-  assert on("rule") == {"detector", "oracle", "scratch", "world-model", "no-fault"}
+  assert on("rule") == {"detector", "rollback", "oracle", "scratch", "world-model", "no-fault"}
   assert {name: int(row.limit) for name, row in rows.items()} == dict.fromkeys(NAMES, 777) | {
       "none": FOREVER, "always": FOREVER, "randomised": FOREVER, "periodic": 30, "random": 60, "oracle-stop": 333}
   late = choices([("oracle-stop", 5), ("oracle-stop", 6)], c, 1500, None, {5: 778, 6: 1})
@@ -169,7 +170,7 @@ def story():
   keys = jax.vmap(jax.random.key)(jnp.arange(len(NAMES)))
 
   def begin():
-    state = loop.init(train, len(NAMES))
+    state = loop.init(train, len(NAMES), rollback=True)
     return state._replace(detector=state.detector._replace(at=jnp.tile(jnp.array(ALARMS), (len(NAMES), 1))))
   copy = lambda tree: jax.tree.map(lambda x: np.array(x), tree)
   state, states, digests = begin(), [], []
@@ -194,7 +195,7 @@ def spans(story):
   drawn = int(np.asarray(story.chosen.at)[NAMES.index("random")].min())
   over = next(c for c in range(CHUNKS) if (c + 1) * STEPS - drawn >= 50)
   heard, true = [(37, 2, 6, STOP)], [(60, 3, 7, STOP)]  # the patience of 4 is full after four more chunks
-  return {"detector": heard, "none": [], "always": [(20, 1, None, None)], "periodic": [(80, 5, 7, END), (160, 10, 12, END), (240, 15, None, None)],
+  return {"detector": heard, "rollback": heard, "none": [], "always": [(20, 1, None, None)], "periodic": [(80, 5, 7, END), (160, 10, 12, END), (240, 15, None, None)],
           "random": [(drawn, drawn // STEPS, over, END)], "oracle": true, "oracle-budget": [(60, 3, 9, END)],
           "oracle-stop": [(60, 3, 8, END)],  # 70 steps after step 60 lie in the chunk of 128 to 143
           "scratch": [(60, 3, 8, STOP)],  # first update in chunk 5, at learning rate 0 of its warm-up: fresh heads say 0 in 4, 5 and 6
@@ -277,6 +278,74 @@ def test_one_trace_serves_all_arms(story):
   assert story.loop._program._cache_size() == 1
 
 
+# ---- an abort that goes back ---------------------------------------------------------------------------------------------------------
+
+BEFORE, SINCE = 0.5, {"rollback": (0.1, 0.9), "detector": (0.1,)}  # reward a step of the weights of before, and of those that have learnt
+
+
+@pytest.fixture(scope="module")
+def aborted(story):
+  """aborted(labels, due, config, chunks, reward(c, learnt), level(c)): [state], [digest] of streams that are due at these control steps. One program."""
+  loop = Loop(story.loop.agent, story.loop.monitor, scripted(), story.loop.spec, EAGER, capacity=512)
+  loop._program = quick.jit(loop._digest, donate_argnums=0)
+
+  def live(names, due, config, chunks, reward, level):
+    loop.config = config  # its numbers are arguments of the program
+    chosen = choices([(name, 0) for name in names], config, STEPS * CHUNKS)
+    chosen = chosen._replace(at=chosen.at.at[:, :len(due)].set(jnp.array(due)))
+    keys = jax.vmap(jax.random.key)(jnp.zeros(len(names), int))
+    state = loop.init(of(story.begin.train, "detector"), len(names), rollback=True)
+    state = state._replace(train=state.train._replace(updates=jnp.full(len(names), 2000, jnp.int32)))  # past the warm-up of the learning rate
+    states, digests = [jax.tree.map(np.array, state)], []
+    for c in range(chunks):
+      rows = hand_rows(c * STEPS, len(names))
+      earned = jnp.asarray(reward(c, bool(digests) and bool(digests[-1].updates.any())))
+      rows = rows._replace(rewards=jnp.broadcast_to(earned[..., None, None], rows.rewards.shape).astype(jnp.float32))
+      state, digest = loop.digest(state, rows, jnp.int32((c + 1) * STEPS), chosen, keys, jnp.full(len(names), level(c), jnp.float32))
+      states.append(jax.tree.map(np.array, state))
+      digests.append(jax.tree.map(np.array, digest))
+    return states, digests
+  yield live
+  assert loop._program._cache_size() == 1
+
+
+UNACCEPTED = dataclasses.replace(EAGER, acceptance=None, budget=9 * STEPS, start_windows=40)
+
+
+def test_an_abort_goes_back_to_what_earned_more(aborted, same):
+  """Three streams whose budget is spent, each with its own rewards: hand means over the chunks of the old weights and over the last ones of the new."""
+  names, after = zip(*((name, reward) for name, own in SINCE.items() for reward in own))
+  earned = []
+
+  def reward(c, learnt):
+    earned.append(np.asarray(after if learnt else [BEFORE + 0.01 * c] * 3))
+    return earned[-1]
+  states, digests = aborted(names, (2 * STEPS,), UNACCEPTED, 13, reward, lambda c: 9.0)
+  end = 10
+  assert all((d.decision == (START if c == 2 else phase_lib.ABORT_BUDGET if c == end else 0)).all() for c, d in enumerate(digests))
+  old = next(c for c, d in enumerate(digests) if d.updates.any()) + 1  # chunks 3 .. old - 1 were lived by the old weights
+  assert 4 < old < end - 4
+  assert [d.back.tolist() for d in digests] == [[False] * 3] * end + [[True, False, False]] + [[False] * 3] * 2
+  np.testing.assert_allclose(digests[end].earned, np.mean(earned[3:old], 0), rtol=1e-6)
+  np.testing.assert_allclose(digests[end].earns, np.mean(earned[end - 3:end + 1], 0), rtol=1e-6)  # a patience of 4 chunks
+  pick = lambda tree, g: jax.tree.map(lambda x: x[g], tree)
+  for g, back in enumerate((True, False, False)):
+    assert not same(pick(states[end].acting, g), pick(states[0].acting, g)), names[g]  # it had learnt something
+    for later in states[end + 1:]:
+      assert same(pick(later.acting, g), pick(states[0].acting, g)) == back and same(pick(later.acting, g), pick(later.train.params, g)), names[g]
+  assert (digests[-1].updates == digests[end].updates).all()  # an aborted stream learns no more
+
+
+def test_a_later_adaptation_goes_back_to_where_it_began(aborted, same):
+  """The first converges, the second is aborted: what comes back is what the first had learnt, not what the run began with."""
+  states, digests = aborted(("rollback",) * 3, (2 * STEPS, 8 * STEPS), dataclasses.replace(UNACCEPTED, budget=7 * STEPS), CHUNKS,
+                            lambda c, learnt: [0.1 if c > 11 else 0.5] * 3, lambda c: -9.0 if c < 8 else 9.0)
+  assert {c: int(d.decision[0]) for c, d in enumerate(digests) if d.decision[0]} == {2: START, 6: STOP, 8: START, 14: phase_lib.ABORT_BUDGET}
+  assert digests[14].back.all() and not any(d.back.any() for d in digests[:14])
+  acting = [state.acting for state in states[1:]]
+  assert same(acting[14], acting[7]) and not same(acting[7], acting[1]) and not same(acting[13], acting[7])
+
+
 # ---- a run of all arms ---------------------------------------------------------------------------------------------------------------
 
 LIFE, FAULT, WARMUP, SEED = 700, 300, 100, 3
@@ -346,7 +415,7 @@ def test_events_say_what_started_and_ended_each_arm(lived):
           "oracle-stop": ["true onset at step 300"], "scratch": ["true onset at step 300"], "none": [], "randomised": []}
   for name, reasons in want.items():
     assert [r for _, r in events(out, name, "start")] == reasons, name
-  for name in ("detector", "world-model", "no-fault"):
+  for name in ("detector", "rollback", "world-model", "no-fault"):
     acted = [s for s, r in events(out, name, "alarm") if r.startswith("acted on")]
     assert acted and [r for _, r in events(out, name, "start")] == [f"alarm at step {s}" for s in acted], name
   over = "fixed number of steps over"

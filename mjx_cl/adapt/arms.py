@@ -49,6 +49,7 @@ class Arm:
     trigger, end: when it adapts.
     world_only: the world model learns; actor, critic and all that belongs to them stay as they are.
     fresh: parameters, moments and counters are drawn anew from the stream's seed at every start. The latent that the robot carries runs on.
+    rollback: an adaptation that is aborted leaves the better of two sets of weights, those of before it or those that it learnt, see loop.Before.
     breaks: the robot gets the run's faults; False: their severity is 0.
     agent: what is joined to the name of the run's agent, after a hyphen, to give that of the arm's own; "": it is the run's.
   """
@@ -57,6 +58,7 @@ class Arm:
   end: End
   world_only: bool = False
   fresh: bool = False
+  rollback: bool = False
   breaks: bool = True
   agent: str = ""
 
@@ -97,6 +99,8 @@ def stops(arm: Arm) -> bool:
 
 ARMS: dict[str, Arm] = {
     "detector": Arm("finetuning starts on the detector's alarm", ALARM, RULE),
+    "rollback": Arm("as detector, but an aborted finetuning goes back to the weights of before it, where these earned more under the fault", ALARM, RULE,
+                    rollback=True),
     "none": Arm("no adaptation; alarms are logged", NEVER, NO_END),
     "always": Arm("finetuning from the end of the warm-up on, without an end", AT_ONCE, NO_END),
     "periodic": Arm("finetuning every --adapt.period steps, for --adapt.period-steps; over 25,000 steps about the updates of one detected fault",

@@ -35,16 +35,16 @@ class Crew:
     self.threads = threads or min(len(cores()), len(self.blocks))
     self._warm: set[int] = set()  # sizes of block whose program is there
 
-  def init(self, trains) -> list[LoopState]:
-    """State before the first step, a list of blocks. trains: TrainState that each stream begins with; those of a block are put in place one by one."""
-    return [self._begin(trains[block]) for block in self.blocks]
+  def init(self, trains, rollback: bool = False) -> list[LoopState]:
+    """State before the first step, a list of blocks. trains: TrainState that each stream begins with; those of a block are put in place one by one. rollback: as of Loop.init."""
+    return [self._begin(trains[block], rollback) for block in self.blocks]
 
-  def _begin(self, trains):
-    state = self.loop.init(trains[0], len(trains))
+  def _begin(self, trains, rollback):
+    state = self.loop.init(trains[0], len(trains), rollback)
     if all(train is trains[0] for train in trains):
       return state
     stack = jax.tree.map(lambda *x: jnp.stack(x), *trains)
-    return state._replace(train=stack, acting=jax.tree.map(jnp.copy, stack.params))
+    return state._replace(train=stack, acting=jax.tree.map(jnp.copy, stack.params))  # `before` is written at every start, before it is read
 
   def digest(self, states: list[LoopState], rows, now, choices: Choices, keys, acceptance=None) -> tuple[list[LoopState], Digest]:
     """One chunk of all streams; arguments as of Loop._digest, `states` is used up. The Digest is NumPy."""

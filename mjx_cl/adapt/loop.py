@@ -24,6 +24,24 @@ BEHAVIOUR = {"pol", "val", "slow", "range"}  # of a TrainState: what is no world
 FRESH = 0  # what a stream's key folds in for new parameters; chunks fold in the control step after them, which is above 0
 
 
+class Before(NamedTuple):
+  """What an adaptation began with, and what that was worth; leading (groups,).
+
+      back  =  aborted  and  mean reward of the last `patience` chunks < mean reward of the chunks between the alarm and the first update
+
+  The weights of before the adaptation are still at work on the faulty robot while the replay fills (start_windows), so both sides were earned under the
+  fault. A stream that is aborted before its first update has nothing to take back.
+
+  Attributes:
+    params: the parameters that acted when the adaptation began. reward, chunks: float32, sum over the chunks that they have lived since, and their number.
+    learnt: bool, an update has been taken since.
+  """
+  params: Any
+  reward: jax.Array
+  chunks: jax.Array
+  learnt: jax.Array
+
+
 class LoopState(NamedTuple):
   """Everything of a run but the streams; leading (groups,) unless said.
 
@@ -37,6 +55,7 @@ class LoopState(NamedTuple):
     past: Residual of the last `refit` rows, leading (refit, groups).
     owed: float32, fraction of an update that is due.
     executed: int32, updates taken since the run began.
+    before: Before of each stream; None where no arm of the run goes back.
   """
   train: TrainState
   acting: Any
@@ -47,11 +66,13 @@ class LoopState(NamedTuple):
   past: Residual
   owed: jax.Array
   executed: jax.Array
+  before: Before | None = None
 
 
 class Digest(NamedTuple):
   """What the host logs of a chunk: rows (T, groups) and values (groups,). `failed`: index into agent.CAUSES of what was at fault in an update, which changed
-  nothing and was the stream's last; -1: nothing."""
+  nothing and was the stream's last; -1: nothing. `back`: bool, an abort put the weights of before the adaptation back; None where no arm does. `earned`, `earns`: mean reward
+  a step that was judged by, see Before; None likewise."""
   residual: Residual
   score: jax.Array
   fired: jax.Array
@@ -62,6 +83,9 @@ class Digest(NamedTuple):
   since: jax.Array
   updates: jax.Array
   failed: jax.Array
+  back: jax.Array | None = None
+  earned: jax.Array | None = None
+  earns: jax.Array | None = None
 
 
 WIDTH = 8  # Choices.at is padded to a multiple of it: arms with up to eight starts share a program, `periodic` too
@@ -75,6 +99,7 @@ class Choices(NamedTuple):
     rule: bool, stop and abort rules are in force. limit: int32, most control steps of one adaptation.
     world_only: bool, actor and critic keep what they are. fresh: bool, every start draws new parameters; None: no arm of the run does, and the
       program goes without the drawing, a quarter of what there is to compile.
+    rollback: bool, an abort may put the weights of before the adaptation back; None: no arm of the run does, and LoopState.before is None too.
   """
   listens: jax.Array
   at: jax.Array
@@ -82,6 +107,7 @@ class Choices(NamedTuple):
   limit: jax.Array
   world_only: jax.Array
   fresh: jax.Array | None
+  rollback: jax.Array | None = None
 
 
 def choices(labels, config: AdaptConfig, steps: int, onsets=None, stops: dict[int, int] | None = None) -> Choices:
@@ -103,7 +129,8 @@ def choices(labels, config: AdaptConfig, steps: int, onsets=None, stops: dict[in
   limits = [min(arm.end.limit(config), stops[seed]) if arm.end.told else arm.end.limit(config) for arm, (_, seed) in zip(arms, labels)]
   return Choices(flags(lambda a: a.trigger.listens), jnp.asarray(at, jnp.int32), flags(lambda a: a.end.rule),
                  jnp.asarray(limits, jnp.int32), flags(lambda a: a.world_only),
-                 flags(lambda a: a.fresh) if any(arm.fresh for arm in arms) else None)
+                 flags(lambda a: a.fresh) if any(arm.fresh for arm in arms) else None,
+                 flags(lambda a: a.rollback) if any(arm.rollback for arm in arms) else None)
 
 
 _programs: dict[Hashable, Any] = {}  # see Loop's `same`; the newest last
@@ -142,15 +169,16 @@ class Loop:
     while len(_programs) > PROGRAMS:
       del _programs[next(iter(_programs))]
 
-  def init(self, train: TrainState, groups: int) -> LoopState:
-    """State before the first step; `train` is the shipped agent, the same for every stream."""
+  def init(self, train: TrainState, groups: int, rollback: bool = False) -> LoopState:
+    """State before the first step; `train` is the shipped agent, the same for every stream. rollback: an arm of the run goes back, see Before."""
     a = self.agent
     spread = lambda tree: jax.tree.map(lambda x: jnp.broadcast_to(x, (groups,) + x.shape).copy(), tree)
     shapes = jax.eval_shape(lambda: replay_lib.init(1, self.capacity, a.obs_size, a.act_size, a.size.deter, a.size.stoch))
     replay = jax.tree.map(lambda x: jnp.zeros((groups,) + x.shape, x.dtype), shapes)  # empty: all zeros; a copy of one would be held twice for a while
     rows = max(1, self.config.refit // self.repeat)
     state = LoopState(spread(train), spread(train.params), replay, self.monitor.init(groups, 1), spread(self.detector.init()),
-                      spread(phase_lib.init(self.config)), unknown((rows, groups), a.obs_size), jnp.zeros(groups), jnp.zeros(groups, jnp.int32))
+                      spread(phase_lib.init(self.config)), unknown((rows, groups), a.obs_size), jnp.zeros(groups), jnp.zeros(groups, jnp.int32),
+                      Before(spread(train.params), jnp.zeros(groups), jnp.zeros(groups), jnp.zeros(groups, bool)) if rollback else None)
     return jax.tree.map(lambda x: jnp.asarray(x, x.dtype) if x.weak_type else x, state)  # a weak type would be a second trace, also of a run that goes on
 
   def digest(self, state: LoopState, rows, now, choices: Choices, keys, acceptance=None) -> tuple[LoopState, Digest]:
@@ -233,13 +261,23 @@ class Loop:
     ended = (was == phase_lib.ADAPTING) & (phase.phase != phase_lib.ADAPTING)
     wide = lambda x, like: x.reshape((-1,) + (1,) * (like.ndim - 1))
     acting = jax.tree.map(lambda a, p: a + wide(rate, a) * (p - a), acting, train.params)
+    back = earned = earns = None
+    old = state.before
+    if old is not None:
+      lived = (was == phase_lib.ADAPTING) & ~old.learnt  # the chunk just lived is one of the old weights
+      reward_sum, chunks = old.reward + jnp.where(lived, reward, 0.0), old.chunks + lived
+      earned, earns = reward_sum / chunks, jnp.nanmean(phase.ring[:, :, SIGNALS.index("reward")], 1)
+      back = choices.rollback & ended & (phase.phase == phase_lib.ABORTED) & old.learnt & (earns < earned)
+      acting = jax.tree.map(lambda a, b: jnp.where(wide(back, a), b, a), acting, old.params)
+      kept = jax.tree.map(lambda a, b: jnp.where(wide(begins, a), a, b), acting, old.params)
+      old = Before(kept, jnp.where(begins, 0.0, reward_sum), jnp.where(begins, 0.0, chunks), ~begins & (old.learnt | (taken > 0)))
     train = train._replace(params=jax.tree.map(lambda a, p: jnp.where(wide(ended, a), a, p), acting, train.params))
 
     # a stream that is done watches again, its reference refitted on the latest rows
     over = (decision == phase_lib.STOP) | (decision == phase_lib.END)
     detector = jax.lax.cond(jnp.any(over), self._refit, lambda d, p, s: d, detector, past, over)
-    state = LoopState(train, acting, replay, history, detector, phase, past, owed - number, state.executed + taken)
-    return state, Digest(residual, alarms.score, alarms.fired, signals, ok, phase.phase, decision, phase.since, state.executed, failed)
+    state = LoopState(train, acting, replay, history, detector, phase, past, owed - number, state.executed + taken, old)
+    return state, Digest(residual, alarms.score, alarms.fired, signals, ok, phase.phase, decision, phase.since, state.executed, failed, back, earned, earns)
 
   @staticmethod
   def _counts(replay):
