@@ -491,6 +491,30 @@ def oracle_stop(results: pathlib.Path) -> str:
   return text + "\n\n" + grid(("fault", "arm", "finetuned [steps]", "updates", "recovered", "reward at the end", "return lost", "less return than `oracle-stop`"), rows)
 
 
+def rollback(results: pathlib.Path) -> str:
+  """Aborts that keep what was learnt beside aborts that take it back where it earned less, on the same seeds."""
+  from mjx_cl.scoring import bootstrap
+  rows, folder = [], results / "rollback"
+  plan, entries = (load(folder / name) for name in ("suite.json", "bench.json"))
+  for part, entry in entries["entries"].items():
+    own = {(r["arm"], r["seed"]): r for r in table(folder / part / "runs.parquet")}
+    back = {(e["arm"], e["seed"]) for e in table(folder / part / "events.parquet") if e["kind"] == "rollback"}
+    seeds = sorted({seed for arm, seed in own})
+    one = plan["parts"][part]
+    name = f"`{one['env']}`, `{one['fault']}`" + ("" if fault_presets.named(one["fault"]) else f" {one['severity']:g}")
+    for k, (arm, summary) in enumerate(entry["arms"].items()):
+      over = lambda other: "-" if arm in (other, "none") else averaged([own[arm, seed]["reward_final"] - own[other, seed]["reward_final"] for seed in seeds], 2)
+      rows.append((name if not k else "", f"`{arm}`", "-" if arm == "none" else str(summary["aborted_by_rule"] + summary["aborted_by_budget"]),
+                   str(sum((arm, seed) in back for seed in seeds)) if arm == "rollback" else "-", both(summary, "reward_final", 2), over("none"), over("detector"),
+                   averaged([own[arm, seed]["return_lost"] for seed in seeds]), averaged([own[arm, seed]["terminations"] for seed in seeds], 1)))
+  gone = joined([f"`{part}`" for part in plan["parts"] if part not in entries["entries"]]) if len(entries["entries"]) < len(plan["parts"]) else ""
+  text = fill(f"""
+      `mjx-cl bench benchmarks/rollback.toml`: ten seeds a fault, the arms side by side. Streams whose finetuning is aborted, by the rule or its budget; those of them that go back to the weights of before;
+      reward a step over the last 2,000 steps (interquartile mean); that reward less that of the same seed in arm `none` and in arm `detector` (means); return lost from the onset to the end of the run and falls,
+      a stream's mean. 95 % bootstrap intervals over streams. {f"Not run yet: {gone}." if gone else ""}""")
+  return text + "\n\n" + grid(("fault", "arm", "aborted", "taken back", "reward at the end", "less `none`", "less `detector`", "return lost", "falls"), rows)
+
+
 def again(results: pathlib.Path) -> str:
   """A fault, its repair, the same fault once more: what each arm does at each of the three."""
   rows, words = [], ("the fault", "its repair", "the fault again")
@@ -732,7 +756,7 @@ def ppo(results: pathlib.Path) -> str:
 
 BLOCKS = {"run-walker": run_walker, "arl0": arl0, "leaderboard": leaderboard, "leaderboard-100k": leaderboard_100k, "physics": physics, "dreamer": dreamer, "agents": agents,
           "detectors": detectors, "paper": experiments, "arms": arms,
-          "other-arms": other_arms, "stop-rule": stop_rule, "oracle-stop": oracle_stop, "again": again, "study": study, "size": sizes, "full": full, "in-loop": in_loop, "two-agents": two_agents, "gradient": gradient, "quadruped": quadruped, "ppo": ppo}
+          "other-arms": other_arms, "stop-rule": stop_rule, "oracle-stop": oracle_stop, "rollback": rollback, "again": again, "study": study, "size": sizes, "full": full, "in-loop": in_loop, "two-agents": two_agents, "gradient": gradient, "quadruped": quadruped, "ppo": ppo}
 
 
 def catalogue(results: pathlib.Path) -> str:

@@ -47,6 +47,7 @@ class Row(NamedTuple):
     reward (): sum over the control steps of the decision; rewards (repeat,): one by one.
     final_obs (O,), terminated (), truncated (): of arriving.
     severity (): true severity in force in the last control step, the greatest where there are several faults. episode int32 (). demo (A,), has_demo ().
+    severities (repeat,): that of each control step; None where a decision is one.
   """
   obs: jax.Array
   first: jax.Array
@@ -63,6 +64,7 @@ class Row(NamedTuple):
   episode: jax.Array
   demo: jax.Array
   has_demo: jax.Array
+  severities: jax.Array | None = None
 
 
 def start(env, agent, fault, key: jax.Array, severity=0.0, onset=0, duration=faults_lib.FOREVER, target=-1, plan: faults_lib.Plan | None = None) -> Stream:
@@ -160,7 +162,7 @@ class Rollout:
       carry, action, demo, has_demo = decide(params, streams, drive, shake, jitter)
       before = streams
       streams, out, severity = control(streams, action)
-      rewards = [out.reward]
+      rewards, severities = [out.reward], [severity]
       for _ in range(self.repeat - 1):
         over = out.terminated | out.truncated
         later, new, severity = control(streams, action)
@@ -168,11 +170,13 @@ class Rollout:
         clock = later.t
         streams, out = hold(streams, later)._replace(t=clock), hold(out, new)
         rewards.append(jnp.where(over, 0.0, new.reward))
+        severities.append(severity)
       reward = sum(rewards[1:], rewards[0])
       done = out.terminated | out.truncated
       stoch = jnp.argmax(carry.stoch.reshape(carry.stoch.shape[:-1] + (self.agent.size.stoch, self.agent.size.classes)), -1)
       row = Row(before.obs, before.first, before.reward, action, carry.deter, stoch, reward, jnp.stack(rewards, -1), out.final_obs,
-                out.terminated, out.truncated, severity, before.episode, demo, has_demo)
+                out.terminated, out.truncated, severity, before.episode, demo, has_demo,
+                jnp.stack(severities, -1) if self.repeat > 1 else None)
       streams = streams._replace(agent=carry, obs=out.obs, reward=reward, first=jnp.zeros_like(done))
       return jax.lax.cond(jnp.any(done), self._reset, lambda s, d: s, streams, done), row
     return jax.lax.scan(step, streams, None, length=length)

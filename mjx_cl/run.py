@@ -234,9 +234,10 @@ class Runner:
       out[:, -1] = x
       return out.reshape((-1,) + x.shape[1:])
     ends = lambda x: at_end(np.asarray(x).astype(np.float32)) > 0
-    rewards = np.asarray(rows.rewards)[:, :, 0].swapaxes(1, 2).reshape(-1, self.groups)
+    each = lambda x: np.asarray(x)[:, :, 0].swapaxes(1, 2).reshape(-1, self.groups)  # a value per control step
+    rewards = each(rows.rewards)
     part = {
-        "reward": rewards, "severity": control(rows.severity), "episode": control(rows.episode),
+        "reward": rewards, "severity": control(rows.severity) if rows.severities is None else each(rows.severities), "episode": control(rows.episode),
         "terminated": ends(np.asarray(rows.terminated)[:, :, 0]), "truncated": ends(np.asarray(rows.truncated)[:, :, 0]),
         "opr": at_end(digest.residual.opr), "rpr": at_end(digest.residual.rpr), "valid": ends(digest.residual.valid),
         "score": at_end(digest.score), "alarm": ends(digest.fired),

@@ -137,6 +137,8 @@ def test_repeat_sums_rewards_and_advances_the_clock(repeated):
   np.testing.assert_array_equal(rows.truncated[:, 0, 0], np.arange(8) % 3 == 2)  # 5 steps: two decisions and a half
   np.testing.assert_array_equal(rows.rewards[2::3, ..., 1], 0)  # nothing is earned after the end
   assert (rows.rewards[[0, 1, 3, 4]] > 0).all()
+  np.testing.assert_array_equal(rows.severities[:, 0, 1].ravel(), np.where(np.arange(16) >= ONSET, np.float32(SEVERITY), 0))  # each control step's own
+  np.testing.assert_array_equal(rows.severity, rows.severities[..., -1])
 
 
 def test_repeat_equals_two_steps_with_the_same_action(repeated, tiny):

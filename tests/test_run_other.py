@@ -16,7 +16,7 @@ from mjx_cl.config import CHUNK, PRESETS, AdaptConfig, RunConfig, replace
 from mjx_cl.dreamer.agent import Agent
 from mjx_cl.types import EnvState, Model, Spec, Step, Var
 
-STEPS, ONSET, EPISODE, WARMUP, REPEAT = 1024, 200, 150, 60, 2
+STEPS, ONSET, EPISODE, WARMUP, REPEAT = 1024, 201, 150, 60, 2  # the onset is the second control step of a decision
 ADAPT = AdaptConfig(warmup=WARMUP, start_windows=40, patience=4, least=64, trend=1e9, fluctuation=1e9, refit=100)
 
 
