@@ -37,6 +37,7 @@ from mjx_cl.config import CHUNK, AdaptConfig, RunConfig, becomes, changes
 from mjx_cl.dreamer.agent import CAUSES, EXPLODED
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.interrupt import Interruptible
+from mjx_cl.lanes import Lanes
 from mjx_cl.ledger import Ledger, acts
 from mjx_cl.monitor import Monitor
 from mjx_cl.rollout import Rollout, Stream, nest, start
@@ -80,8 +81,7 @@ class Runner:
   """Runs one RunConfig into the folder `out`.
 
   Streams are ordered arm by arm, seed by seed. A stream's keys come from its seed alone, so the same seed lives the same life in
-  every arm until an alarm is acted on. That is so bit for bit where XLA lets all streams act alike, as it does with up to 4. With 10 or 20 the
-  last few of them are left over from its vector registers and are rounded otherwise, and a robot that walks makes much of a last bit.
+  every arm until an alarm is acted on, bit for bit: see lanes.py. Another number of arms or seeds is another program, which rounds otherwise.
   """
 
   def __init__(self, config: RunConfig, out):
@@ -117,6 +117,7 @@ class Runner:
     self.seeds = [config.first_seed + i for i in range(config.seeds)]
     self.labels = [(arm, seed) for arm in config.arms for seed in self.seeds]
     self.groups = len(self.labels)
+    self.lanes = Lanes(len(config.arms), config.seeds)
     same = (agent.config, agent.obs_size, agent.act_size, agent.stepwise, config.form, config.actions, spec, detectors.factory(config.detector),
             config.detector, robot, json.dumps(settings, sort_keys=True, default=repr))
     self.crew = Crew(Loop(agent, monitor, detector, spec, config.adapt, self.repeat, capacity=needs(config.steps), same=same), self.groups)
@@ -125,7 +126,7 @@ class Runner:
     self.keys = jax.vmap(lambda k: jax.random.fold_in(k, 7))(keys[:, 0])
     trains = [self.others[arm].train if arm in self.others else self.trained.train for arm, _ in self.labels]
     self.state = State(nest(begin, (0, 0), (0, None))(keys, jnp.asarray(self.breaks)), self.crew.init(trains, any(ARMS[arm].rollback for arm in config.arms)))
-    self.acting = self.crew.acting(self.state.loop)
+    self.acting = self.crew.acting(self.state.loop, self.lanes)
     self.choices = self._choices(self.state.streams)
     self.done_chunks = 0
     self.compiled = False  # the first chunk of this process compiles
@@ -151,8 +152,8 @@ class Runner:
     """Lives one chunk and logs it."""
     begin = time.perf_counter()
     physics = self._physics_seconds()
-    streams, rows = self.rollout.chunk(self.acting, self.state.streams, CHUNK)
-    rows = jax.block_until_ready(rows)
+    streams, rows = self.rollout.chunk(self.acting, self.lanes.spread(self.state.streams), CHUNK)
+    streams, rows = self.lanes.gather(streams), self.lanes.gather_rows(jax.block_until_ready(rows))
     acted = time.perf_counter()
     physics = self._physics_seconds() - physics
     now = (self.done_chunks + 1) * self.chunk_steps
@@ -163,7 +164,7 @@ class Runner:
     self.state = State(streams, loop)
     changed = (digest.updates != self._updates) | (digest.decision > 0)  # weights are what they were in every other stream
     if changed.any() or len(loop) == 1:  # the only block's own arrays, which its next digest uses up
-      self.acting = self.crew.acting(loop)
+      self.acting = self.crew.acting(loop, self.lanes)
     before = self._phase
     self._log(rows, digest)
     updates = digest.updates - self._updates
@@ -171,7 +172,7 @@ class Runner:
     self.done_chunks += 1
     self._notice_failures(digest, now)
     if self.snapshots:
-      self.snapshots.take(self.acting, before, digest, now, self.chunk_steps)
+      self.snapshots.take(self.acting, self.lanes.place, before, digest, now, self.chunk_steps)
     if self.compiled:
       self.seconds["physics"] += physics
       self.seconds["acting"] += acted - begin - physics
@@ -291,7 +292,7 @@ class Runner:
     (streams, loop), meta = self.checkpoints.load(like)
     number = self.checkpoints.latest()
     self.state = State(streams, self.crew.split(LoopState(**loop)))
-    self.acting = self.crew.acting(self.state.loop)
+    self.acting = self.crew.acting(self.state.loop, self.lanes)
     self.parts = [store.read_arrays(self.work / f"trace-{number:06d}.npz")]
     self.done_chunks = number
     self.seconds, self.quiet, self.stream_seconds = meta["seconds"], meta["quiet"], np.asarray(meta["stream_seconds"])
@@ -527,18 +528,23 @@ def identity(config: RunConfig) -> dict:
                                 **({"files": files} if files else {})}))
 
 
+def differing(old: dict, values: dict) -> list[str]:
+  """Keys of `values` in which the run differs whose config.json holds `old`. A setting that did not exist when it began counts as its default."""
+  skip = ("git_commit", "machine", "python")
+  if isinstance(old.get("adapt"), dict):
+    old = old | {"adapt": {**dataclasses.asdict(AdaptConfig()), **old["adapt"]}}
+  default = {f.name: f.default for f in dataclasses.fields(RunConfig)}  # nor did `changes` always exist
+  changed = [k for k in values if k not in skip and old.get(k, default.get(k, values[k] if k == "changes" else None)) != values[k]]
+  return changed + ["threshold"] * ("threshold" in old and "threshold" not in values)
+
+
 def check_same(out: pathlib.Path, values: dict) -> None:
   """Refuses to resume with other settings than the run began with."""
   try:
     old = store.read_json(out / "config.json")
   except FileError as e:
     raise FileError(f"{e}; give --overwrite or another --out") from None
-  skip = ("git_commit", "machine", "python")
-  if isinstance(old.get("adapt"), dict):
-    old["adapt"] = {**dataclasses.asdict(AdaptConfig()), **old["adapt"]}
-  default = {f.name: f.default for f in dataclasses.fields(RunConfig)}  # of a setting that did not exist when the run began; nor did `changes` always
-  changed = [k for k in values if k not in skip and old.get(k, default.get(k, values[k] if k == "changes" else None)) != values[k]]
-  changed += ["threshold"] * ("threshold" in old and "threshold" not in values)
+  changed = differing(old, values)
   if changed == ["threshold"]:
     raise UserError(f"--resume: {out} was begun when its detector {old.get('detector')} had another default threshold than today; --overwrite begins anew")
   if changed:

@@ -79,14 +79,14 @@ class Snapshots:
 
   # ---- while the run lives -------------------------------------------------------------------------------------------------------
 
-  def take(self, acting, before, digest, now: int, length: int) -> None:
-    """Writes the snapshots that are due. acting: parameters with leading (groups,); digest: loop.Digest; the rest as in `due`."""
+  def take(self, acting, place, before, digest, now: int, length: int) -> None:
+    """Writes the snapshots that are due. acting: parameters, those of stream g at place[g]; digest: loop.Digest; the rest as in `due`."""
     wanted = np.flatnonzero(due(before, digest.decision, digest.since, now, length, self.config.snapshots) & self.kept)
     if not len(wanted):
       return
     arrays = {name: np.asarray(leaf) for name, leaf in _named({k: acting[k] for k in ACTS})}
     for g in wanted:
-      self._write(self._path(Snapshot(int(g), int(digest.since[g]), min(now, self.config.steps) - 1)), {name: x[g] for name, x in arrays.items()})
+      self._write(self._path(Snapshot(int(g), int(digest.since[g]), min(now, self.config.steps) - 1)), {name: x[place[g]] for name, x in arrays.items()})
 
   def _path(self, s: Snapshot) -> pathlib.Path:
     return self.folder / f"{s.stream:04d}-{s.step:09d}.npz"

@@ -94,7 +94,7 @@ def first_step(rows, g, due=ONSET):
 
 def equal(a, b, where=slice(None)):
   """Every array of two Rows is bit for bit the same in the rows `where`."""
-  return all(x[where].tobytes() == y[where].tobytes() for x, y in zip(a, b, strict=True))
+  return all(x is y or x[where].tobytes() == y[where].tobytes() for x, y in zip(a, b, strict=True))
 
 
 # ---- who changes when ----------------------------------------------------------------------------------------------------------------

@@ -93,8 +93,8 @@ def never_stops(arm: Arm) -> bool:
 
 
 def stops(arm: Arm) -> bool:
-  """The arm goes on from the shipped agent, all of it learns, and the stop rule ends that: its stop compares with those of one that never stops."""
-  return arm.end is RULE and arm.breaks and not arm.fresh and not arm.world_only
+  """The arm goes on from the shipped agent, all of it learns and is kept, and the stop rule ends that: its stop compares with those of one that never stops."""
+  return arm.end is RULE and arm.breaks and not arm.fresh and not arm.world_only and not arm.rollback
 
 
 ARMS: dict[str, Arm] = {

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_cl.adapt.loop import Choices, Digest, Loop, LoopState
+from mjx_cl.lanes import Lanes
 from mjx_cl.runtime import cores
 
 LATER = ("history", "past")                         # fields of a LoopState whose streams lie along axis 1; of the others along axis 0
@@ -71,11 +72,16 @@ class Crew:
     done = [out[i] for i in range(len(self.blocks))]
     return [state for state, _ in done], glue([digest for _, digest in done], ROWS)
 
-  def acting(self, states: list[LoopState]) -> Any:
-    """What each stream acts by, leading (groups,). Of a single block these are its own arrays: the next digest uses them up."""
-    if len(states) == 1:
-      return states[0].acting
-    return jax.tree.map(lambda *x: jnp.asarray(np.concatenate([np.asarray(y) for y in x])), *[state.acting for state in states])
+  def acting(self, states: list[LoopState], lanes: Lanes | None = None) -> Any:
+    """What each stream acts by, leading (lanes,); None: (groups,). Of a single block in that order these are its own arrays: the next digest uses them up."""
+    whole = states[0].acting if len(states) == 1 else None
+    if lanes is None or lanes.plain:
+      return whole if whole is not None else jax.tree.map(lambda *x: jnp.asarray(np.concatenate([np.asarray(y) for y in x])), *[state.acting for state in states])
+    if whole is not None:
+      return lanes.spread(whole)
+    at = [(states[i].acting, g - block.start) for i, block in enumerate(self.blocks) for g in range(block.start, block.stop)]
+    one = lambda tree, k: jax.tree.map(lambda x: np.asarray(x)[k], tree)
+    return jax.tree.map(lambda *x: jnp.asarray(np.stack(x)), *[one(*at[g]) for g in lanes.order])
 
   def shapes(self, states: list[LoopState]) -> LoopState:
     """What `join` gives, without its numbers and without their memory."""
