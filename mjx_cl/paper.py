@@ -148,8 +148,10 @@ def last_stop(rows: list[dict]) -> Measured:
 
 
 def outcomes(rows: list[dict]) -> Measured:
-  """How the streams ended; the value is the share that converged."""
-  count = lambda *names: sum(r["outcome"] in names for r in rows)
+  """How the finetunings that went on at the change or began after it ended; the value is the share of streams that converged. One that was over before, begun by a false
+  alarm, counts as never alarmed."""
+  over = lambda r: r["adapt_stop"] is not None and r["onset"] is not None and r["adapt_stop"] < r["onset"] and r["outcome"] != "adapting"
+  count = lambda *names: sum(("nominal" if over(r) else r["outcome"]) in names for r in rows)
   n, good = len(rows), count("converged")
   ci = [x * n for x in bootstrap.wilson(good, n)]
   return Measured(good / n, f"converged {good} of {n} {span(ci, 1)}, aborted {count('aborted_by_rule', 'aborted_by_budget')}, "
@@ -190,7 +192,9 @@ def setup(experiment: Experiment, config: dict) -> list[str]:
            (dreamer["min_std"], author.min_std, "standard deviation of the actions at least {:g} in place of {:g}"),
            (dreamer["max_std"], author.max_std, "at most {:g} in place of {:g}"), (dreamer["entropy"], author.entropy, "entropy weight {:g} in place of {:g}"),
            (dreamer["horizon"], author.horizon, "discount horizon {} in place of {}"), (adapt["ratio"], RATIO, "train ratio {:g} in place of {:g}"),
-           (config["onset"], experiment.onset, "onset {:,} in place of {:,}")]
+           (config["onset"], experiment.onset, "onset {:,} in place of {:,}"),
+           (adapt["average"], 1.0, "while finetuning the robot acts by a moving average of the weights (rate {:g} every 64 steps)"),
+           (adapt["least"], 1, "a finetuning lasts {:,} steps at least before it may converge")]
   words = [text.format(ours, theirs) for ours, theirs, text in pairs if ours != theirs]
   if config["detector"] != "rolling_sigma_plain":
     words.append(f"detector `{config['detector']}` in place of three standard deviations of single residuals")

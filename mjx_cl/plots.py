@@ -103,8 +103,12 @@ def _figure(folder, width: int) -> pathlib.Path:
   return folder / "figure.png"
 
 
+FEW = 3  # seeds that give no interval, see report.few
+
+
 def survival(out, parts: list[str], columns: int = 3) -> pathlib.Path | None:
-  """Draws OUT/recovery.png: of each part with affected streams and several arms, the share not yet recovered (Kaplan-Meier) since the onset.
+  """Draws OUT/recovery.png: of each part with affected streams and several arms, the share not yet recovered (Kaplan-Meier) since the onset, shaded its pointwise 95 %
+  interval, which ends where the last stream recovers or is watched no longer.
 
   Returns:
     The file; None where no part has an affected stream.
@@ -133,6 +137,8 @@ def survival(out, parts: list[str], columns: int = 3) -> pathlib.Path | None:
       curve = estimate.kaplan_meier(time, seen)
       x, level = [0.0, *curve.time, curve.last], [1.0, *curve.survival]
       axis.step(x, level + level[-1:], where="post", color=f"C{k}", lw=1.6, label=f"{arm}, {int(seen.sum())} of {len(seen)}")
+      bounds = [[1.0, *side, *side[-1:]] for side in (curve.low, curve.high)]
+      axis.fill_between(x, *(side if len(side) == len(x) else [1.0] * len(x) for side in bounds), step="post", color=f"C{k}", alpha=0.12, lw=0)
       axis.plot(time[~seen], [level[int(np.searchsorted(curve.time, t, "right"))] for t in time[~seen]], "|", color=f"C{k}", ms=7)
     axis.set(title=part, xlabel="control steps since onset", ylim=(-0.03, 1.05))
     axis.locator_params(axis="x", nbins=5)
@@ -146,7 +152,8 @@ def survival(out, parts: list[str], columns: int = 3) -> pathlib.Path | None:
 
 
 def ratios(out, points: list[dict]) -> pathlib.Path | None:
-  """Draws OUT/ratio.png: restricted mean time to recovery against train ratio, a line with 95 % intervals for each env, fault and severity.
+  """Draws OUT/ratio.png: restricted mean time to recovery against train ratio, a line with 95 % intervals for each env, fault and severity. Points of FEW seeds or fewer
+  are hollow, without an interval, and no line joins them to others, which are of other seeds too.
 
   Args:
     points: {line, ratio, mean, ci (low, high) or None, n, recovered} of parts with affected streams.
@@ -164,10 +171,15 @@ def ratios(out, points: list[dict]) -> pathlib.Path | None:
   for k, (line, own) in enumerate(lines.items()):
     x, mean = np.array([p["ratio"] for p in own]) * 1.04 ** (k - (len(lines) - 1) / 2), np.array([p["mean"] for p in own])
     ends = np.array([p["ci"] or (p["mean"], p["mean"]) for p in own], float).T
-    axis.errorbar(x, mean, np.maximum(0.0, [mean - ends[0], ends[1] - mean]), fmt="o-", capsize=3, color=f"C{k}", label=line)
+    many = np.array([p["n"] > FEW for p in own])
+    if many.any():
+      axis.errorbar(x[many], mean[many], np.maximum(0.0, [mean - ends[0], ends[1] - mean])[:, many], fmt="o-", capsize=3, color=f"C{k}")
+    axis.plot(x[~many], mean[~many], "o:", color=f"C{k}", mfc="white")
+    axis.plot([], [], "o-", color=f"C{k}", label=line, mfc=f"C{k}" if many.any() else "white")
     for a, b, p in zip(x, mean, own):
       axis.annotate(f"{p['recovered']}/{p['n']}", (a, b), textcoords="offset points", xytext=(5, 4), fontsize=7, color=f"C{k}")
-  axis.set(xscale="log", xlabel="train ratio (replayed steps per lived step)", ylabel="control steps to recovery, restricted mean", ylim=(0, None))
+  axis.set_title(f"recovered / affected at each point; hollow: {FEW} seeds or fewer", fontsize=9)
+  axis.set(xscale="log", xlabel="train ratio (replayed steps per lived step)", ylabel="control steps to recovery, restricted mean", ylim=(0, 1.1 * max(p["ci"][1] if p["ci"] and p["ci"][1] else p["mean"] for p in points)))
   axis.set_xticks(sorted({p["ratio"] for p in points}), [f"{r:g}" for r in sorted({p["ratio"] for p in points})])
   axis.minorticks_off()
   axis.legend(fontsize=8)
