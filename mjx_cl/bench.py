@@ -24,7 +24,7 @@ from typing import NamedTuple
 
 from mjx_cl import pieces, store
 from mjx_cl.adapt.arms import ARMS, FOREVER, ONSET
-from mjx_cl.config import AdaptConfig, RunConfig, becomes, kinds, replace
+from mjx_cl.config import AdaptConfig, RunConfig, becomes, changes, kinds, replace
 from mjx_cl.errors import FileError, UserError
 
 SUITES = pathlib.Path(__file__).parent / "suites" / "bench"
@@ -38,7 +38,11 @@ PHYSICS_S = {"walker": 0.05e-3, "quadruped": 0.06e-3, "car": 0.0, "car_real": 0.
 UPDATE_S = 0.045 / (4 * 64)            # per replayed step that an update trains on, size1m, every state an imagination start, several streams side by side;
                                        # results/study: 0.087 s an update on one core
 COMPILE_S = 35.0                       # programs of one part
-ADAPTS = 7_000                         # control steps that an adaptation with a stop rule lasted on walkers (results/walker_gear)
+ADAPTS = {"walker": 7_900, "quadruped": 9_200, "car": 8_100, "car_real": 15_000}  # control steps that a finetuning with a stop rule lasted, of the robot
+                                       # that it goes on with: the mean, which sums need, of 585 in the published suites; test_bench.py holds it against them
+ADAPT = 9_000                          # of any other robot
+
+FOLDER, LETTERS = r"\w[\w .,=+-]*", "letters, digits, spaces and _ - + . , ="  # what the names of suites and entries are made of
 
 
 class Part(NamedTuple):
@@ -84,19 +88,23 @@ def suite(name: str, change: dict | None = None) -> Suite:
   if unknown or "name" not in data:
     wrong = f"unknown {', '.join(map(repr, unknown))}" if unknown else "no name"
     raise UserError(f"{where}: {wrong}; it takes: name, about, run, entries")
+  if not isinstance(data["name"], str) or not re.fullmatch(FOLDER, data["name"]):
+    raise UserError(f"{where}: name {data['name']!r} is a folder's name and takes {LETTERS} alone")
+  if not isinstance(data.get("run", {}), dict):
+    raise UserError(f"{where}: run is a table of settings for every entry; got {data['run']!r}")
   entries = data.get("entries", {})
   if not isinstance(entries, dict) or not entries or not all(isinstance(e, dict) for e in entries.values()):
     raise UserError(f"{where}: it needs tables [entries.NAME]")
   parts: list[Part] = []
   for key, entry in entries.items():
-    if not re.fullmatch(r"\w[\w .,=+-]*", key):
-      raise UserError(f"{where}: entry {key!r} is a folder's name and takes letters, digits and _ - + . , = alone")
+    if not re.fullmatch(FOLDER, key):
+      raise UserError(f"{where}: entry {key!r} is a folder's name and takes {LETTERS} alone")
     parts += grid(f"{where}, entry {key!r}", key, merged(merged(data.get("run", {}), entry), change or {}))
   names = [p.name for p in parts]
   twice = next((n for k, n in enumerate(names) if n in names[:k]), None)
   if twice:
     raise UserError(f"{where}: part {twice} is there twice")
-  return Suite(str(data["name"]), str(data.get("about", "")), tuple(parts))
+  return Suite(data["name"], str(data.get("about", "")), tuple(parts))
 
 
 def merged(first: dict, second: dict) -> dict:
@@ -108,9 +116,16 @@ def merged(first: dict, second: dict) -> dict:
 
 
 def grid(where: str, name: str, values: dict) -> list[Part]:
-  """Parts of one entry: all combinations of its lists."""
+  """Parts of one entry: all combinations of its lists.
+
+  Raises:
+    UserError for an empty list, a list of tables, or what `config` refuses.
+  """
+  for table in ("adapt", "settings"):
+    if not isinstance(values.get(table, {}), dict):
+      raise UserError(f"{where}: {table} is a table of settings; got {values[table]!r}")
   lists = [((k,), v) for k, v in values.items() if isinstance(v, list) and k != "arms"]
-  lists += [(("adapt", k), v) for k, v in values.get("adapt", {}).items() if isinstance(v, list)] if isinstance(values.get("adapt"), dict) else []
+  lists += [(("adapt", k), v) for k, v in values.get("adapt", {}).items() if isinstance(v, list)]
   for path, choices in lists:
     if not choices:
       raise UserError(f"{where}: {'.'.join(path)} is an empty list")
@@ -137,9 +152,9 @@ def config(where: str, values: dict) -> RunConfig:
     raise UserError(f"{where}: unknown setting {', '.join(map(repr, unknown))}; it takes: {', '.join(sorted(known))}")
   if "env" not in values:
     raise UserError(f"{where}: it needs an env")
-  for name in ("adapt", "settings"):
-    if not isinstance(values.get(name, {}), dict):
-      raise UserError(f"{where}: {name} is a table of settings; got {values[name]!r}")
+  arms = values.get("arms", [])
+  if not isinstance(arms, (list, tuple)) or not all(isinstance(arm, str) for arm in arms):
+    raise UserError(f"{where}: arms is one list of names; got {arms!r}; choose from: {', '.join(ARMS)}")
   check_kinds(where, RunConfig, values)
   check_kinds(where, AdaptConfig, values.get("adapt", {}), "adapt.")
   try:
@@ -176,18 +191,30 @@ def matmul_rate(seconds: float = 1.0) -> float:
   return 2 * 2048**3 / best
 
 
-def adapting_steps(config: RunConfig, arm: str) -> int:
-  """Control steps that a stream of `arm` is expected to adapt for: those of its schedule, or ADAPTS where a rule ends it."""
-  own = ARMS[arm]
-  if own.trigger.listens and not own.breaks:
-    return 0
-  changes = [c for c in (config.onset,) if c < config.steps]
-  if own.trigger.listens:
-    starts = changes
+def finetunings(config: RunConfig, arm: str, seed: int | None = None, most: int = FOREVER) -> list[int]:
+  """Control steps of each finetuning that is expected of a stream: those of its arm's schedule, or, where it listens, one from each onset and repair on; as long
+  as its robot's took (ADAPTS) where a rule ends it. What begins within another begins nothing.
+
+  Args:
+    seed: of the stream; None: the run's first. most: control steps after which it is told to end.
+  """
+  from mjx_cl.ledger import acts
+  own, faulty = ARMS[arm], [change for change in changes(config) if change.fault != "none"]
+  first = [config.onset] * (becomes(config) is not None)
+  if not own.breaks:
+    starts = []
+  elif own.trigger.listens:
+    starts = first + [config.onset + change.after + late for change in faulty if acts(change) for late in (0, change.duration) if late is not None]
   else:
-    starts = [s for s in own.trigger.steps(config.adapt, tuple(changes), config.steps, config.first_seed) if s < config.steps]
-  limit = min(ADAPTS if own.end.rule else FOREVER, own.end.limit(config.adapt))
-  return sum(min(limit, config.steps - s) for s in starts)
+    onsets = tuple(first + [config.onset + change.after for change in faulty])
+    starts = own.trigger.steps(config.adapt, onsets, config.steps, config.first_seed if seed is None else seed)
+  limit = min(ADAPTS.get(becomes(config) or config.env, ADAPT) if own.end.rule else FOREVER, own.end.limit(config.adapt), most)
+  out, free = [], config.adapt.warmup
+  for start in sorted(max(step, config.adapt.warmup) if own.trigger.listens else step for step in starts):
+    if free <= start < config.steps:
+      out.append(min(limit, config.steps - start))
+      free = start + out[-1]
+  return out
 
 
 class Robots:
@@ -200,16 +227,23 @@ class Robots:
 
 
 def estimate(part: Part, rate: float, robots: Robots | None = None) -> Estimate:
-  """Expected cost of a part on a machine whose dense float32 products run at `rate` FLOP/s. Physics is taken to scale alike: an estimate, no promise."""
+  """Expected cost of a part on a machine whose dense float32 products run at `rate` FLOP/s. Physics is taken to scale alike: an estimate, no promise.
+
+  Raises:
+    UserError, FileError for an agent or oracle stops that cannot be read, see `check`.
+  """
   from mjx_cl import memory, run
+  from mjx_cl.scoring import stop
   c = part.config
   robots = robots or Robots()
   spec, trained = robots.make(c.env, "auto").spec, robots.learner(c.env, c.agent)
   batch, starts = c.adapt.batch or trained.batch, c.adapt.last_starts
   size = memory.parameters(trained.size, len(spec.obs), len(spec.act), trained.bins)[0] / 640_867  # of size1m on a walker
   streams = len(c.arms) * c.seeds
-  updates = sum(c.seeds * max(0.0, adapting_steps(c, arm) - c.adapt.start_windows - trained.length) * c.adapt.ratio / (batch * trained.length)
-                for arm in c.arms)
+  told = stop.told(c)
+  learning = sum(max(0, steps - c.adapt.start_windows - trained.length) for arm in c.arms for seed in range(c.first_seed, c.first_seed + c.seeds)
+                 for steps in finetunings(c, arm, seed, told[seed] if ARMS[arm].end.told else FOREVER))
+  updates = learning * c.adapt.ratio / (batch * trained.length)
   share = 1.0 if not starts else 0.5 + 0.5 * starts / trained.length  # imagination is about half of an update
   physics = max(PHYSICS_S.get(name, 0.1e-3) for name in filter(None, (c.env, becomes(c))))
   seconds = streams * c.steps * ((WATCH_S + ACT_S) * size + physics) + updates * batch * trained.length * UPDATE_S * share * size
@@ -226,12 +260,12 @@ def estimates(parts, robots: Robots | None = None) -> dict[str, Estimate]:
 def check(part: Part, robots: Robots | None = None) -> None:
   """Refuses, before the suite starts, names and values that only the registries know: fault, target, detector, agent."""
   from mjx_cl import detectors, faults, run
-  from mjx_cl.config import changes
   from mjx_cl.scoring import stop
   c, robots = part.config, robots or Robots()
   try:
     detectors.make(c.detector, **c.settings)
     faults.build(changes(c), robots.make(becomes(c) or c.env, c.physics), c.onset)
+    robots.learner(c.env, c.agent)
     run.arm_agents(c, robots.make(c.env, c.physics))
     stop.told(c)
   except UserError as e:
@@ -256,12 +290,30 @@ def finished(out: pathlib.Path, part: Part) -> bool:
   Raises:
     UserError where it holds a run with other settings.
   """
-  folder = out / part.name
-  if not (folder / "config.json").exists():
-    return False
-  from mjx_cl.run import check_same, identity
-  check_same(folder, {k: v for k, v in identity(part.config).items() if k != "physics"})
-  return (folder / "summary.json").exists()
+  folder = pathlib.Path(out) / part.name
+  if text := pieces.differs(folder, part.config):
+    raise UserError(f"{folder} {text}; give the same settings or another --out, or remove that folder")
+  return _complete(folder)
+
+
+def _complete(folder: pathlib.Path) -> bool:
+  return (folder / "config.json").exists() and (folder / "summary.json").exists()
+
+
+def standing(out, parts) -> tuple[list[Part], dict[str, str]]:
+  """What OUT holds of the parts: those that are finished, and name -> why, in a few words, of those that it holds with other settings."""
+  own, others = [], {}
+  for part in parts:
+    folder = pathlib.Path(out) / part.name
+    try:
+      text = pieces.differs(folder, part.config)
+    except UserError as e:
+      text = f"cannot be compared: {e}"
+    if text:
+      others[part.name] = text
+    elif _complete(folder):
+      own.append(part)
+  return own, others
 
 
 def pick(parts: tuple[Part, ...], only: tuple[str, ...], shard: tuple[int, int] = (0, 1)) -> list[Part]:
@@ -276,20 +328,37 @@ def pick(parts: tuple[Part, ...], only: tuple[str, ...], shard: tuple[int, int] 
   return chosen[k::n]
 
 
-def take(out: pathlib.Path, parts, folders) -> list[str]:
-  """Copies finished parts that lie in `folders`, others' OUT of the same suite, and are missing here; returns their names. Seeds of a part that
-  lie in several of them are joined, see pieces.py.
+def offers(out, parts, folders, tell: Callable[[str], None] = lambda text: None) -> dict[str, list[pathlib.Path]]:
+  """Part -> folders that its run can be taken from, of those that are not finished in OUT: one, or several whose seeds are to be joined, see pieces.py.
 
+  Args:
+    folders: others' OUT of the same suite. tell: gets a line for each part of theirs that is refused, since it was run with other settings or cannot be read.
   Raises:
-    UserError where a folder holds a part with other settings, or seeds of a part are missing or there twice.
+    UserError where OUT holds a part with other settings, or seeds of a part are missing or there twice.
   """
-  got = []
+  found = {}
   for part in parts:
     if finished(out, part):
       continue
-    there = [pathlib.Path(folder) / part.name for folder in folders]
-    sources = next(([own] for own in there if pieces.seeds_of(own, part.config) == part_seeds(part)), None) or pieces.choose(there, part.config)
-    if not sources:
+    there = []
+    for folder in (pathlib.Path(f) / part.name for f in folders):
+      try:
+        if text := pieces.differs(folder, part.config, pieces.SEEDS):
+          tell(f"note: {folder} {text}; it is not taken over")
+        elif own := pieces.seeds_of(folder, part.config):
+          there.append((folder, own))
+      except UserError as e:
+        tell(f"note: {e}; {part.name} is not taken over from there")
+    whole = [[folder] for folder, own in there if own == part_seeds(part)]
+    if sources := whole[0] if whole else pieces.choose([folder for folder, _ in there], part.config):
+      found[part.name] = sources
+  return found
+
+
+def take(out, parts, found: dict[str, list[pathlib.Path]]) -> None:
+  """Copies to OUT, or joins there, what `offers` has found of the parts."""
+  for part in parts:
+    if not (sources := found.get(part.name)):
       continue
     tmp = out / (part.name + ".tmp")
     shutil.rmtree(tmp, ignore_errors=True)
@@ -298,12 +367,11 @@ def take(out: pathlib.Path, parts, folders) -> list[str]:
       for name in MERGED:
         if (sources[0] / name).exists():
           shutil.copyfile(sources[0] / name, tmp / name)
+      pieces.copy_agents(sources[0], tmp)
     else:
       pieces.join(sources, tmp, part.config)
     shutil.rmtree(out / part.name, ignore_errors=True)
     os.replace(tmp, out / part.name)
-    got.append(part.name)
-  return got
 
 
 def part_seeds(part: Part) -> list[int]:
@@ -311,23 +379,53 @@ def part_seeds(part: Part) -> list[int]:
   return list(range(part.config.first_seed, part.config.first_seed + part.config.seeds))
 
 
-def publish(out: pathlib.Path, parts, to) -> list[str]:
-  """Copies the finished parts' small files, all but the trace, to the folder `to`, as they are committed; returns the parts' names."""
-  to, done = pathlib.Path(to), []
-  for part in parts:
-    if not finished(out, part):
-      continue
+def publish(out, plan: Suite, to) -> list[str]:
+  """Copies the finished parts' small files, all but the trace, to the folder `to`, as they are committed, and writes there what `collect` does of them and of the
+  parts that lie there already and OUT lacks, which stay as they are; returns the names of those copied.
+
+  Raises:
+    UserError, FileError as `earlier`.
+  """
+  out, to = pathlib.Path(out), pathlib.Path(to)
+  kept, done = earlier(to, plan), standing(out, plan.parts)[0]
+  for part in done:
+    kept.pop(part.name, None)
     (to / part.name).mkdir(parents=True, exist_ok=True)
     for name in PUBLISHED:
       if (out / part.name / name).exists():
         store.atomic(to / part.name / name, lambda file, source=out / part.name / name: file.write(source.read_bytes()))
       else:  # of an earlier run, as the figure where seeds were joined without their traces
         (to / part.name / name).unlink(missing_ok=True)
-    done.append(part.name)
-  for name in ("suite.json", "bench.json", "bench.parquet", "recovery.png", "ratio.png"):
-    if done and (out / name).exists():
-      store.atomic(to / name, lambda file, source=out / name: file.write(source.read_bytes()))
-  return done
+  if done:
+    names = {p.name for p in plan.parts}
+    both = plan._replace(parts=(*(kept[p.name][0] if p.name in kept else p for p in plan.parts), *(part for name, (part, _) in kept.items() if name not in names)))
+    known = {name: scored for name, (_, scored) in kept.items()} | {p.name: store.read_json(out / "bench.json")["entries"][p.name]["scores"] for p in done}
+    write_plan(both, to)
+    collect(to, both, known, frozenset(kept))
+  return [p.name for p in done]
+
+
+def earlier(to, plan: Suite) -> dict[str, tuple[Part, dict]]:
+  """Name -> the part and its scores, of what was published in the folder `to` before.
+
+  Raises:
+    UserError where another suite was, or suite.json does not say what a part is; FileError for a broken file.
+  """
+  to = pathlib.Path(to)
+  if not (to / "bench.json").exists():
+    return {}
+  value = store.read_json(to / "bench.json")
+  if value.get("suite") != plan.name:
+    raise UserError(f"--publish: {to} holds suite {value.get('suite')!r}, not {plan.name!r}; give another folder")
+  entries = {name: entry for name, entry in value.get("entries", {}).items() if _complete(to / name)}
+  said = store.read_json(to / "suite.json").get("parts", {}) if entries else {}
+  out = {}
+  for name, entry in entries.items():
+    try:
+      out[name] = Part(name, _resolved(said[name])), entry["scores"]
+    except (KeyError, TypeError, UserError) as e:
+      raise UserError(f"--publish: {to} holds part {name}, which its suite.json and bench.json do not describe ({e}); give another folder") from None
+  return out
 
 
 HORIZON = 10_000  # control steps after the onset, of the restricted mean time to recovery
@@ -340,14 +438,14 @@ def scores(folder) -> dict:
   Returns:
     normalised: arm -> recovery, 0 = arm `none`, 1 = reward_pre (scoring.normalised.summarise); null without arm `none`.
     against_oracle: paired difference of `detector` and `oracle` in it (scoring.normalised.difference); null without both arms.
-    recovery: arm -> Kaplan-Meier of the affected streams: n, recovered, median_steps, restricted_mean_steps up to HORIZON or to where the run ends, each with
-      _ci; null without affected streams.
+    recovery: arm -> Kaplan-Meier of the affected streams: n, recovered, median_steps, restricted_mean_steps up to HORIZON or to where the first stream is no longer
+      watched, see survival.watched, each with _ci; null without affected streams.
     ablation: the stop rule with each signal left out (scoring.stop.ablated); only where an arm that never stops has adapted.
     without_floor: patience [chunks], as text -> the same without the floor of `least` control steps, so that the signals alone decide.
   """
-  from mjx_cl.scoring import normalised, recovery, stop, survival
+  from mjx_cl.scoring import normalised, stop, survival
   config, rows = store.read_json(folder / "config.json"), store.read_rows(folder / "runs.parquet")
-  first, arms = [r for r in rows if not r["change"]], config["arms"]
+  arms, watched = config["arms"], survival.watched(rows, config["steps"])
   scored = normalised.rows(rows) if "none" in arms else []
   out = {"normalised": normalised.summarise(scored) or None, "against_oracle": None, "recovery": {}}
   if scored and {"detector", "oracle"} <= set(arms):
@@ -367,24 +465,26 @@ def scores(folder) -> dict:
     time_, seen = survival.of_runs([r for r in own if not r["change"]] + [dict(r, affected=False) for r in own if r["change"]], config["steps"])
     median, median_ci = survival.quantile(survival.kaplan_meier(time_, seen))
     enough = len(seen) > 3  # three streams or fewer give no interval
-    horizon = min(HORIZON, config["steps"] - max(r["onset"] for r in first if r["onset"] is not None) - recovery.HOLD)
+    horizon = min(HORIZON, *(w for w, r in zip(watched, rows) if not r["change"] and r["onset"] is not None))
     mean, mean_ci = survival.restricted_mean(time_, seen, horizon) if horizon > 0 else (None, None)
     out["recovery"][arm] = {"n": len(seen), "recovered": int(seen.sum()), "median_steps": median, "median_steps_ci": median_ci if enough else None,
                             "restricted_mean_steps": mean, "restricted_mean_steps_ci": mean_ci if enough else None, "horizon": horizon}
   return out
 
 
-def collect(out: pathlib.Path, plan: Suite, known: dict | None = None) -> dict:
-  """Writes OUT/bench.parquet, OUT/bench.json, OUT/recovery.png and OUT/ratio.png from the finished parts and returns the second's value.
+def collect(out: pathlib.Path, plan: Suite, known: dict | None = None, kept: frozenset[str] = frozenset()) -> dict:
+  """Writes OUT/bench.parquet, OUT/bench.json, OUT/recovery.png and OUT/ratio.png from the finished parts and returns the second's value. What OUT holds of a part
+  with other settings is left out, see `standing`.
 
   Args:
-    known: part -> scores, of those that an earlier call has read; filled here.
+    known: part -> scores, of those that an earlier call has read; filled here. kept: parts that count whatever their settings.
   """
   known = {} if known is None else known
   columns: dict[str, list] = {}
   value = {"suite": plan.name, "parts": len(plan.parts), "finished": 0, "entries": {}}
+  there = {p.name for p in standing(out, [p for p in plan.parts if p.name not in kept])[0]} | kept
   for part in plan.parts:
-    if not finished(out, part):
+    if part.name not in there:
       continue
     summary = store.read_json(out / part.name / "summary.json")
     value["finished"] += 1
@@ -439,8 +539,12 @@ def _published(folder: pathlib.Path, name: str) -> Suite:
     parts = store.read_json(folder / "suite.json")["parts"]
   except FileError as e:
     raise UserError(f"suite {name!r} is none of this package's, and {e}") from None
-  config = lambda c: RunConfig(**c | {"arms": tuple(c["arms"]), "adapt": AdaptConfig(**c["adapt"])})
-  return Suite(name, "", tuple(Part(part, config(c)) for part, c in parts.items()))
+  return Suite(name, "", tuple(Part(part, _resolved(c)) for part, c in parts.items()))
+
+
+def _resolved(values: dict) -> RunConfig:
+  """The settings of a part as suite.json holds them."""
+  return RunConfig(**values | {"arms": tuple(values["arms"]), "adapt": AdaptConfig(**values["adapt"])})
 
 
 def _points(part: Part, scores_: dict) -> list[dict]:

@@ -69,26 +69,37 @@ def do_bench(args: Bench) -> None:
       raise UserError(f"--merge: no folder {folder}")
   parts = bench.pick(suite.parts, args.only, (int(k), int(n)))
   out = pathlib.Path(args.out or f"runs/bench/{suite.name}")
+  for folder in args.merge:
+    if not any(os.path.isfile(os.path.join(folder, p.name, "config.json")) for p in parts):
+      raise UserError(f"--merge: {folder} holds none of the parts {', '.join(p.name for p in parts[:3])}{' ...' * (len(parts) > 3)}; it takes the OUT of a bench of this suite")
+  if args.publish:
+    bench.earlier(args.publish, suite)
   done = {p.name for p in parts if bench.finished(out, p)}
+  found = bench.offers(out, parts, args.merge, say)
   robots = bench.Robots()
-  estimates = bench.estimates(parts, robots)
   for part in parts:  # whatever can be refused is refused before the first part runs
-    if part.name not in done:
+    if part.name not in done and part.name not in found:
       bench.check(part, robots)
+  estimates = bench.estimates(parts, robots)
+  chosen, others = {p.name for p in parts}, {}
+  for name, text in bench.standing(out, [p for p in suite.parts if p.name not in chosen])[1].items():
+    others.setdefault(text, []).append(name)
+  if others:
+    which = "; ".join(f"{', '.join(names)} ({text})" for text, names in others.items())
+    say(f"note: left out of bench.json, with the folder as it is, for settings other than now and not asked for: {which}")
   if args.plan:
+    done |= set(found)
     if args.json:
       emit([{"part": p.name, "finished": p.name in done, **estimates[p.name]._asdict()} for p in parts])
     else:
       print("\n".join(plan_lines(suite, parts, done, estimates)))
     return
-  for folder in args.merge:
-    if not any(os.path.isfile(os.path.join(folder, p.name, "config.json")) for p in parts):
-      raise UserError(f"--merge: {folder} holds none of the parts {', '.join(p.name for p in parts[:3])}{' ...' * (len(parts) > 3)}; it takes the OUT of a bench of this suite")
   try:
     out.mkdir(parents=True, exist_ok=True)
   except OSError as e:
     raise FileError(f"cannot make {out}: {e.strerror}") from None
-  for name in bench.take(out, parts, args.merge):
+  bench.take(out, parts, found)
+  for name in found:
     say(f"{name}: taken over")
     done.add(name)
   needs, space = [estimates[p.name].bytes for p in parts if p.name not in done], int(memory.MARGIN * memory.free())
@@ -99,7 +110,7 @@ def do_bench(args: Bench) -> None:
     say(line)
   value = bench.execute(suite, out, parts, estimates, say, RunDisplay, jobs=jobs)
   if args.publish:
-    bench.publish(out, suite.parts, args.publish)
+    bench.publish(out, suite, args.publish)
   if args.json:
     emit(value)
     return

@@ -3,21 +3,88 @@
 A stream's keys come from its seed alone, so the seeds of a run may be lived apart; only the last digits of a float may differ then (see run.Runner).
 The joined folder is as `mjx-cl run` writes it: streams are numbered arm by arm, seed by seed, and summary.json is computed anew from the rows. Its config.json
 is the first piece's with all the seeds, and `pieces` says of each when and on what it was run. Tables that one piece lacks, as published ones
-lack their trace, are left out.
+lack their trace, are left out; agents that were kept stay by arm and seed.
 """
 from __future__ import annotations
 
+import functools
 import pathlib
+import shutil
 
 from mjx_cl import store
+from mjx_cl.adapt.arms import ARMS
 from mjx_cl.config import RunConfig
 from mjx_cl.errors import FileError, UserError
 
-ORDER = {"trace": "step", "events": "step", "runs": "change", "signals": "step", "snapshots": "step", "stop": "since"}  # table -> what follows the stream
+ORDER = {"trace": "step", "events": "step", "runs": "change", "signals": "step", "snapshots": "step", "stop": "since",
+         "residuals": "step"}  # table -> what follows the stream
 KEPT = ("git_commit", "machine", "python", "versions")
-SAME = ("physics", "agent_card", "repeat", "control_s")  # of config.json, beside the settings: one agent and one backend lived all the seeds
+SEEDS = ("seeds", "first_seed")  # settings that pieces do not share
+SAME = ("physics", "agent_card", "arm_cards", "repeat", "control_s")  # of config.json, beside the settings: one agent and one backend lived all the seeds
 
 SUMMED = ("env", "fault", "severity", "onset", "steps", "detector", "invalid_share", "wall_s", "wall_s_arms", "wall_share")  # what `join` takes from summary.json
+
+
+def differs(folder, config: RunConfig, but: tuple[str, ...] = ()) -> str | None:
+  """How the run in `folder` differs from `config`, as the rest of a line that begins with it; None where it does not, or there is none.
+
+  Of `oracle_stops` those of the folder's own seeds count. Agents are compared by their cards, as far as today's can be read: a key that a card has gained since
+  is no difference.
+
+  Args:
+    but: settings that may differ.
+  Raises:
+    FileError for a config.json that cannot be read.
+  """
+  from mjx_cl.run import differing, identity
+  folder = pathlib.Path(folder)
+  if not (folder / "config.json").exists():
+    return None
+  try:
+    old = store.read_json(folder / "config.json")
+  except FileError as e:
+    raise FileError(f"{e}; give another folder, or remove that one") from None
+  values = {k: v for k, v in identity(config).items() if k not in ("physics", *but)}
+  if "oracle_stops" in values:
+    values["oracle_stops"] = {seed: stop for seed, stop in values["oracle_stops"].items() if int(seed) in _seeds(folder, old)}
+  changed = differing(old, values)
+  for name, today in cards(config).items():
+    if name in old and (keys := changed_keys(old[name], today)):
+      changed.append(f"{name} ({', '.join(keys)})")
+  if changed == ["threshold"]:
+    return f"was begun when its detector {old.get('detector')} had another default threshold than today"
+  return f"was begun with another {', '.join(changed)}" if changed else None
+
+
+def cards(config: RunConfig) -> dict[str, dict]:
+  """Today's `agent_card` and `arm_cards` as config.json holds them; empty where the agent cannot be read, as one that was moved."""
+  file = pathlib.Path(config.agent or "") / "card.json"
+  return _cards(config.env, config.agent, tuple(arm for arm in config.arms if ARMS[arm].agent), file.stat().st_mtime_ns if file.is_file() else None)
+
+
+@functools.lru_cache(maxsize=64)
+def _cards(env_name, agent, arms, written) -> dict[str, dict]:
+  """written: when the card of an agent by folder was; it stands for its content."""
+  from mjx_cl import agents, envs, run
+  try:
+    env = envs.make(env_name, "auto")
+    others = run.arm_agents(RunConfig(env_name, agent=agent, arms=("none", *arms)), env)
+    return {"agent_card": agents.of(env, agent).card, **({"arm_cards": {arm: other.card for arm, other in others.items()}} if others else {})}
+  except UserError:
+    return {}
+
+
+def changed_keys(old, new) -> list[str]:
+  """Keys of the card `old`, in order, of which `new` says something else or nothing; of tables in it as `dreamer.size`."""
+  if not isinstance(old, dict) or not isinstance(new, dict):
+    return [] if old == new else ["all"]
+  out = []
+  for key, value in old.items():
+    if isinstance(value, dict) and isinstance(new.get(key), dict):
+      out += [f"{key}.{below}" for below in changed_keys(value, new[key])]
+    elif key not in new or new[key] != value:
+      out.append(key)
+  return out
 
 
 def seeds_of(folder, config: RunConfig) -> list[int] | None:
@@ -26,14 +93,18 @@ def seeds_of(folder, config: RunConfig) -> list[int] | None:
   Raises:
     UserError where it was run with other settings; FileError for a config.json that is not a run's.
   """
-  from mjx_cl.run import check_same, identity
   folder = pathlib.Path(folder)
   if not (folder / "config.json").exists() or not (folder / "summary.json").exists():
     return None
-  check_same(folder, {k: v for k, v in identity(config).items() if k not in ("physics", "seeds", "first_seed")})
-  own = store.read_json(folder / "config.json")
+  if text := differs(folder, config, SEEDS):
+    raise UserError(f"{folder} {text}; --overwrite of `mjx-cl run` begins it anew")
+  return list(_seeds(folder, store.read_json(folder / "config.json")))
+
+
+def _seeds(folder, values: dict) -> range:
+  """Seeds of a run by its config.json, `values`."""
   try:
-    return list(range(own["first_seed"], own["first_seed"] + own["seeds"]))
+    return range(values["first_seed"], values["first_seed"] + values["seeds"])
   except (KeyError, TypeError):
     raise FileError(f"{folder / 'config.json'} is not a run's: it does not say its seeds") from None
 
@@ -119,11 +190,20 @@ def join(folders, out, config: RunConfig) -> dict:
     value["wall_s_snapshots"] = float(sum(s.get("wall_s_snapshots") or 0.0 for s in summaries))
     value["stop_rule"] = stop.summarise(rows["stop"].to_pylist())
   pieces = [piece for own in configs for piece in own.get("pieces", [{k: own[k] for k in ("first_seed", "seeds", *KEPT) if k in own}])]
-  store.write_json(out / "config.json", configs[0] | {"first_seed": config.first_seed, "seeds": config.seeds, "pieces": pieces})
+  told = {seed: stop for own in configs for seed, stop in own.get("oracle_stops", {}).items()}
+  store.write_json(out / "config.json", configs[0] | {"first_seed": config.first_seed, "seeds": config.seeds, **({"oracle_stops": told} if told else {}), "pieces": pieces})
+  for folder in folders:
+    copy_agents(folder, out)
   if "trace" in rows:
     plots.figure(out)
   store.write_json(out / "summary.json", value)  # last: a folder with it is a finished run
   return value
+
+
+def copy_agents(folder: pathlib.Path, out: pathlib.Path) -> None:
+  """Agents that the run in `folder` kept (RunConfig.keep), ARM-SEED each, also into the folder `out`."""
+  if (folder / "agents").is_dir():
+    shutil.copytree(folder / "agents", out / "agents", dirs_exist_ok=True)
 
 
 def joined(tables, number: dict[tuple[str, int], int], key: str):

@@ -413,8 +413,8 @@ def arms(results: pathlib.Path, suite: str = "paper", beside: dict | None = None
       holds = {True: "the interval holds 0", False: "the interval does not hold 0", None: "no interval"}[pair["holds_zero"]]
       pairs.append(f"{part} {both(pair, 'difference', 2)}, {pair['seeds']} seeds, {holds}")
   text = fill(f"""
-      Affected streams that recover, Kaplan-Meier's median with Brookmeyer and Crowley's interval, restricted mean up to 10,000 steps or to where the run
-      ends; normalised recovery over the last 2,000 steps before the next change (0: arm `none`, 1: the reward before onset), interquartile mean with its bootstrap
+      Affected streams that recover, Kaplan-Meier's median with Brookmeyer and Crowley's interval, restricted mean up to 10,000 steps or to 2,000 steps before the first
+      stream's next change or end; normalised recovery over the last 2,000 steps before the next change (0: arm `none`, 1: the reward before onset), interquartile mean with its bootstrap
       interval; updates and falls or crashes a stream, means. {FEW if any(" to " in cell for row in rows for cell in row) else ""} {f"Method minus oracle trigger, paired over seeds: {'; '.join(pairs)}." if pairs else ""}""")
   return text + "\n\n" + grid(("experiment", "arm", "recovered", "median [steps]", "restricted mean [steps]", "normalised recovery", "updates", "falls"), rows)
 
@@ -429,6 +429,7 @@ def other_arms(results: pathlib.Path) -> str:
 
 def stop_rule(results: pathlib.Path) -> str:
   """When the stop rule ended finetuning, against the oracle stop; and when it would have with a signal left out."""
+  from mjx_cl.scoring import normalised
   rows, without, floorless, first = [], [], [], None
   stopped = lambda own: (f"{own['converged']} of {own['adaptations']}", str(own["aborted"]), both(own, "own_stop_steps_median"), f"{own['early']} of {own['judged']}",
                          "-" if own["lost_share"] is None else f"{percent(own['lost_share'], 1)} {percents(own['lost_share_ci'], 1)} %")
@@ -455,7 +456,8 @@ def stop_rule(results: pathlib.Path) -> str:
   text = fill(f"""
       The oracle stop is the earliest snapshot whose frozen episodes on the faulty robot reach {percent(first['share'])} % of the best snapshot's. Medians and
       interquartile means with 95 % bootstrap intervals over streams; an adaptation that never ended counts as later than all others. Return lost is the best
-      snapshot's reward less that of the stop, over {number(first['horizon_steps'])} control steps, and as a share of the former: an upper bound, since the best of many noisy snapshots is the luckiest too.""")
+      snapshot's reward less that of the stop, over {number(first['horizon_steps'])} control steps, and as a share of the former: an upper bound, since the best of many noisy snapshots is the luckiest too. An abort is
+      right where no arm has won back {percent(normalised.HALF)} % of the loss by the end of the run, {number(entry['steps'] - entry['onset'])} steps after the onset.""")
   more = fill("""
       The rule replayed over the recorded signals of the adaptations that never stop, with each signal left out: how many converge, abort, and
       when.""")
@@ -489,6 +491,35 @@ def oracle_stop(results: pathlib.Path) -> str:
       stream; affected streams that recover before the run ends; reward a step over the last 2,000 steps (interquartile mean); return lost from the onset to the end of the run, {number(lived)} steps, a stream's mean; and how much less return than `oracle-stop` an
       arm has from the onset on, as a share of the latter's, paired over the seeds: below 0 it has more. 95 % bootstrap intervals over streams.""")
   return text + "\n\n" + grid(("fault", "arm", "finetuned [steps]", "updates", "recovered", "reward at the end", "return lost", "less return than `oracle-stop`"), rows)
+
+
+def expert(results: pathlib.Path) -> str:
+  """The paper's walker measured against an expert, and what that expert is worth."""
+  from mjx_cl.scoring import normalised
+  folder, lived = results / "expert" / "walker", table(results / "paper" / "walker" / "runs.parquet")
+  config, runs = load(folder / "config.json"), {(r["arm"], r["seed"]): r for r in table(folder / "runs.parquet")}
+  arm = next(a for a in config["arms"] if a != "none")
+  seeds = sorted(seed for a, seed in runs if a == arm)
+  by = {word: {(r["arm"], r["seed"]): r for r in normalised.rows(lived, reference)} for word, reference in (
+      ("before", None), ("expert", [r for (a, _), r in runs.items() if a == arm]))}
+  rows = []
+  for seed in seeds:
+    of = lambda word, name: number(by[word][name, seed]["normalised"], 2)
+    final = lambda name: number(by["before"][name, seed]["reward_final"], 2)
+    rows.append((str(seed), runs[arm, seed]["fault"].split(":")[-1], number(by["before"]["detector", seed]["reward_pre"], 2), final("none"), final("detector"), final("oracle"), number(runs[arm, seed]["reward_final"], 2),
+                 number(runs["none", seed]["reward_final"], 2), of("before", "detector"), of("expert", "detector"), of("before", "oracle"), of("expert", "oracle"), number(runs[arm, seed]["updates"])))
+  shots = [r for r in table(folder / "snapshots.parquet") if r["arm"] == arm]
+  every = config["snapshots"]
+  at = sorted({every * round(r["since_start"] / every) for r in shots})
+  curve = {(r["seed"], every * round(r["since_start"] / every)): r["reward_mean"] for r in shots}
+  text = fill(f"""
+      Expert: finetuning from the true onset at train ratio {config['adapt']['ratio']:g} for {number(config['adapt']['budget'])} steps (`mjx-cl bench benchmarks/expert.toml`). Reward a step before the onset and over the last
+      2,000 steps of each arm of `paper/walker`, of the expert, and of its pair that never adapts and lives as long; normalised recovery of arms `detector` and `oracle`, with the reward before the onset as 1 and with the expert's last reward as 1; updates of
+      the expert. Single seeds, no intervals.""")
+  more = fill(f"""
+      Reward a step of the expert's weights by the time it has finetuned, as it was when that began (0) and every {number(every)} steps: {len([k for k in shots[0] if k.startswith("return_")])} episodes each on the broken robot, weights frozen.""")
+  return "\n\n".join([text, grid(("seed", "joint", "before", "`none`", "`detector`", "`oracle`", "expert", "`none`, as long", "`detector`, of before", "`detector`, of expert", "`oracle`, of before", "`oracle`, of expert", "updates"), rows), more,
+                      grid(("seed", *map(number, at)), [(str(seed), *(number(curve.get((seed, t)), 2) for t in at)) for seed in seeds])])
 
 
 def rollback(results: pathlib.Path) -> str:
@@ -626,7 +657,7 @@ def full(results: pathlib.Path) -> str:
       Of {hit} affected streams {len(first)} alarm; {back} recover in arm `detector`, {alone} in arm `none`. {len(entries)} of {len(plan)} parts of suite `full` are finished ({done}), seeds {one['first_seed']} to {one['first_seed'] + one['seeds'] - 1}. Affected streams; streams with a false alarm
       before the onset; streams that alarm after it, of those not adapting to a false one by then; affected ones that do within 500 steps; their median latency, misses counted as infinite; affected streams
       recovered before the run ends, without and with finetuning; their reward over the last 2,000 steps over that before the onset (interquartile mean); normalised recovery (0: arm
-      `none`, 1: the reward before onset, interquartile mean with 95 % bootstrap interval over the streams that end a tenth or more below it without adaptation); finetunings that converge / are aborted / still run; updates a stream. {FEW if any(" to " in cell for row in rows for cell in row) else ""}""")
+      `none`, 1: the reward before onset, interquartile mean with 95 % bootstrap interval over the streams that end a tenth or more below it without adaptation); finetunings that converge / are aborted / still run, those begun by a false alarm included; updates a stream. {FEW if any(" to " in cell for row in rows for cell in row) else ""}""")
   return text + "\n\n" + grid(("robot", "fault, severity", "affected", "false alarms", "alarm", "within 500", "latency [steps]", "recovered, `none`", "recovered",
                                 "reward left, `none`", "reward left", "normalised recovery", "converged / aborted / still running", "updates"), rows)
 
@@ -756,7 +787,7 @@ def ppo(results: pathlib.Path) -> str:
 
 BLOCKS = {"run-walker": run_walker, "arl0": arl0, "leaderboard": leaderboard, "leaderboard-100k": leaderboard_100k, "physics": physics, "dreamer": dreamer, "agents": agents,
           "detectors": detectors, "paper": experiments, "arms": arms,
-          "other-arms": other_arms, "stop-rule": stop_rule, "oracle-stop": oracle_stop, "rollback": rollback, "again": again, "study": study, "size": sizes, "full": full, "in-loop": in_loop, "two-agents": two_agents, "gradient": gradient, "quadruped": quadruped, "ppo": ppo}
+          "other-arms": other_arms, "stop-rule": stop_rule, "oracle-stop": oracle_stop, "expert": expert, "rollback": rollback, "again": again, "study": study, "size": sizes, "full": full, "in-loop": in_loop, "two-agents": two_agents, "gradient": gradient, "quadruped": quadruped, "ppo": ppo}
 
 
 def catalogue(results: pathlib.Path) -> str:

@@ -3,6 +3,7 @@ import contextlib
 import dataclasses
 import json
 import pathlib
+import shutil
 
 import jax
 import jax.numpy as jnp
@@ -12,11 +13,13 @@ import pytest
 from test_cli import content, mjx, refused  # noqa: F401  fixtures
 from test_transfer import agent, saved  # noqa: F401  fixtures: a tiny agent of the car, whose programs hold no callback and are cached
 
-from mjx_cl import bench, plots, run, store
+from mjx_cl import bench, pieces, plots, run, store
 from mjx_cl.adapt.arms import ARMS, NEVER
 from mjx_cl.config import AdaptConfig, RunConfig
 from mjx_cl.errors import FileError, UserError
+from mjx_cl.scoring import stop
 
+RESULTS = pathlib.Path(__file__).parents[1] / "results"
 MINI = """
 name = "mini"
 about = "two short runs"
@@ -62,10 +65,10 @@ def write(tmp_path, text):
 
 @pytest.mark.parametrize("name", bench.shipped())
 def test_shipped_suites_fit_the_registries(name):
-  suite = bench.suite(name)
+  suite, robots = bench.suite(name), bench.Robots()
   assert suite.name == name and suite.about and suite.parts
   for part in suite.parts:
-    bench.check(part)
+    bench.check(part, robots)
     assert part.config.first_seed == (10 if name == "loop" else 0)  # seeds 0 to 9 report, 100 to 109 tune; the detectors of `loop` were picked on a board of the former
     assert ".." not in part.name and not part.name.startswith("/")
   assert len({p.name for p in suite.parts}) == len(suite.parts)
@@ -125,6 +128,15 @@ BAD = {
     "unknown robot": ('name = "x"\n[entries.a]\nenv = "wlker"', ["wlker", "walker"]),
     "unknown fault": ('name = "x"\n[entries.a]\nenv = "walker"\nfault = "geer"', ["geer", "gear"]),
     "unknown detector": ('name = "x"\n[entries.a]\nenv = "walker"\ndetector = "cusums"', ["cusums", "cusum"]),
+    "settings of every entry are a word": ('name = "x"\nrun = "x"\n[entries.a]\nenv = "walker"', ["run is a table of settings", "'x'"]),
+    "settings of every entry are a number": ('name = "x"\nrun = 3\n[entries.a]\nenv = "walker"', ["run is a table of settings", "3"]),
+    "arms are a word": ('name = "x"\n[entries.a]\nenv = "walker"\narms = "detector"', ["'a'", "arms is one list of names", "'detector'", "oracle-budget"]),
+    "arms are a grid": ('name = "x"\n[entries.a]\nenv = "walker"\narms = [["none"], ["oracle"]]', ["'a'", "arms is one list of names", "oracle-budget"]),
+    "name outside": ('name = "../../x"\n[entries.a]\nenv = "walker"', ["'../../x'", "folder's name", "letters, digits"]),
+    "name is a number": ('name = 3\n[entries.a]\nenv = "walker"', ["name 3", "folder's name"]),
+    "tables of adapt": ('name = "x"\n[entries.a]\nenv = "walker"\nadapt = [{ratio = 4}, {ratio = 8}]', ["'a'", "adapt is a table of settings"]),
+    "tables of the detector": ('name = "x"\n[entries.a]\nenv = "walker"\nsettings = [{window = 4}]', ["'a'", "settings is a table of settings"]),
+    "unknown agent": ('name = "x"\n[entries.a]\nenv = "walker"\nagent = ["walker", "wlker"]', ["part a/agent=wlker: ", "no agent 'wlker'", "walker-plain"]),
     "unknown arm": ('name = "x"\n[entries.a]\nenv = "walker"\narms = ["nobody"]', ["nobody", "none"]),
 }
 
@@ -171,10 +183,52 @@ def test_updates_of_the_plan():
   assert bench.estimate(bench.Part("a", c), 1e11).updates == pytest.approx(3 * (5000 - 1000 - 1024 - 64) * 16 / (4 * 64))
   for arm in ARMS:
     own = RunConfig("walker", steps=20_000, onset=2000, seeds=1, arms=(arm,), stops="told" if ARMS[arm].end.told else None)
-    steps = bench.adapting_steps(own, arm)
+    steps = sum(bench.finetunings(own, arm))
     assert 0 <= steps <= 19_000 and (steps == 0) == (ARMS[arm].trigger is NEVER or not ARMS[arm].breaks)
   slow, quick = (bench.estimate(bench.Part("a", c), rate).seconds - bench.COMPILE_S for rate in (1e11, 2e11))
   assert slow == pytest.approx(2 * quick)
+
+
+def test_finetunings_of_the_plan():
+  """From each change on, of an arm that listens also from each repair; none within another, nor where nothing changes."""
+  twice = RunConfig("walker", fault="walker/gear-half-twice", onset=5000, steps=28_000, arms=("detector", "oracle", "oracle-budget", "no-fault"))
+  walker = bench.ADAPTS["walker"]
+  assert [bench.finetunings(twice, arm) for arm in twice.arms] == [[walker, walker, 3000], [walker, 3000], [19_000, 3000], []]  # broken, repaired, broken at 5,000, 15,000, 25,000
+  assert bench.finetunings(twice, "oracle-budget", most=700) == [700, 700]
+  assert bench.finetunings(RunConfig("walker", fault="any/all-easy"), "detector") == [walker]  # six faults at once
+  assert bench.finetunings(RunConfig("walker", severity=0.0), "detector") == [] and bench.finetunings(RunConfig("walker", onset=200), "detector") == [walker]
+  car = RunConfig("car", fault="car/transfer-then-socks", onset=10_000, steps=64_000, adapt=AdaptConfig(budget=40_000))
+  assert bench.finetunings(car, "detector") == [bench.ADAPTS["car_real"], 12_000]
+
+
+PLANNED = ["again/walker", "arms/car", "paper/car", "paper/walker", "paper/quadruped", "oracle_stop/damping", "oracle_stop/payload",
+           *(f"loop/car/detector={detector}" for detector in ("rolling_sigma", "cusum@surprise", "ewma", "hotelling"))]
+
+
+@pytest.mark.parametrize("name", PLANNED)
+def test_the_plan_is_within_a_factor_of_two_of_what_was_lived(name, monkeypatch):
+  """Updates of published parts."""
+  monkeypatch.chdir(RESULTS.parent)  # the oracle stops' folder is named from there
+  folder, _, part_name = name.partition("/")
+  (part,) = [p for p in published(folder).parts if p.name == part_name]
+  lived = sum(r["updates"] for r in store.read_rows(RESULTS / name / "runs.parquet"))
+  assert 0.5 < lived / bench.estimate(part, 1e11).updates < 2
+
+
+def test_lengths_of_finetunings_are_those_of_the_published_suites():
+  lengths = {}
+  for suite in ("paper", "full", "arms", "loop", "study", "stop", "again", "quick", "size", "oracle_stop"):
+    for part in published(suite).parts:
+      if (RESULTS / suite / part.name / "events.parquet").exists():
+        own = lengths.setdefault(bench.becomes(part.config) or part.config.env, [])
+        own += [(part.config.steps if s["stop"] is None else s["stop"] + 1) - s["since"] for s in stop.spans(store.read_rows(RESULTS / suite / part.name / "events.parquet"))
+                if ARMS[s["arm"]].end.rule]
+  assert bench.ADAPTS == {robot: pytest.approx(np.mean(own), rel=0.1) for robot, own in lengths.items()}
+
+
+def published(folder):
+  """The suite of a folder of results/."""
+  return bench._published(RESULTS / folder, json.loads((RESULTS / folder / "bench.json").read_text())["suite"])
 
 
 def test_shards_are_a_partition():
@@ -235,6 +289,117 @@ def test_parts_run_once_go_on_and_merge(mjx, refused, mini, tmp_path, monkeypatc
   before = content(out)
   assert "steps" in refused(2, "bench", mini, "--out", out)
   assert content(out) == before
+
+
+def changed(folder, **change):
+  """A run's config.json with some of it changed."""
+  store.write_json(folder / "config.json", json.loads((folder / "config.json").read_text()) | change)
+
+
+def test_a_part_of_other_settings_that_was_not_asked_for_stops_nothing(mjx, refused, tmp_path):  # noqa: F811
+  """It is named before anything runs and left out of bench.json; where it is asked for, the line names a way out that `bench` has."""
+  out = shutil.copytree(RESULTS / "quick", tmp_path / "out")
+  changed(out / "walker", seeds=1)
+  before = content(out / "walker")
+  code, text, err = mjx("bench", "quick", "--only", "car", "--out", out, "--publish", tmp_path / "to", "--json")
+  (note,) = [line for line in err.splitlines() if "left out" in line]
+  assert code == 0 and note.endswith("walker (was begun with another seeds)") and list(json.loads(text)["entries"]) == ["quadruped", "car"]
+  assert list(json.loads((out / "bench.json").read_text())["entries"]) == ["quadruped", "car"] and content(out / "walker") == before
+  assert not (tmp_path / "to/walker").exists() and (tmp_path / "to/car/runs.parquet").exists()
+  message = refused(2, "bench", "quick", "--only", "walker", "--out", out)
+  assert "out/walker was begun with another seeds" in message and "another --out" in message and "remove that folder" in message and "--overwrite" not in message
+
+
+def test_a_part_of_another_agent_of_the_same_name_is_not_finished(tmp_path):
+  """By the card; one that has gained keys, or can no longer be read, is no other agent."""
+  plan = bench.suite("quick")
+  out = shutil.copytree(RESULTS / "quick", tmp_path / "out")
+  card = json.loads((out / "walker/config.json").read_text())["agent_card"]
+  changed(out / "walker", agent_card={k: v for k, v in card.items() if k != "eval"})  # a key that came later
+  assert bench.standing(out, plan.parts) == (list(plan.parts), {})
+  changed(out / "walker", agent_card=card | {"updates": 7, "dreamer": card["dreamer"] | {"size": "size12m"}})
+  assert bench.standing(out, plan.parts)[1] == {"walker": "was begun with another agent_card (dreamer.size, updates)"}
+  with pytest.raises(UserError, match="another agent_card"):
+    bench.finished(out, plan.parts[0])
+  with pytest.raises(UserError, match="another agent_card"):
+    pieces.seeds_of(out / "walker", plan.parts[0].config)
+  assert pieces.cards(RunConfig("walker", agent="nowhere")) == {}
+  (triggers,) = bench.pick(bench.suite("arms").parts, ("triggers",))
+  shutil.copytree(RESULTS / "arms/triggers", tmp_path / "triggers")
+  assert bench.finished(tmp_path, triggers)
+  cards = json.loads((tmp_path / "triggers/config.json").read_text())["arm_cards"]
+  changed(tmp_path / "triggers", arm_cards={"randomised": cards["randomised"] | {"seed": 9}})
+  with pytest.raises(UserError, match=r"another arm_cards \(randomised.seed\)"):
+    bench.finished(tmp_path, triggers)
+
+
+def test_an_agent_by_folder_is_read_anew_when_it_is_written_anew(saved, tmp_path):  # noqa: F811
+  folder = shutil.copytree(saved, tmp_path / "agent")
+  config = RunConfig("car", agent=str(folder))
+  first = pieces.cards(config)["agent_card"]
+  (folder / "card.json").write_text(json.dumps(first | {"seed": 5}))
+  assert pieces.changed_keys(pieces.cards(config)["agent_card"], first) == ["seed"]
+
+
+@pytest.mark.parametrize("folder", ["paper", "full", "arms", "loop", "study", "stop", "again", "quick", "size", "oracle_stop"])
+def test_what_is_published_counts(folder, monkeypatch):
+  """But for what a later threshold or preset has made another run."""
+  monkeypatch.chdir(RESULTS.parent)
+  own, others = bench.standing(pathlib.Path("results") / folder, published(folder).parts)
+  there = {str(p.parent.relative_to(RESULTS / folder)) for p in (RESULTS / folder).rglob("summary.json")}
+  assert {p.name for p in own} == there - set(others)
+  assert set(others) <= {"walker-levels/fault=any-all-easy"} | {f"{robot}/detector=hotelling" for robot in ("walker", "quadruped", "car")}
+  assert all(pieces.seeds_of(pathlib.Path("results") / folder / p.name, p.config) == bench.part_seeds(p) for p in own)
+
+
+def test_what_a_merge_refuses_is_named_and_the_rest_is_taken(mjx, tmp_path):  # noqa: F811
+  """results/loop holds runs of a detector whose default threshold has changed since. The plan counts what would be taken as finished."""
+  theirs, out = RESULTS / "loop", tmp_path / "out"
+  refused_, rest = {f"{robot}/detector=hotelling" for robot in ("walker", "quadruped", "car")}, 9
+  code, text, err = mjx("bench", "loop", "--merge", theirs, "--out", out, "--plan", "--json")
+  rows = json.loads(text)
+  assert code == 0 and {r["part"] for r in rows if not r["finished"]} == refused_ and sum(r["finished"] for r in rows) == rest and not out.exists()
+  assert sorted(err.splitlines()) == sorted(f"note: {theirs / name} was begun when its detector hotelling had another default threshold than today; it is not taken over"
+                                            for name in refused_)
+  parts, said = bench.suite("loop").parts, []
+  bench.take(out, parts, bench.offers(out, parts, [theirs], said.append))
+  own, others = bench.standing(out, parts)
+  assert {p.name for p in own} == {p.name for p in parts} - refused_ and not others and len(said) == 3
+  shutil.rmtree(out)
+  broken = shutil.copytree(theirs / "walker", tmp_path / "other/walker")
+  (broken / "detector=ewma/config.json").write_text("{")
+  said.clear()
+  assert list(bench.offers(out, parts, [tmp_path / "other", theirs])) == [p.name for p in parts if p.name not in refused_]  # another folder holds it whole
+  assert "walker/detector=ewma" not in bench.offers(out, parts, [tmp_path / "other"], said.append) and any("is broken" in line for line in said)
+
+
+def test_publishing_a_part_keeps_the_others(mjx, refused, tmp_path):  # noqa: F811
+  """Among them one that today's preset makes another run, and one that the suite no longer has."""
+  name, kept, gone = "car/fault=slope,severity=0.25", "walker-levels/fault=any-all-easy", "car/fault=bygone"
+  to = shutil.copytree(RESULTS / "full", tmp_path / "to")
+  shutil.copytree(to / name, to / gone)
+  for file, key in (("bench.json", "entries"), ("suite.json", "parts")):
+    value = json.loads((to / file).read_text())
+    value[key][gone] = value[key][name]
+    store.write_json(to / file, value)
+  out = tmp_path / "out"
+  for file in ("summary.json", "config.json", "runs.parquet", "events.parquet"):
+    (out / name).mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(to / name / file, out / name / file)
+  (to / name / "summary.json").write_text("{}")
+  before, was, rows = content(to), json.loads((to / "bench.json").read_text()), store.read_rows(RESULTS / "full/bench.parquet")
+  assert mjx("bench", "full", "--only", name, "--out", out, "--publish", to)[0] == 0
+  now = json.loads((to / "bench.json").read_text())
+  assert now["entries"] == was["entries"] and kept in now["entries"] and (now["finished"], now["parts"]) == (len(was["entries"]), was["parts"] + 1)
+  whole = lambda table: sorted((r["part"], r["stream"], r["change"], r["reward_final"]) for r in table if r["part"] != gone)
+  assert whole(store.read_rows(to / "bench.parquet")) == whole(rows)
+  after = content(to)
+  different = {file for file in before.keys() | after.keys() if before.get(file) != after.get(file)}
+  assert different <= {f"{name}/summary.json", f"{name}/figure.png", "bench.json", "bench.parquet", "suite.json", "recovery.png", "ratio.png"}
+  assert json.loads((to / "suite.json").read_text())["parts"][gone] == json.loads(before["suite.json"])["parts"][gone]
+  assert "holds suite 'full', not 'quick'" in refused(2, "bench", "quick", "--out", tmp_path / "q", "--publish", to) and not (tmp_path / "q").exists()
+  store.write_json(to / "suite.json", {"suite": "full", "parts": {}})
+  assert "do not describe" in refused(2, "bench", "full", "--only", name, "--out", out, "--publish", to)
 
 
 def test_runs_of_one_kind_share_their_program(mini, tmp_path):  # noqa: F811
@@ -381,6 +546,16 @@ def test_what_arms_say_together(tmp_path):
   assert plots.survival(tmp_path, ["part"]).stat().st_size > 5000
 
 
+def test_the_restricted_mean_ends_with_the_next_change(tmp_path):
+  """Streams break at 2,000 and are repaired at 9,000: what no stream was watched for is in no arm's mean. By hand: 7,000 less the 2,000 that recovery must hold."""
+  rows = [lived(s, "none", None, 0.5) for s in range(3)] + [lived(s, "detector", 2000 + 1000, 0.9) for s in range(3)]
+  rows += [lived(s, arm, None, 0.9, change=1, onset=9000) for s in range(3) for arm in ("none", "detector")]
+  store.write_table(tmp_path / "runs.parquet", {k: [r[k] for r in rows] for k in rows[0]})
+  store.write_json(tmp_path / "config.json", {"arms": ["detector", "none"], "steps": 30_000})
+  got = bench.scores(tmp_path)["recovery"]
+  assert {arm: (own["horizon"], own["restricted_mean_steps"]) for arm, own in got.items()} == {"detector": (5000, 1000.0), "none": (5000, 5000.0)}
+
+
 def test_arms_alone_say_nothing_together(tmp_path):
   store.write_table(tmp_path / "runs.parquet", {k: [v] for k, v in lived(0, "detector", None, 0.9, affected=None).items()})
   store.write_json(tmp_path / "config.json", {"arms": ["detector"], "steps": 10_000})
@@ -400,7 +575,6 @@ def test_recovery_against_the_ratio_is_drawn_where_a_suite_has_several(tmp_path)
 
 def test_published_figures_are_drawn_anew(tmp_path, mjx):  # noqa: F811
   """From the committed files of a suite alone; what cannot be drawn is one line."""
-  import shutil
   study = pathlib.Path(__file__).parent.parent / "results/study"
   shutil.copytree(study, tmp_path / "study", ignore=shutil.ignore_patterns("*.png"))
   (tmp_path / "page.md").write_text("no block")

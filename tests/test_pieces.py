@@ -1,4 +1,5 @@
 """Runs of other seeds joined to one: a finished run taken apart by seed and joined again is what it was."""
+import dataclasses
 import json
 import pathlib
 import shutil
@@ -13,12 +14,13 @@ from mjx_cl import bench, ledger, pieces, store
 from mjx_cl.errors import FileError, UserError
 
 RESULTS = pathlib.Path(__file__).parents[1] / "results"
-RUNS = {"walker": ("paper", "walker"), "car": ("paper", "car"), "snapshots": ("stop", "damping")}  # car: two changes of each stream; its onsets are its own
+RUNS = {"walker": ("paper", "walker"), "car": ("paper", "car"), "snapshots": ("stop", "damping"), "told": ("oracle_stop", "damping")}  # car: two changes of each stream; its onsets are its own
 
 
 def part_of(suite, name, seeds=None):
-  (part,) = bench.pick(bench.suite(suite, {"seeds": seeds} if seeds else None).parts, (name,))
-  return part
+  known = suite in bench.shipped()
+  (part,) = bench.pick((bench.suite(suite) if known else bench._published(RESULTS / suite, suite.replace("_", "-"))).parts, (name,))
+  return part._replace(config=dataclasses.replace(part.config, seeds=seeds or part.config.seeds))
 
 
 def cut(folder, out, seeds):
@@ -31,6 +33,8 @@ def cut(folder, out, seeds):
     at = table.column_names.index("stream")
     store.write_arrow(out / file.name, table.set_column(at, "stream", pyarrow.array([streams[s] for s in table["stream"].to_pylist()], table["stream"].type)))
   config = json.loads((folder / "config.json").read_text())
+  if "oracle_stops" in config:
+    config["oracle_stops"] = {str(seed): config["oracle_stops"][str(seed)] for seed in seeds}
   store.write_json(out / "config.json", config | {"seeds": len(seeds), "first_seed": seeds[0], "git_commit": f"of seed {seeds[0]}"})
   summary = json.loads((folder / "summary.json").read_text())
   share = len(seeds) / config["seeds"]
@@ -55,7 +59,8 @@ def close(a, b, at=""):
 
 
 @pytest.mark.parametrize("suite, name", RUNS.values(), ids=RUNS)
-def test_what_is_taken_apart_and_joined_is_what_it_was(tmp_path, suite, name):
+def test_what_is_taken_apart_and_joined_is_what_it_was(tmp_path, suite, name, monkeypatch):
+  monkeypatch.chdir(RESULTS.parent)  # where the folder of oracle stops is named from
   folder = RESULTS / suite / name
   whole = json.loads((folder / "config.json").read_text())
   part = part_of(suite, name, whole["seeds"])
@@ -65,7 +70,7 @@ def test_what_is_taken_apart_and_joined_is_what_it_was(tmp_path, suite, name):
   assert pieces.choose(folders[::-1], part.config) == folders  # in the order of their seeds
   value = pieces.join(folders, tmp_path / "all", part.config)
   today = shutil.copytree(folder, tmp_path / "today")
-  summary = {"invalid_share_ci": None} | ledger.rescore(today)  # what is published may be older than a definition
+  summary = ledger.rescore(today) | {"invalid_share_ci": None}  # what is published may be older than a definition, and has no trace
   for file in today.glob("*.parquet"):
     want, got = pyarrow.parquet.read_table(file), pyarrow.parquet.read_table(tmp_path / "all" / file.name)
     if file.stem == "runs":
@@ -93,6 +98,35 @@ def test_a_table_that_one_piece_lacks_is_left_out(tmp_path):
   value = pieces.join(folders, tmp_path / "all", part.config)
   assert "stop_rule" not in value and {p.name for p in (tmp_path / "all").iterdir()} == {"config.json", "summary.json", "runs.parquet", "events.parquet",
                                                                                             "snapshots.parquet", "signals.parquet"}
+
+
+def test_a_piece_that_was_told_other_stops_is_refused(tmp_path, monkeypatch):
+  monkeypatch.chdir(RESULTS.parent)
+  folder, config = cut(RESULTS / "oracle_stop/damping", tmp_path / "a", [3, 4]), part_of("oracle_stop", "damping").config
+  assert pieces.seeds_of(folder, config) == [3, 4]
+  own = json.loads((folder / "config.json").read_text())
+  for stops in ({"3": 1}, own["oracle_stops"] | {"3": own["oracle_stops"]["3"] + 1}):  # one is missing, one is another
+    store.write_json(folder / "config.json", own | {"oracle_stops": stops})
+    with pytest.raises(UserError, match="another oracle_stops"):
+      pieces.seeds_of(folder, config)
+
+
+def test_agents_and_residuals_come_along(tmp_path):
+  """Of pieces that are joined, and of a part that one folder holds whole."""
+  folder, part = RESULTS / "stop/damping", part_of("stop", "damping", 5)
+  folders = [cut(folder, tmp_path / name / "damping", seeds) for name, seeds in (("a", [0, 1]), ("b", [2, 3, 4]))]
+  for piece, seed in zip(folders, (1, 2)):
+    (piece / f"agents/oracle-{seed}").mkdir(parents=True)
+    (piece / f"agents/oracle-{seed}/agent.npz").write_bytes(b"weights of %d" % seed)
+    rows = [(r["stream"], r["arm"], r["seed"], step) for r in store.read_rows(piece / "runs.parquet") for step in (0, 1)]
+    store.write_table(piece / "residuals.parquet", {k: list(v) for k, v in zip(("stream", "arm", "seed", "step"), zip(*rows))} | {"height": [float(s) for _, _, s, _ in rows]})
+  for out, theirs in ((tmp_path / "joined", [tmp_path / "a", tmp_path / "b"]), (tmp_path / "whole", [tmp_path / "joined"])):
+    bench.take(out, [part], bench.offers(out, [part], theirs))
+    assert {p.parent.name: p.read_bytes() for p in (out / "damping/agents").rglob("agent.npz")} == {"oracle-1": b"weights of 1", "oracle-2": b"weights of 2"}
+    rows = store.read_rows(out / "damping/residuals.parquet")
+    assert [(r["stream"], r["arm"], r["seed"], r["step"]) for r in rows] == [(5 * a + seed, arm, seed, step) for a, arm in enumerate(part.config.arms)
+                                                                             for seed in range(5) for step in (0, 1)]
+    assert all(r["height"] == r["seed"] for r in rows)
 
 
 def test_pieces_that_do_not_fit_are_one_line(tmp_path):

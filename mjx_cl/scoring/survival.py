@@ -149,15 +149,21 @@ def of_runs(rows, steps: int) -> tuple[np.ndarray, np.ndarray]:
   A stream that has not recovered is censored 2,000 steps before the end of the run, or before its next change: recovery must hold for that
   long, so none could be seen later.
   """
+  hit = [(r, until) for r, until in zip(rows, watched(rows, steps)) if r["affected"]]
+  seen = np.array([r["recovery_step"] is not None for r, _ in hit], bool)
+  time = [until if r["recovery_step"] is None else r["recovery_step"] - r["onset"] for r, until in hit]
+  return np.maximum(0.0, np.array(time, float)), seen
+
+
+def watched(rows, steps: int) -> list[int | None]:
+  """Control steps after its onset for which a recovery could be seen, of each row of runs.parquet: up to 2,000 before the stream's next change, or before the end
+  of the run. Below 0 where even that is earlier; None without an onset."""
   onsets: dict[int, list[int]] = {}
   for r in rows:
     if r["onset"] is not None:
       onsets.setdefault(r["stream"], []).append(r["onset"])
-  hit = [r for r in rows if r["affected"]]
-  seen = np.array([r["recovery_step"] is not None for r in hit], bool)
-  ends = [min([at for at in onsets[r["stream"]] if at > r["onset"]], default=steps) - recovery.HOLD for r in hit]
-  time = [(end if r["recovery_step"] is None else r["recovery_step"]) - r["onset"] for r, end in zip(hit, ends)]
-  return np.maximum(0.0, np.array(time, float)), seen
+  end = lambda r: min([at for at in onsets[r["stream"]] if at > r["onset"]], default=steps)
+  return [None if r["onset"] is None else end(r) - recovery.HOLD - r["onset"] for r in rows]
 
 
 def _checked(time, seen):
