@@ -504,9 +504,9 @@ def expert(results: pathlib.Path) -> str:
       ("before", None), ("expert", [r for (a, _), r in runs.items() if a == arm]))}
   rows = []
   for seed in seeds:
-    of = lambda word, name: number(by[word][name, seed]["normalised"], 2)
-    final = lambda name: number(by["before"][name, seed]["reward_final"], 2)
-    rows.append((str(seed), runs[arm, seed]["fault"].split(":")[-1], number(by["before"]["detector", seed]["reward_pre"], 2), final("none"), final("detector"), final("oracle"), number(runs[arm, seed]["reward_final"], 2),
+    of = lambda word, name, column="normalised": number(by[word].get((name, seed), {}).get(column), 2)
+    final = lambda name: of("before", name, "reward_final")
+    rows.append((str(seed), runs[arm, seed]["fault"].split(":")[-1], of("before", "none", "reward_pre"), final("none"), final("detector"), final("oracle"), number(runs[arm, seed]["reward_final"], 2),
                  number(runs["none", seed]["reward_final"], 2), of("before", "detector"), of("expert", "detector"), of("before", "oracle"), of("expert", "oracle"), number(runs[arm, seed]["updates"])))
   shots = [r for r in table(folder / "snapshots.parquet") if r["arm"] == arm]
   every = config["snapshots"]

@@ -35,6 +35,8 @@ SOURCES = {
     "other-arms": ("arms/bench.json",),
     "stop-rule": ("stop/bench.json",),
     "oracle-stop": ("oracle_stop/suite.json", "oracle_stop/bench.json", "oracle_stop/damping/runs.parquet", "oracle_stop/payload/runs.parquet"),
+    "expert": ("paper/walker/runs.parquet", *(f"expert/walker/{file}" for file in ("config.json", "runs.parquet", "snapshots.parquet"))),
+    "rollback": ("rollback/suite.json", "rollback/bench.json", *(f"rollback/quadruped-{part}/{file}.parquet" for part in ("easy", "payload") for file in ("runs", "events"))),
     "again": ("again/bench.json",),
     "study": ("study/bench.json", "study/suite.json", "study/bench.parquet"),
     "size": ("size/bench.json", "size/suite.json", "size/less/config.json"),
@@ -323,6 +325,8 @@ CONSTANTS = {  # what a block says of itself: windows of the definitions, sizes 
     "arms": {"95", "1", "2,000", "10,000"},
     "other-arms": {"95", "1", "2,000", "10,000"},
     "oracle-stop": {"95", "2,000", "0"},
+    "expert": {"4", "2,000", "1", "5", "0", "0.94"},  # the last a ratio of differences of one column
+    "rollback": {"95", "2,000", "10", "5", "1"},
     "stop-rule": {"95", "1", "768", "1,536", "3,072"},
     "again": {"95", "2,000"},
     "study": {"1", "2,000"},
