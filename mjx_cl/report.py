@@ -529,21 +529,21 @@ def rollback(results: pathlib.Path) -> str:
   plan, entries = (load(folder / name) for name in ("suite.json", "bench.json"))
   for part, entry in entries["entries"].items():
     own = {(r["arm"], r["seed"]): r for r in table(folder / part / "runs.parquet")}
-    back = {(e["arm"], e["seed"]) for e in table(folder / part / "events.parquet") if e["kind"] == "rollback"}
+    back = sum(e["kind"] == "rollback" for e in table(folder / part / "events.parquet"))  # an aborted stream begins no other finetuning: at most one of each
     seeds = sorted({seed for arm, seed in own})
     one = plan["parts"][part]
     name = f"`{one['env']}`, `{one['fault']}`" + ("" if fault_presets.named(one["fault"]) else f" {one['severity']:g}") + f", {len(seeds)} seeds"
     for k, (arm, summary) in enumerate(entry["arms"].items()):
       over = lambda other: "-" if arm in (other, "none") else averaged([own[arm, seed]["reward_final"] - own[other, seed]["reward_final"] for seed in seeds], 2)
       rows.append((name if not k else "", f"`{arm}`", "-" if arm == "none" else str(summary["aborted_by_rule"] + summary["aborted_by_budget"]),
-                   str(sum((arm, seed) in back for seed in seeds)) if arm == "rollback" else "-", both(summary, "reward_final", 2), over("none"), over("detector"),
+                   str(back) if arm == "rollback" else "-", both(summary, "reward_final", 2), over("none"), over("detector"),
                    averaged([own[arm, seed]["return_lost"] for seed in seeds]), averaged([own[arm, seed]["terminations"] for seed in seeds], 1)))
   gone = joined([f"`{part}`" for part in plan["parts"] if part not in entries["entries"]]) if len(entries["entries"]) < len(plan["parts"]) else ""
   text = fill(f"""
       `mjx-cl bench benchmarks/rollback.toml`: the arms side by side on the same seeds. Streams whose finetuning is aborted, by the rule or its budget; those of them that go back to the weights of before;
       reward a step over the last 2,000 steps (interquartile mean); that reward less that of the same seed in arm `none` and in arm `detector` (means); return lost from the onset to the end of the run and falls,
       a stream's mean. 95 % bootstrap intervals over streams. {f"Not run yet: {gone}." if gone else ""}""")
-  return text + "\n\n" + grid(("fault", "arm", "aborted", "taken back", "reward at the end", "less `none`", "less `detector`", "return lost", "falls"), rows)
+  return text + "\n\n" + grid(("fault", "arm", "aborted", "taken back", "reward at the end", "minus `none`", "minus `detector`", "return lost", "falls"), rows)
 
 
 def again(results: pathlib.Path) -> str:
