@@ -233,6 +233,7 @@ def estimate(part: Part, rate: float, robots: Robots | None = None) -> Estimate:
     UserError, FileError for an agent or oracle stops that cannot be read, see `check`.
   """
   from mjx_cl import memory, run
+  from mjx_cl.lanes import Lanes
   from mjx_cl.scoring import stop
   c = part.config
   robots = robots or Robots()
@@ -246,7 +247,8 @@ def estimate(part: Part, rate: float, robots: Robots | None = None) -> Estimate:
   updates = learning * c.adapt.ratio / (batch * trained.length)
   share = 1.0 if not starts else 0.5 + 0.5 * starts / trained.length  # imagination is about half of an update
   physics = max(PHYSICS_S.get(name, 0.1e-3) for name in filter(None, (c.env, becomes(c))))
-  seconds = streams * c.steps * ((WATCH_S + ACT_S) * size + physics) + updates * batch * trained.length * UPDATE_S * share * size
+  lanes = len(Lanes(len(c.arms), c.seeds).order)
+  seconds = c.steps * (streams * WATCH_S * size + lanes * (ACT_S * size + physics)) + updates * batch * trained.length * UPDATE_S * share * size
   need = memory.need(trained.size, len(spec.obs), len(spec.act), run.capacity(c.steps, spec.episode_steps), trained.bins)
   return Estimate(streams, streams * c.steps, updates, COMPILE_S + seconds * RATE / rate, memory.resident(need.total(streams)))
 

@@ -148,14 +148,15 @@ def last_stop(rows: list[dict]) -> Measured:
 
 
 def outcomes(rows: list[dict]) -> Measured:
-  """How the finetunings that went on at the change or began after it ended; the value is the share of streams that converged. One that was over before, begun by a false
-  alarm, counts as never alarmed."""
+  """How the finetunings that went on at the change or began after it ended; the value is the share of streams that converged. Those whose finetuning was over before,
+  begun by a false alarm, are counted apart."""
   over = lambda r: r["adapt_stop"] is not None and r["onset"] is not None and r["adapt_stop"] < r["onset"] and r["outcome"] != "adapting"
-  count = lambda *names: sum(("nominal" if over(r) else r["outcome"]) in names for r in rows)
+  count = lambda *names: sum(not over(r) and r["outcome"] in names for r in rows)
+  before = sum(map(over, rows))
   n, good = len(rows), count("converged")
   ci = [x * n for x in bootstrap.wilson(good, n)]
   return Measured(good / n, f"converged {good} of {n} {span(ci, 1)}, aborted {count('aborted_by_rule', 'aborted_by_budget')}, "
-                  f"still adapting {count('adapting')}, never alarmed {count('nominal')}", "%")
+                  f"still adapting {count('adapting')}, never alarmed {count('nominal')}" + f", over before the change {before}" * bool(before), "%")
 
 
 def kept(rows: list[dict]) -> Measured:

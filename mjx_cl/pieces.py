@@ -58,7 +58,7 @@ def differs(folder, config: RunConfig, but: tuple[str, ...] = ()) -> str | None:
 
 def cards(config: RunConfig) -> dict[str, dict]:
   """Today's `agent_card` and `arm_cards` as config.json holds them; empty where the agent cannot be read, as one that was moved."""
-  file = pathlib.Path(config.agent or "") / "card.json"
+  file = pathlib.Path(config.agent or "no agent by folder") / "card.json"
   return _cards(config.env, config.agent, tuple(arm for arm in config.arms if ARMS[arm].agent), file.stat().st_mtime_ns if file.is_file() else None)
 
 

@@ -99,7 +99,7 @@ def stops(arm: Arm) -> bool:
 
 ARMS: dict[str, Arm] = {
     "detector": Arm("finetuning starts on the detector's alarm", ALARM, RULE),
-    "rollback": Arm("as detector, but an aborted finetuning goes back to the weights of before it, where these earned more under the fault", ALARM, RULE,
+    "rollback": Arm("as detector, but an aborted finetuning goes back to the weights of before it, where these earned more after the alarm", ALARM, RULE,
                     rollback=True),
     "none": Arm("no adaptation; alarms are logged", NEVER, NO_END),
     "always": Arm("finetuning from the end of the warm-up on, without an end", AT_ONCE, NO_END),

@@ -29,8 +29,10 @@ class Before(NamedTuple):
 
       back  =  aborted  and  mean reward of the last `patience` chunks < mean reward of the chunks between the alarm and the first update
 
-  The weights of before the adaptation are still at work on the faulty robot while the replay fills (start_windows), so both sides were earned under the
-  fault. A stream that is aborted before its first update has nothing to take back.
+  The weights of before the adaptation are still at work while the replay fills (start_windows). The two sides are earned at two times: under the same fault where a true
+  alarm began the adaptation; but one begun by a false alarm compares a healthy robot with one that may have broken since, which favours going back, and so does a fault under which the
+  reward goes on falling. Where an abort comes before `patience` chunks have been lived, the mean is over those that have. A stream that is aborted before its first update has nothing to
+  take back. Moments, slow critic and range stay those of the learner, which takes no other update.
 
   Attributes:
     params: the parameters that acted when the adaptation began. reward, chunks: float32, sum over the chunks that they have lived since, and their number.
