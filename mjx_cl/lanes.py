@@ -6,7 +6,7 @@ that shall live the same life therefore lie side by side, in blocks whose length
 
     lane = width * seed + arm        width = the least power of two that holds all arms; lanes without an arm live an arm's life once more
 
-Two, four or eight arms cost nothing more; three act and move a third more robots (some 20 % of a run's time is acting and physics), five 60 %.
+What it costs is measured in benchmarks/README.md; with three arms a third more robots act and move, with five 60 % more.
 """
 from __future__ import annotations
 

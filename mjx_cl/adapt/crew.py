@@ -74,14 +74,12 @@ class Crew:
 
   def acting(self, states: list[LoopState], lanes: Lanes | None = None) -> Any:
     """What each stream acts by, leading (lanes,); None: (groups,). Of a single block in that order these are its own arrays: the next digest uses them up."""
-    whole = states[0].acting if len(states) == 1 else None
-    if lanes is None or lanes.plain:
-      return whole if whole is not None else jax.tree.map(lambda *x: jnp.asarray(np.concatenate([np.asarray(y) for y in x])), *[state.acting for state in states])
-    if whole is not None:
-      return lanes.spread(whole)
+    plain = lanes is None or lanes.plain
+    if len(states) == 1:
+      return states[0].acting if plain else lanes.spread(states[0].acting)
     at = [(states[i].acting, g - block.start) for i, block in enumerate(self.blocks) for g in range(block.start, block.stop)]
-    one = lambda tree, k: jax.tree.map(lambda x: np.asarray(x)[k], tree)
-    return jax.tree.map(lambda *x: jnp.asarray(np.stack(x)), *[one(*at[g]) for g in lanes.order])
+    streams = [jax.tree.map(lambda x: np.asarray(x)[k], acting) for acting, k in (at if plain else (at[g] for g in lanes.order))]
+    return jax.tree.map(lambda *x: jnp.asarray(np.stack(x)), *streams)
 
   def shapes(self, states: list[LoopState]) -> LoopState:
     """What `join` gives, without its numbers and without their memory."""
