@@ -1,4 +1,5 @@
 """python -m mjx_cl"""
+
 import sys
 
 from mjx_cl.cli import main

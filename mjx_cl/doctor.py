@@ -1,4 +1,5 @@
 """What `mjx-cl doctor` reports."""
+
 from __future__ import annotations
 
 import time
@@ -11,7 +12,11 @@ def report() -> dict:
   import jax
   import numpy as np
   from mjx_cl import __version__, bench, envs, runtime, store
-  rows = {"mjx_cl": __version__, **{k: v for k, v in store.provenance().items() if k in ("versions", "python", "machine")}}
+
+  rows = {
+    "mjx_cl": __version__,
+    **{k: v for k, v in store.provenance().items() if k in ("versions", "python", "machine")},
+  }
   rows["devices"] = ", ".join(str(d) for d in jax.devices())
   rows["physics"] = runtime.default_physics()
   rows["free_memory_gib"] = round(psutil.virtual_memory().available / 2**30, 1)

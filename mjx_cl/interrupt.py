@@ -1,8 +1,9 @@
 """Ctrl-C and SIGTERM during a long run: noted at once, acted on between two chunks.
 
-Raising inside a physics callback would surface as an XLA error with half a chunk lived; a flag lets the chunk end, the state be saved, and
-then KeyboardInterrupt be raised.
+Raising inside a physics callback would surface as an XLA error with half a chunk lived; a flag lets
+the chunk end, the state be saved, and then KeyboardInterrupt be raised.
 """
+
 from __future__ import annotations
 
 import os
@@ -12,7 +13,9 @@ import threading
 
 
 class Lasting:
-  """A text stream that swallows what cannot be written: where the reader of progress lines has gone (`2>&1 | tee log` dies of the same Ctrl-C) the work goes on and is saved."""
+  """A text stream that swallows what cannot be written: where the reader of progress lines has gone
+  (`2>&1 | tee log` dies of the same Ctrl-C) the work goes on and is saved.
+  """
 
   def __init__(self, stream):
     self._stream = stream
@@ -31,7 +34,9 @@ class Lasting:
       self._deaf()
 
   def _deaf(self) -> None:
-    """From now on nothing is kept for a reader that is gone, so that the interpreter's last flush finds nothing to fail on."""
+    """From now on nothing is kept for a reader that is gone, so that the interpreter's last flush
+    finds nothing to fail on.
+    """
     self._stream = open(os.devnull, "w")
 
   def __getattr__(self, name):
@@ -39,7 +44,9 @@ class Lasting:
 
 
 def later(number: int, frame) -> bool:
-  """Whether the signal came within JAX's hook of the collector, where Python drops what is raised; it is then sent once more, in a moment."""
+  """Whether the signal came within JAX's hook of the collector, where Python drops what is raised;
+  it is then sent once more, in a moment.
+  """
   if frame is None or frame.f_code.co_name != "_xla_gc_callback":
     return False
   threading.Timer(0.01, signal.raise_signal, (number,)).start()
@@ -47,11 +54,14 @@ def later(number: int, frame) -> bool:
 
 
 class Interruptible:
-  """Context in which SIGINT and SIGTERM set a flag; `check()` raises KeyboardInterrupt once it is set. A second signal raises at once.
+  """Context in which SIGINT and SIGTERM set a flag; `check()` raises KeyboardInterrupt once it is
+  set. A second signal raises at once.
 
   Attributes:
-    again: of the class, a second signal came. What it broke off, such as a save, may still be under way on other threads: the process should end without them.
+    again: of the class, a second signal came. What it broke off, such as a save, may still be under
+      way on other threads: the process should end without them.
   """
+
   again = False
 
   def __init__(self):

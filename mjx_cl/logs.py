@@ -1,4 +1,7 @@
-"""Logs of one's own as CSV files: what is read of them, and which of their columns can be watched. `detect` judges what they hold."""
+"""Logs of one's own as CSV files: what is read of them, and which of their columns can be watched.
+`detect` judges what they hold.
+"""
+
 from __future__ import annotations
 
 import csv
@@ -14,20 +17,40 @@ import numpy as np
 
 from mjx_cl.errors import FileError, UserError
 
-LEAST = 100     # finite nominal samples that a column needs
+LEAST = 100  # finite nominal samples that a column needs
 SECONDS = frozenset(("s", "sec", "secs", "second", "seconds"))
 UNITS = SECONDS | {"ms", "msec", "us", "µs", "usec", "ns", "nsec", "min", "h"}
 CLOCKS = SECONDS - {"s"} | {  # words of a name; such a column is a clock if it also rises
-    "time", "timestamp", "stamp", "clock", "epoch", "elapsed", "uptime", "millis", "micros", "sample", "samples", "step", "steps", "index", "idx",
-    "frame", "row", "tick", "seq"}
+  "time",
+  "timestamp",
+  "stamp",
+  "clock",
+  "epoch",
+  "elapsed",
+  "uptime",
+  "millis",
+  "micros",
+  "sample",
+  "samples",
+  "step",
+  "steps",
+  "index",
+  "idx",
+  "frame",
+  "row",
+  "tick",
+  "seq",
+}
 
 
 class Log(NamedTuple):
   """Attributes:
-    columns: name -> float64 (T,), nan = missing; clocks too, but for those of `clocks`. time: float64 (T,) [s], or None. step: float64 (T,), or None.
-    ignored: name of a column that holds something else than numbers -> its first such line and cell. clocks: names of the columns `time` and `step`.
-    labels: name -> name and unit. notes: what a reader must know of the file, one line each.
+  columns: name -> float64 (T,), nan = missing; clocks too, but for those of `clocks`. time: float64
+  (T,) [s], or None. step: float64 (T,), or None. ignored: name of a column that holds something
+  else than numbers -> its first such line and cell. clocks: names of the columns `time` and `step`.
+  labels: name -> name and unit. notes: what a reader must know of the file, one line each.
   """
+
   columns: dict[str, np.ndarray]
   time: np.ndarray | None
   step: np.ndarray | None
@@ -37,15 +60,20 @@ class Log(NamedTuple):
   notes: tuple[str, ...]
 
 
-# ---- files ---------------------------------------------------------------------------------------------------------------------------
+# ---- files ---------------------------------------------------------------------------------------
+
 
 def read(path) -> Log:
-  """Reads a CSV file, also one compressed by gzip: a header row, then numbers; an empty cell, `nan` or anything infinite is a missing sample.
+  """Reads a CSV file, also one compressed by gzip: a header row, then numbers; an empty cell, `nan`
+  or anything infinite is a missing sample.
 
-  The separator is the comma, or where the header has none the semicolon or the tabulator; then numbers may have a decimal comma, if most that have
-  a fraction do: one sign for the whole file, a cell with the other is no number. A second row without a number above columns of numbers is taken for
-  units. A column `time` [s] or `step` tells when samples were taken and is not watched; a column of seconds by another name (`time_s`, `seconds`) is
-  taken as `time` if there is none and it rises throughout. A first column without a name, among others, is called `index`. A column with a cell that is no number is left out.
+  The separator is the comma, or where the header has none the semicolon or the tabulator; then
+  numbers may have a decimal comma, if most that have a fraction do: one sign for the whole file, a
+  cell with the other is no number. A second row without a number above columns of numbers is taken
+  for units. A column `time` [s] or `step` tells when samples were taken and is not watched; a
+  column of seconds by another name (`time_s`, `seconds`) is taken as `time` if there is none and it
+  rises throughout. A first column without a name, among others, is called `index`. A column with a
+  cell that is no number is left out.
   """
   text, notes = _text(path)
   head = _first_line(text)
@@ -66,7 +94,10 @@ def read(path) -> Log:
   if _units(cells, comma):
     (_, units), *cells = cells
     labels = {name: f"{name} [{unit.strip()}]" for name, unit in zip(names, units)}
-    notes.append(f"{path}: line 2 holds no number and is taken for units: {', '.join(filter(None, map(str.strip, units)))}")
+    notes.append(
+      f"{path}: line 2 holds no number and is taken for units: "
+      f"{', '.join(filter(None, map(str.strip, units)))}"
+    )
   columns, ignored = {}, {}
   for name, column in zip(names, zip(*(row for _, row in cells)) if cells else [()] * len(names)):
     values = [_number(cell, comma) for cell in column]
@@ -81,10 +112,16 @@ def read(path) -> Log:
     told[_told(name, labels[name])] = at = columns.pop(name)
     if len(at) and not _throughout(at):
       raise FileError(f"{path}: column {name} must rise from row to row and have no gap")
-  seconds = {name: x for name, x in columns.items() if _of_seconds(labels[name])} if "time" not in told else {}
+  seconds = (
+    {name: x for name, x in columns.items() if _of_seconds(labels[name])}
+    if "time" not in told
+    else {}
+  )
   told |= {"time": x for x in list(filter(_throughout, seconds.values()))[:1]}
   if seconds and "time" not in told and cells:
-    notes.append(f"{path}: column {next(iter(seconds))} tells no times, as it does not rise at every row")
+    notes.append(
+      f"{path}: column {next(iter(seconds))} tells no times, as it does not rise at every row"
+    )
   return Log(columns, told.get("time"), told.get("step"), ignored, clocks, labels, tuple(notes))
 
 
@@ -104,9 +141,16 @@ def _text(path) -> tuple[str, list[str]]:
       raise FileError(f"{path} is no CSV file: {e}; save it as UTF-8") from None
     text = raw.decode("latin-1")
     notes.append(f"{path}: no UTF-8, so it is read as Latin-1")
-  strange = [c for c in _first_line(text).replace("\t", " ") if unicodedata.category(c) == "Cc" or c == "\ufeff"]
+  strange = [
+    c
+    for c in _first_line(text).replace("\t", " ")
+    if unicodedata.category(c) == "Cc" or c == "\ufeff"
+  ]
   if strange:
-    raise FileError(f"{path} is no CSV file: {strange[0]!r} in its first line is no text; save it as UTF-8, with commas between the cells")
+    raise FileError(
+      f"{path} is no CSV file: {strange[0]!r} in its first line is no text; save it as UTF-8, "
+      "with commas between the cells"
+    )
   return text, notes
 
 
@@ -120,17 +164,29 @@ def _header(path, head: str, names: list[str]) -> list[str]:
     raise FileError(f"{path} has no header row with the names of its columns")
   for sign in [s for s in ";\t," if s in head] or ",":  # 0,5;0,6 are two numbers
     numbers = [cell.strip('" ') for cell in head.split(sign)]
-    if all(_number(cell) is not None or sign != "," and _number(cell, True) is not None for cell in numbers):
-      example = sign.join(f"x{k + 1}" for k in range(min(3, len(numbers)))) + (f"{sign}..." if len(numbers) > 3 else "")
-      raise FileError(f"{path} has no header row with the names of its columns; put a line of names before it, e.g. {example}")
+    if all(
+      _number(cell) is not None or sign != "," and _number(cell, True) is not None
+      for cell in numbers
+    ):
+      example = sign.join(f"x{k + 1}" for k in range(min(3, len(numbers)))) + (
+        f"{sign}..." if len(numbers) > 3 else ""
+      )
+      raise FileError(
+        f"{path} has no header row with the names of its columns; put a line of names before "
+        f"it, e.g. {example}"
+      )
   if names[0] == "" and len(names) > 1 and "" not in names[1:] and "index" not in names:
     names = ["index", *names[1:]]  # pandas and R write the numbers of the rows there
   if "" in names or len(set(names)) < len(names):
-    raise FileError(f"{path}: every column needs a name of its own; got {', '.join(map(repr, names))}")
+    raise FileError(
+      f"{path}: every column needs a name of its own; got {', '.join(map(repr, names))}"
+    )
   return names
 
 
-def _cells(path, names: list[str], rows: list[tuple[int, list[str]]]) -> list[tuple[int, list[str]]]:
+def _cells(
+  path, names: list[str], rows: list[tuple[int, list[str]]]
+) -> list[tuple[int, list[str]]]:
   """(line, a cell per name) of each sample."""
   cells = []
   for line, row in rows:
@@ -144,7 +200,9 @@ def _cells(path, names: list[str], rows: list[tuple[int, list[str]]]) -> list[tu
 
 
 def _number(cell: str, comma: bool = False) -> float | None:
-  """nan where the cell is empty, None where it is no number; a number with the other decimal sign is none."""
+  """nan where the cell is empty, None where it is no number; a number with the other decimal sign
+  is none.
+  """
   cell = cell.strip()
   if comma:
     cell = "?" if "." in cell else cell.replace(",", ".")
@@ -174,24 +232,37 @@ def _units(cells, comma: bool) -> bool:
   texts = [k for k, cell in enumerate(first) if cell.strip()]
   if not texts or any(_number(first[k], comma) is not None for k in texts):
     return False
-  return any(_number(row[k], comma) is not None and row[k].strip() for _, row in cells[1:] for k in texts)
+  return any(
+    _number(row[k], comma) is not None and row[k].strip() for _, row in cells[1:] for k in texts
+  )
 
 
-# ---- clocks --------------------------------------------------------------------------------------------------------------------------
+# ---- clocks --------------------------------------------------------------------------------------
+
 
 def _words(label: str) -> list[str]:
   """Words of a name in small letters: "simTime [s]" -> sim, time, s."""
-  return [word.lower() for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-zµ]+|\d+", label.replace("μ", "µ"))]
+  return [
+    word.lower()
+    for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-zµ]+|\d+", label.replace("μ", "µ"))
+  ]
 
 
 def _told(name: str, label: str) -> str | None:
-  """"time" where a column of that name has seconds or no unit, "step" where it is called so."""
+  """ "time" where a column of that name has seconds or no unit, "step" where it is called so."""
   role = "".join(_words(name)[:1])
-  return role if role in ("time", "step") and (_words(label) == [role] or _words(name) == [role] == ["time"] and _of_seconds(label)) else None
+  return (
+    role
+    if role in ("time", "step")
+    and (_words(label) == [role] or _words(name) == [role] == ["time"] and _of_seconds(label))
+    else None
+  )
 
 
 def _of_seconds(label: str) -> bool:
-  """Whether a name tells a clock in seconds: `time_s`, `t [s]`, `seconds`; not `t` or `timestamp`, whose unit nobody knows."""
+  """Whether a name tells a clock in seconds: `time_s`, `t [s]`, `seconds`; not `t` or `timestamp`,
+  whose unit nobody knows.
+  """
   *rest, last = _words(label) or [""]
   return last in SECONDS and set(rest) <= CLOCKS | {"t"} and (bool(rest) or last in CLOCKS)
 
@@ -214,15 +285,20 @@ def _rises(x: np.ndarray, least: int = LEAST) -> bool:
 
 
 def _evenly(x: np.ndarray) -> bool:
-  """Whether 95 % of the increments per row lie within half of their median; a clock that is written with few digits has uneven ones."""
+  """Whether 95 % of the increments per row lie within half of their median; a clock that is written
+  with few digits has uneven ones.
+  """
   at = np.flatnonzero(np.isfinite(x))
   steps = np.diff(x[at]) / np.diff(at)
-  return not len(steps) or float(np.mean(np.abs(steps - np.median(steps)) <= 0.501 * np.median(steps))) >= 0.95
+  return (
+    not len(steps)
+    or float(np.mean(np.abs(steps - np.median(steps)) <= 0.501 * np.median(steps))) >= 0.95
+  )
 
 
 def _clocks(log: Log, nominal: Log) -> list[str]:
-  """Columns that tell when and not what: `time` and `step`, by their name if they rise in a log that holds them, by what they hold if they rise
-  evenly in both."""
+  """Columns that tell when and not what: `time` and `step`, by their name if they rise in a log
+  that holds them, by what they hold if they rise evenly in both."""
   found = [*log.clocks, *nominal.clocks]
   for name in {**log.columns, **nominal.columns}:
     there = [one.columns[name] for one in (nominal, log) if name in one.columns]
@@ -234,10 +310,14 @@ def _clocks(log: Log, nominal: Log) -> list[str]:
   return list(dict.fromkeys(found))
 
 
-# ---- choice --------------------------------------------------------------------------------------------------------------------------
+# ---- choice --------------------------------------------------------------------------------------
 
-def choose_columns(log: Log, nominal: Log, names: tuple[str, ...], path, nominal_path) -> tuple[list[str], list[str]]:
-  """Columns that are watched, and notes on those that are not: those named, or all that both files hold as numbers, less clocks and what is unfit.
+
+def choose_columns(
+  log: Log, nominal: Log, names: tuple[str, ...], path, nominal_path
+) -> tuple[list[str], list[str]]:
+  """Columns that are watched, and notes on those that are not: those named, or all that both files
+  hold as numbers, less clocks and what is unfit.
 
   Raises:
     FileError or UserError where a column that is named cannot be watched, or none is left.
@@ -250,8 +330,13 @@ def choose_columns(log: Log, nominal: Log, names: tuple[str, ...], path, nominal
       raise FileError(f"{at} has no column of numbers to watch{_because(one)}")
   shared = list(dict.fromkeys(names)) or [name for name in log.columns if name in nominal.columns]
   if not shared:
-    raise FileError(f"{path} and {nominal_path} share no column of numbers: {', '.join(log.columns)} against {', '.join(nominal.columns)}"
-                    + (_because(log) or _because(nominal)))
+    raise FileError(
+      (
+        f"{path} and {nominal_path} share no column of numbers: {', '.join(log.columns)} against "
+        f"{', '.join(nominal.columns)}"
+      )
+      + (_because(log) or _because(nominal))
+    )
   clocks = [] if names else _clocks(log, nominal)
   able = [name for name in shared if name not in clocks]
   unfit = {name: why for name in able if (why := _unfit(name, log, nominal, path, nominal_path))}
@@ -260,8 +345,11 @@ def choose_columns(log: Log, nominal: Log, names: tuple[str, ...], path, nominal
     _, error = next(iter(unfit.values()))
     raise FileError(error + (f"; name the others by --column: {', '.join(found)}" if found else ""))
   if not found:
-    raise FileError(f"{path} and {nominal_path} share no column but such as rise like a clock or counter: {', '.join(clocks)}; "
-                    "--column watches one all the same")
+    raise FileError(
+      f"{path} and {nominal_path} share no column but such as rise like a clock or counter: "
+      f"{', '.join(clocks)}; "
+      "--column watches one all the same"
+    )
   return found, [] if names else _left_out(files, clocks, unfit)
 
 
@@ -272,14 +360,19 @@ def _there(one: Log, at, name: str) -> None:
     raise FileError(f"{at}: column {name} holds {cell!r} in line {line}, which is no number")
   choices = f"choose from: {', '.join(sorted(one.columns)) or 'none'}"
   if name in one.clocks:
-    raise UserError(f"{at}: column {name} tells when samples were taken and cannot be watched; {choices}")
+    raise UserError(
+      f"{at}: column {name} tells when samples were taken and cannot be watched; {choices}"
+    )
   if name not in one.columns:
     raise UserError(f"{at} has no column {name!r}; {choices}")
 
 
 def _because(one: Log) -> str:
   """The first cell that keeps a column from being one of numbers."""
-  return "".join(f"; column {name}: line {line} holds {cell!r}" for name, (line, cell) in list(one.ignored.items())[:1])
+  return "".join(
+    f"; column {name}: line {line} holds {cell!r}"
+    for name, (line, cell) in list(one.ignored.items())[:1]
+  )
 
 
 def _unfit(name: str, log: Log, nominal: Log, path, nominal_path) -> tuple[str, str] | None:
@@ -289,8 +382,10 @@ def _unfit(name: str, log: Log, nominal: Log, path, nominal_path) -> tuple[str, 
     why = f"{len(known)} samples, at least {LEAST} are needed"
     return f"{nominal_path} has {why}", f"{nominal_path} is too short: column {name} has {why}"
   if np.ptp(known) == 0:
-    return (f"constant in {nominal_path}" + (f", but not in {path}" if (now != known[0]).any() else ""),
-            f"{nominal_path}: column {name} is constant ({known[0]:g}), nothing can be calibrated on it")
+    return (
+      f"constant in {nominal_path}" + (f", but not in {path}" if (now != known[0]).any() else ""),
+      f"{nominal_path}: column {name} is constant ({known[0]:g}), nothing can be calibrated on it",
+    )
   return None if len(now) else (f"no sample in {path}", f"{path}: column {name} has no sample")
 
 
@@ -308,5 +403,10 @@ def _left_out(files, clocks: list[str], unfit: dict[str, tuple[str, str]]) -> li
   groups: dict[str, list[str]] = {}
   for name, reason in reasons.items():
     groups.setdefault(reason, []).append(name)
-  return [f"{'column' if len(group) == 1 else 'columns'} {', '.join(group)} {'is' if len(group) == 1 else 'are'} not watched: {reason}"
-          for reason, group in groups.items()]
+  return [
+    (
+      f"{'column' if len(group) == 1 else 'columns'} {', '.join(group)} "
+      f"{'is' if len(group) == 1 else 'are'} not watched: {reason}"
+    )
+    for reason, group in groups.items()
+  ]

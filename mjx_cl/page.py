@@ -1,4 +1,7 @@
-"""The leaderboard as one HTML file that needs no network: tables, plots and a page per fault, drawn by assets/leaderboard.js."""
+"""The leaderboard as one HTML file that needs no network: tables, plots and a page per fault, drawn
+by assets/leaderboard.js.
+"""
+
 from __future__ import annotations
 
 import json
@@ -22,11 +25,15 @@ class Column(NamedTuple):
   """One column of the tables.
 
   Attributes:
-    key: of a row. label, help: of the header and its tooltip. kind: text, number, integer, share (shown in per cent), ratio or score.
-    better: 1 where a higher figure is better, -1 where a lower one is, 0 where neither; the first click sorts the best to the top.
-    core: shown before `all columns` is chosen. tables: `rows`, `overall` or both. few: flag of a row that marks the figure.
+    key: of a row. label, help: of the header and its tooltip. kind: text, number, integer, share
+      (shown in per cent), ratio or score.
+    better: 1 where a higher figure is better, -1 where a lower one is, 0 where neither; the first
+      click sorts the best to the top.
+    core: shown before `all columns` is chosen. tables: `rows`, `overall` or both. few: flag of a
+      row that marks the figure.
     noted: a figure above it is marked, and the row's note told at the mark.
   """
+
   key: str
   label: str
   kind: str
@@ -39,37 +46,177 @@ class Column(NamedTuple):
 
 
 BOTH = ("rows", "overall")
-SCORE = "0: never alarms; 100: alarms at the onset of every fault and at no other time; negative: worse than no detector."
+SCORE = (
+  "0: never alarms; 100: alarms at the onset of every fault and at no other time; negative: "
+  "worse than no detector."
+)
 COLUMNS = (
   Column("detector", "Detector", "text", 0, "Name in the detector table", True, BOTH, "few"),
   Column("robot", "Robot", "text", 0, "Robot that the streams come from", True),
-  Column("fault", "Fault", "text", 0, "Fault that begins at the onset; the link opens its page", True),
-  Column("severity", "Severity", "number", 0, "0: healthy, 1: the worst that the fault can do", True),
+  Column(
+    "fault", "Fault", "text", 0, "Fault that begins at the onset; the link opens its page", True
+  ),
+  Column(
+    "severity", "Severity", "number", 0, "0: healthy, 1: the worst that the fault can do", True
+  ),
   Column("cost_standard", "Cost score, standard", "score", 1, SCORE, True, BOTH),
-  Column("cost_few_false", "Cost score, few false alarms", "score", 1, f"False alarms weigh more. {SCORE}", True, BOTH),
-  Column("cost_few_misses", "Cost score, few misses", "score", 1, f"Misses weigh more. {SCORE}", True, BOTH),
-  Column("latency_median_s", "Median latency [s]", "number", -1,
-         "Onset to first alarm, misses counted as later than all others; dash: half or more are missed", True),
-  Column("latency_median_steps", "Median latency [steps]", "number", -1, "The same in control steps"),
-  Column("miss_probability", "Missed", "share", -1, "Share of streams without an alarm before the horizon", True, BOTH),
-  Column("detected_within_0.5s", "Detected in 0.5\u00a0s", "share", 1, "Share of streams with an alarm at most 0.5 s after the onset"),
-  Column("detected_within_1s", "Detected in 1\u00a0s", "share", 1, "Share of streams with an alarm at most 1 s after the onset", True, BOTH),
-  Column("detected_within_5s", "Detected in 5\u00a0s", "share", 1, "Share of streams with an alarm at most 5 s after the onset", True, BOTH),
-  Column("detected_within_20s", "Detected in 20\u00a0s", "share", 1, "Share of streams with an alarm at most 20 s after the onset"),
-  Column("mean_rank", "Mean rank", "number", -1, "Mean over robots, faults and severities of the rank by the standard cost score; 1 is best", True,
-         ("overall",)),
-  Column("false_alarms_per_hour", "False alarms per hour", "number", -1, "In healthy operation, per hour of robot time", True, few="arl0_few"),
-  Column("arl0", "ARL0 [steps]", "number", 0, "Healthy steps per alarm, with restarts", True, few="arl0_few"),
-  Column("arl0_alarms", "Alarms behind ARL0", "integer", 0, "Alarms that the ARL0 was counted from"),
-  Column("episode_alarm_probability", "Alarm in a healthy episode", "share", -1, "Share of healthy episodes with an alarm", few="arl0_few"),
+  Column(
+    "cost_few_false",
+    "Cost score, few false alarms",
+    "score",
+    1,
+    f"False alarms weigh more. {SCORE}",
+    True,
+    BOTH,
+  ),
+  Column(
+    "cost_few_misses",
+    "Cost score, few misses",
+    "score",
+    1,
+    f"Misses weigh more. {SCORE}",
+    True,
+    BOTH,
+  ),
+  Column(
+    "latency_median_s",
+    "Median latency [s]",
+    "number",
+    -1,
+    "Onset to first alarm, misses counted as later than all others; dash: half or more are missed",
+    True,
+  ),
+  Column(
+    "latency_median_steps", "Median latency [steps]", "number", -1, "The same in control steps"
+  ),
+  Column(
+    "miss_probability",
+    "Missed",
+    "share",
+    -1,
+    "Share of streams without an alarm before the horizon",
+    True,
+    BOTH,
+  ),
+  Column(
+    "detected_within_0.5s",
+    "Detected in 0.5\u00a0s",
+    "share",
+    1,
+    "Share of streams with an alarm at most 0.5 s after the onset",
+  ),
+  Column(
+    "detected_within_1s",
+    "Detected in 1\u00a0s",
+    "share",
+    1,
+    "Share of streams with an alarm at most 1 s after the onset",
+    True,
+    BOTH,
+  ),
+  Column(
+    "detected_within_5s",
+    "Detected in 5\u00a0s",
+    "share",
+    1,
+    "Share of streams with an alarm at most 5 s after the onset",
+    True,
+    BOTH,
+  ),
+  Column(
+    "detected_within_20s",
+    "Detected in 20\u00a0s",
+    "share",
+    1,
+    "Share of streams with an alarm at most 20 s after the onset",
+  ),
+  Column(
+    "mean_rank",
+    "Mean rank",
+    "number",
+    -1,
+    "Mean over robots, faults and severities of the rank by the standard cost score; 1 is best",
+    True,
+    ("overall",),
+  ),
+  Column(
+    "false_alarms_per_hour",
+    "False alarms per hour",
+    "number",
+    -1,
+    "In healthy operation, per hour of robot time",
+    True,
+    few="arl0_few",
+  ),
+  Column(
+    "arl0",
+    "ARL0 [steps]",
+    "number",
+    0,
+    "Healthy steps per alarm, with restarts",
+    True,
+    few="arl0_few",
+  ),
+  Column(
+    "arl0_alarms", "Alarms behind ARL0", "integer", 0, "Alarms that the ARL0 was counted from"
+  ),
+  Column(
+    "episode_alarm_probability",
+    "Alarm in a healthy episode",
+    "share",
+    -1,
+    "Share of healthy episodes with an alarm",
+    few="arl0_few",
+  ),
   Column("threshold", "Threshold", "number", 0, "Decision level after calibration", few="arl0_few"),
-  Column("auroc", "AUROC", "ratio", 1, "Ranks scores sample by sample; says nothing about delay or false alarms in a row", True),
-  Column("efficiency", "Efficiency", "ratio", 1, "Delay of the likelihood-ratio oracle / delay of this detector, at equal ARL0", True, noted=1.0),
-  Column("oracle_delay_steps", "Oracle delay [steps]", "number", 0, "Delay of the likelihood-ratio test fitted on other seeds"),
-  Column("optimal_delay_steps", "Optimal delay [steps]", "number", 0, "Closed form; printed only where its assumptions hold"),
-  Column("information_nats_per_step", "Information [nats/step]", "number", 0, "Estimated divergence of faulty from healthy streams"),
-  Column("us_per_sample", "Time per sample [µs]", "number", -1,
-         "Wall time of one update of one stream, beside the threads of other detectors on a shared machine; dash: not timed (oracles, files of scores)"),
+  Column(
+    "auroc",
+    "AUROC",
+    "ratio",
+    1,
+    "Ranks scores sample by sample; says nothing about delay or false alarms in a row",
+    True,
+  ),
+  Column(
+    "efficiency",
+    "Efficiency",
+    "ratio",
+    1,
+    "Delay of the likelihood-ratio oracle / delay of this detector, at equal ARL0",
+    True,
+    noted=1.0,
+  ),
+  Column(
+    "oracle_delay_steps",
+    "Oracle delay [steps]",
+    "number",
+    0,
+    "Delay of the likelihood-ratio test fitted on other seeds",
+  ),
+  Column(
+    "optimal_delay_steps",
+    "Optimal delay [steps]",
+    "number",
+    0,
+    "Closed form; printed only where its assumptions hold",
+  ),
+  Column(
+    "information_nats_per_step",
+    "Information [nats/step]",
+    "number",
+    0,
+    "Estimated divergence of faulty from healthy streams",
+  ),
+  Column(
+    "us_per_sample",
+    "Time per sample [µs]",
+    "number",
+    -1,
+    (
+      "Wall time of one update of one stream, beside the threads of other detectors on a shared "
+      "machine; dash: not timed (oracles, files of scores)"
+    ),
+  ),
   Column("streams", "Streams", "integer", 0, "Streams that the row rests on"),
   Column("note", "Note", "text", 0, "What is to be known about the row"),
 )
@@ -106,29 +253,42 @@ into one figure: 0 for a detector that never alarms, 100 for one that alarms at 
 """
 
 
-def write(path, rows: list[dict], overall: list[dict], curves: dict, faults: list[dict], meta: dict) -> None:
-  """Writes the leaderboard to a temporary name and renames it. nan becomes null and is shown as a dash; infinity is refused.
+def write(
+  path, rows: list[dict], overall: list[dict], curves: dict, faults: list[dict], meta: dict
+) -> None:
+  """Writes the leaderboard to a temporary name and renames it. nan becomes null and is shown as a
+  dash; infinity is refused.
 
   Args:
-    rows: one dict per detector x robot x fault x severity, with every key of COLUMNS for `rows`; key_ci [low, high] or None is optional, and so
-      is arl0_few, which marks figures that rest on fewer than 50 alarms; a figure above Column.noted needs a note.
+    rows: one dict per detector x robot x fault x severity, with every key of COLUMNS for `rows`;
+      key_ci [low, high] or None is optional, and so is arl0_few, which marks figures that rest on
+      fewer than 50 alarms; a figure above Column.noted needs a note.
     overall: one dict per detector, with every key of COLUMNS for `overall`, key_ci likewise.
     curves: {detector: {robot: [point, ...]}}, a point has POINT_KEYS.
-    faults: dicts with FAULT_KEYS: onset [control steps], channels {name: values}, alarms {detector: control step or None}, the first from the onset
-      on; value k of a channel belongs to control step first + k * every (optional keys, 0 and 1 where absent). Optional are early, {detector: control
-      step} of the first alarm that is shown before the onset, seed, target, and others: the streams of further seeds, dicts with LIFE_KEYS, first,
-      every, early and target likewise.
-    meta: printed at the foot as it is, save for critical_difference (of mean ranks, or None), references (names drawn in grey, instead of
-      REFERENCES) and notes (text, or a list of texts).
+    faults: dicts with FAULT_KEYS: onset [control steps], channels {name: values}, alarms {detector:
+      control step or None}, the first from the onset on; value k of a channel belongs to control
+      step first + k * every (optional keys, 0 and 1 where absent). Optional are early, {detector:
+      control step} of the first alarm that is shown before the onset, seed, target, and others: the
+      streams of further seeds, dicts with LIFE_KEYS, first, every, early and target likewise.
+    meta: printed at the foot as it is, save for critical_difference (of mean ranks, or None),
+      references (names drawn in grey, instead of REFERENCES) and notes (text, or a list of texts).
   Raises:
-    UserError where a key or a note is missing or a figure is infinite; FileError where the file cannot be written.
+    UserError where a key or a note is missing or a figure is infinite; FileError where the file
+    cannot be written.
   """
-  for name, table, keys in (("row", rows, _keys("rows")), ("overall", overall, _keys("overall")), ("fault", faults, FAULT_KEYS)):
+  for name, table, keys in (
+    ("row", rows, _keys("rows")),
+    ("overall", overall, _keys("overall")),
+    ("fault", faults, FAULT_KEYS),
+  ):
     for i, row in enumerate(table):
       _demand(f"{name} {i}", row, keys)
       for c in COLUMNS if name == "row" else ():
         if c.noted is not None and (row[c.key] or 0) > c.noted and not row["note"]:
-          raise UserError(f"page: row {i} of {row['detector']}: its {c.key} is above {c.noted:g}, and no note says why")
+          raise UserError(
+            f"page: row {i} of {row['detector']}: its {c.key} is above {c.noted:g}, and no "
+            "note says why"
+          )
       for j, life in enumerate(row.get("others", ()) if name == "fault" else ()):
         _demand(f"{name} {i}, other stream {j}", life, LIFE_KEYS)
   for detector, robots in curves.items():
@@ -136,10 +296,22 @@ def write(path, rows: list[dict], overall: list[dict], curves: dict, faults: lis
       for i, point in enumerate(points):
         _demand(f"curve of {detector} on {robot}, point {i}", point, POINT_KEYS)
   keys = list(dict.fromkeys(key for row in rows for key in row))
-  data = {"columns": [c._asdict() for c in COLUMNS], "profiles": PROFILES, "references": meta.get("references", REFERENCES), "keys": keys,
-          "rows": [[row.get(key) for key in keys] for row in rows],  # keys once: half the size
-          "overall": overall, "curves": curves, "faults": faults, "meta": {k: v for k, v in meta.items() if k != "references"}}
-  parts = {"@CSS@": _asset("leaderboard.css"), "@JS@": _asset("leaderboard.js"), "@DATA@": embed(data)}
+  data = {
+    "columns": [c._asdict() for c in COLUMNS],
+    "profiles": PROFILES,
+    "references": meta.get("references", REFERENCES),
+    "keys": keys,
+    "rows": [[row.get(key) for key in keys] for row in rows],  # keys once: half the size
+    "overall": overall,
+    "curves": curves,
+    "faults": faults,
+    "meta": {k: v for k, v in meta.items() if k != "references"},
+  }
+  parts = {
+    "@CSS@": _asset("leaderboard.css"),
+    "@JS@": _asset("leaderboard.js"),
+    "@DATA@": embed(data),
+  }
   text = HTML
   for mark, part in parts.items():  # the data last, since a name may hold a mark
     text = text.replace(mark, part)
@@ -150,11 +322,15 @@ def write(path, rows: list[dict], overall: list[dict], curves: dict, faults: lis
     os.replace(tmp, path)
   except OSError as e:
     tmp.unlink(missing_ok=True)
-    raise FileError(f"cannot write {path}: {e.strerror or e}; what was there is unchanged") from None
+    raise FileError(
+      f"cannot write {path}: {e.strerror or e}; what was there is unchanged"
+    ) from None
 
 
 def embed(value) -> str:
-  """JSON that may stand inside a script element: no <, > or & is left in it, so no name can end the element or open a comment."""
+  """JSON that may stand inside a script element: no <, > or & is left in it, so no name can end the
+  element or open a comment.
+  """
   text = json.dumps(_clean(value, "page"), allow_nan=False, separators=(",", ":"))
   return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 

@@ -1,4 +1,7 @@
-"""Tables that others add to: robots, faults and detectors, by entry points of their packages or out of a file, path/to/file.py:Name."""
+"""Tables that others add to: robots, faults and detectors, by entry points of their packages or out
+of a file, path/to/file.py:Name.
+"""
+
 from __future__ import annotations
 
 import collections
@@ -16,18 +19,27 @@ from mjx_cl.errors import FileError, PluginError, UserError
 
 
 class Registry(collections.UserDict):
-  """A table that the entry points of `group` join at its first use, so that a plug-in may import whatever it likes of this package. A name with a
-  colon, "path/to/file.py:Name" or "module:Name", is what stands there, see `find`; the table does not list it.
+  """A table that the entry points of `group` join at its first use, so that a plug-in may import
+  whatever it likes of this package. A name with a colon, "path/to/file.py:Name" or "module:Name",
+  is what stands there, see `find`; the table does not list it.
 
   Args:
-    group: of entry points, such as `mjx_cl.faults`. kind: what a message calls a member. own: the members that are there already.
+    group: of entry points, such as `mjx_cl.faults`. kind: what a message calls a member. own: the
+      members that are there already.
   Raises:
-    PluginError at each use, one line: a name that is taken, a module that cannot be loaded, a member that cannot be called; UserError for a name
+    PluginError at each use, one line: a name that is taken, a module that cannot be loaded, a
+      member that cannot be called; UserError for a name
     with a colon where nothing of that name is.
   """
 
   def __init__(self, group: str, kind: str, own: dict):
-    self.group, self.kind, self.own, self.filled, self.members = group, kind, frozenset(own), False, dict(own)
+    self.group, self.kind, self.own, self.filled, self.members = (
+      group,
+      kind,
+      frozenset(own),
+      False,
+      dict(own),
+    )
 
   @property
   def data(self) -> dict:
@@ -36,7 +48,9 @@ class Registry(collections.UserDict):
     return self.members
 
   def fill(self) -> None:
-    """Loads the plug-ins unless that is done, or is being done: a plug-in that looks into the table meanwhile sees what is there."""
+    """Loads the plug-ins unless that is done, or is being done: a plug-in that looks into the table
+    meanwhile sees what is there.
+    """
     if self.filled:
       return
     self.filled = True
@@ -44,13 +58,20 @@ class Registry(collections.UserDict):
     try:
       for entry in importlib.metadata.entry_points(group=self.group):
         if entry.name in self.own or entry.name in found:
-          raise PluginError(f"{self.kind} {entry.name!r} of {entry.value} is there already; a plug-in must have a name of its own")
+          raise PluginError(
+            f"{self.kind} {entry.name!r} of {entry.value} is there already; a plug-in must "
+            "have a name of its own"
+          )
         try:
           found[entry.name] = entry.load()
         except (Exception, SystemExit) as e:  # whatever a foreign module raises
-          raise PluginError(f"{self.kind} {entry.name!r} of {entry.value} cannot be loaded: {line(e)}") from e
+          raise PluginError(
+            f"{self.kind} {entry.name!r} of {entry.value} cannot be loaded: {line(e)}"
+          ) from e
         if not callable(found[entry.name]):
-          raise PluginError(f"{self.kind} {entry.name!r} of {entry.value} is nothing that can be called to make one")
+          raise PluginError(
+            f"{self.kind} {entry.name!r} of {entry.value} is nothing that can be called to make one"
+          )
     except BaseException:
       self.filled = False
       raise
@@ -83,7 +104,9 @@ def file_of(source: str) -> pathlib.Path | None:
 
 
 def find(source: str, kind: str) -> Callable:
-  """What "module:Name" or "path/to/file.py:Name" names; UserError, one line that begins with `kind`, where there is nothing that can be called."""
+  """What "module:Name" or "path/to/file.py:Name" names; UserError, one line that begins with
+  `kind`, where there is nothing that can be called.
+  """
   where, colon, name = source.rpartition(":")
   if not colon or not where or not name:
     raise UserError(f"{kind} {source!r}: give module:Name or path/to/file.py:Name")
@@ -100,7 +123,10 @@ def find(source: str, kind: str) -> Callable:
     raise
   except ModuleNotFoundError as e:
     if e.name and (where == e.name or where.startswith(e.name + ".")):
-      raise UserError(f"{kind} {source}: no module {e.name!r} is installed; a file of your own is given as path/to/file.py:Name") from None
+      raise UserError(
+        f"{kind} {source}: no module {e.name!r} is installed; a file of your own is given as "
+        "path/to/file.py:Name"
+      ) from None
     raise PluginError(f"{kind} {source}: importing {where} failed: {line(e)}") from None
   except (Exception, SystemExit) as e:  # whatever a foreign module raises
     raise PluginError(f"{kind} {source}: importing {where} failed: {line(e)}") from None

@@ -1,15 +1,21 @@
-"""`run`: the whole loop for arms x seeds streams, a host loop over chunks; checkpoints, result files.
+"""`run`: the whole loop for arms x seeds streams, a host loop over chunks; checkpoints, result
+files.
 
-Where the robot becomes another one (a preset with `becomes`, see transfer.py) each stream has an onset of its own: the step with which its first
-episode of the other robot begins. That step is its `onset` in events.parquet, from it on its `severity` is 1, and latency, windows and recovery
-in runs.parquet are counted from it. `onset` is null there, and every alarm a false one, for a stream that never changed. Faults that follow have
-events of their own at the run's onset plus their `after`.
+Where the robot becomes another one (a preset with `becomes`, see transfer.py) each stream has an
+onset of its own: the step with which its first episode of the other robot begins. That step is its
+`onset` in events.parquet, from it on its `severity` is 1, and latency, windows and recovery in
+runs.parquet are counted from it. `onset` is null there, and every alarm a false one, for a stream
+that never changed. Faults that follow have events of their own at the run's onset plus their
+`after`.
 
-A stream that changes more than once (a preset in sequence, such as car/transfer-then-socks, or a fault that is repaired) has a row in runs.parquet for
-each change, numbered in column `change`, `kind` onset or repair; summary.json holds the first in `arms`, the others in `later_changes`. A row ends where the next change begins. Of a later change
-reward_pre is the mean of the 2,000 steps before it, and reward_drop that of the same stream, whatever its arm did in those steps: no stream
+A stream that changes more than once (a preset in sequence, such as car/transfer-then-socks, or a
+fault that is repaired) has a row in runs.parquet for each change, numbered in column `change`,
+`kind` onset or repair; summary.json holds the first in `arms`, the others in `later_changes`. A row
+ends where the next change begins. Of a later change reward_pre is the mean of the 2,000 steps
+before it, and reward_drop that of the same stream, whatever its arm did in those steps: no stream
 without adaptation shares its past.
 """
+
 from __future__ import annotations
 
 import dataclasses
@@ -27,7 +33,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_cl import agents, checkpoint, detectors, envs, faults, memory, plugins, replay, runtime, store
+from mjx_cl import (
+  agents,
+  checkpoint,
+  detectors,
+  envs,
+  faults,
+  memory,
+  plugins,
+  replay,
+  runtime,
+  store,
+)
 from mjx_cl.adapt import phase as phase_lib
 from mjx_cl.adapt.arms import ARMS, FOREVER, never_stops
 from mjx_cl.adapt.convergence import SIGNALS
@@ -45,14 +62,17 @@ from mjx_cl.scoring import special, stop
 from mjx_cl.snapshots import Snapshots
 from mjx_cl.transfer import Moving, Transfer
 
+
 class State(NamedTuple):
   """All arrays of a run: the robots and everything else, in blocks of streams, see crew.py."""
+
   streams: Stream | Moving
   loop: list[LoopState]
 
 
 class Progress(NamedTuple):
   """What a display needs after each chunk: arrays over streams; `note`: what else is under way."""
+
   step: int
   steps: int
   seconds: float
@@ -66,33 +86,47 @@ class Progress(NamedTuple):
 
 
 def capacity(steps: int, episode: int, repeat: int = 1) -> int:
-  """Replay records kept for a stream of `steps` control steps whose episodes last `episode`: all that it can write, one more than steps an episode.
-  A robot that falls often begins more episodes than that, and in the end forgets its oldest records."""
+  """Replay records kept for a stream of `steps` control steps whose episodes last `episode`: all
+  that it can write, one more than steps an episode. A robot that falls often begins more episodes
+  than that, and in the end forgets its oldest records.
+  """
   chunks = -(-steps // (CHUNK * repeat))
   return replay.room((chunks + 2) * CHUNK + steps // episode)
 
 
 def held(state: LoopState) -> dict:
-  """Its fields by name, without those that this run has no use for: a checkpoint of a version that did not know them yet goes on."""
+  """Its fields by name, without those that this run has no use for: a checkpoint of a version that
+  did not know them yet goes on.
+  """
   return {name: value for name, value in state._asdict().items() if value is not None}
 
 
 class Runner:
   """Runs one RunConfig into the folder `out`.
 
-  Streams are ordered arm by arm, seed by seed. A stream's keys come from its seed alone, so the same seed lives the same life in
-  every arm until an alarm is acted on, bit for bit: see lanes.py. Another number of arms or seeds is another program, which rounds otherwise.
+  Streams are ordered arm by arm, seed by seed. A stream's keys come from its seed alone, so the
+  same seed lives the same life in every arm until an alarm is acted on, bit for bit: see lanes.py.
+  Another number of arms or seeds is another program, which rounds otherwise.
   """
 
   def __init__(self, config: RunConfig, out):
     self.config, self.out = config, pathlib.Path(out)
     self.env = envs.make(config.env, config.physics)
-    self.other = envs.make(becomes(config), config.physics) if becomes(config) else None  # what the robot becomes
+    self.other = (
+      envs.make(becomes(config), config.physics) if becomes(config) else None
+    )  # what the robot becomes
     self.robots = [self.env] + [self.other] * (self.other is not None)
     spec = self.env.spec
     adapt = config.adapt
-    self.trained = agents.of(self.env, config.agent, lr=adapt.lr, policy_lr=adapt.policy_lr, anchor=adapt.anchor, last_starts=adapt.last_starts,
-                             batch=adapt.batch)
+    self.trained = agents.of(
+      self.env,
+      config.agent,
+      lr=adapt.lr,
+      policy_lr=adapt.policy_lr,
+      anchor=adapt.anchor,
+      last_starts=adapt.last_starts,
+      batch=adapt.batch,
+    )
     agent, self.repeat = self.trained.agent, int(self.trained.card.get("repeat", 1))
     self.others = arm_agents(config, self.env)
     self.changes = changes(config)
@@ -105,27 +139,69 @@ class Runner:
     monitor = Monitor(agent, n=15, form=config.form, actions=config.actions, spec=spec)
     if self.other is None:
       self.rollout = Rollout(self.env, agent, self.faults, self.repeat, config.deterministic)
-      begin = lambda k, breaks: start(self.env, agent, self.faults, k, target=target, plan=spared(plan, breaks))
+      begin = lambda k, breaks: start(
+        self.env, agent, self.faults, k, target=target, plan=spared(plan, breaks)
+      )
     else:
-      self.rollout = Transfer(self.env, self.other, agent, self.faults, self.repeat, config.deterministic)
-      begin = lambda k, breaks: self.rollout.start(k, target, spared(plan, breaks), jnp.where(breaks, config.onset, FOREVER))
+      self.rollout = Transfer(
+        self.env, self.other, agent, self.faults, self.repeat, config.deterministic
+      )
+      begin = lambda k, breaks: self.rollout.start(
+        k, target, spared(plan, breaks), jnp.where(breaks, config.onset, FOREVER)
+      )
     self.chunk_steps = CHUNK * self.repeat
     self.chunks = -(-config.steps // self.chunk_steps)
     episode = min(r.spec.episode_steps for r in self.robots)
     needs = lambda steps: capacity(steps, episode, self.repeat)
-    memory.check(agent.config.size, len(spec.obs), len(spec.act), needs(config.steps), len(config.arms) * config.seeds, ("steps", needs), agent.config.bins)
+    memory.check(
+      agent.config.size,
+      len(spec.obs),
+      len(spec.act),
+      needs(config.steps),
+      len(config.arms) * config.seeds,
+      ("steps", needs),
+      agent.config.bins,
+    )
     self.seeds = [config.first_seed + i for i in range(config.seeds)]
     self.labels = [(arm, seed) for arm in config.arms for seed in self.seeds]
     self.groups = len(self.labels)
     self.lanes = Lanes(len(config.arms), config.seeds)
-    same = (agent.config, agent.obs_size, agent.act_size, agent.stepwise, config.form, config.actions, spec, detectors.factory(config.detector),
-            config.detector, robot, json.dumps(settings, sort_keys=True, default=repr))
-    self.crew = Crew(Loop(agent, monitor, detector, spec, config.adapt, self.repeat, capacity=needs(config.steps), same=same), self.groups)
+    same = (
+      agent.config,
+      agent.obs_size,
+      agent.act_size,
+      agent.stepwise,
+      config.form,
+      config.actions,
+      spec,
+      detectors.factory(config.detector),
+      config.detector,
+      robot,
+      json.dumps(settings, sort_keys=True, default=repr),
+    )
+    self.crew = Crew(
+      Loop(
+        agent,
+        monitor,
+        detector,
+        spec,
+        config.adapt,
+        self.repeat,
+        capacity=needs(config.steps),
+        same=same,
+      ),
+      self.groups,
+    )
     self.breaks = np.asarray([ARMS[arm].breaks for arm, _ in self.labels])
     keys = jnp.stack([jax.random.key(seed) for _, seed in self.labels])[:, None]
     self.keys = jax.vmap(lambda k: jax.random.fold_in(k, 7))(keys[:, 0])
-    trains = [self.others[arm].train if arm in self.others else self.trained.train for arm, _ in self.labels]
-    self.state = State(nest(begin, (0, 0), (0, None))(keys, jnp.asarray(self.breaks)), self.crew.init(trains, any(ARMS[arm].rollback for arm in config.arms)))
+    trains = [
+      self.others[arm].train if arm in self.others else self.trained.train for arm, _ in self.labels
+    ]
+    self.state = State(
+      nest(begin, (0, 0), (0, None))(keys, jnp.asarray(self.breaks)),
+      self.crew.init(trains, any(ARMS[arm].rollback for arm in config.arms)),
+    )
     self.acting = self.crew.acting(self.state.loop, self.lanes)
     self.choices = self._choices(self.state.streams)
     self.done_chunks = 0
@@ -139,14 +215,27 @@ class Runner:
     self._phase = np.zeros(self.groups, int)
     self.work = self.out / "work"
     self.endless = any(never_stops(ARMS[arm]) for arm in config.arms)
-    self.snapshots = Snapshots(config, self.robots[-1], agent, self.faults, self.changes, self.repeat, self.labels, self.trained.train.params,
-                               self.work / "snapshots") if config.snapshots else None
+    self.snapshots = (
+      Snapshots(
+        config,
+        self.robots[-1],
+        agent,
+        self.faults,
+        self.changes,
+        self.repeat,
+        self.labels,
+        self.trained.train.params,
+        self.work / "snapshots",
+      )
+      if config.snapshots
+      else None
+    )
 
   def open(self) -> None:
     """Makes the working folder; before that nothing in `out` is touched."""
     self.checkpoints = checkpoint.Checkpoints(self.work / "checkpoints")
 
-  # ---- one chunk -----------------------------------------------------------------------------------------------------------------
+  # ---- one chunk ---------------------------------------------------------------------------------
 
   def step(self) -> Progress:
     """Lives one chunk and logs it."""
@@ -159,11 +248,17 @@ class Runner:
     now = (self.done_chunks + 1) * self.chunk_steps
     if self.other is not None:
       self.choices = self._choices(streams)  # robots have changed in this chunk
-    loop, digest = self.crew.digest(self.state.loop, rows, jnp.int32(now), self.choices, self.keys, self._acceptance(streams, now))
+    loop, digest = self.crew.digest(
+      self.state.loop, rows, jnp.int32(now), self.choices, self.keys, self._acceptance(streams, now)
+    )
     digested = time.perf_counter()
     self.state = State(streams, loop)
-    changed = (digest.updates != self._updates) | (digest.decision > 0)  # weights are what they were in every other stream
-    if changed.any() or len(loop) == 1:  # the only block's own arrays, which its next digest uses up
+    changed = (digest.updates != self._updates) | (
+      digest.decision > 0
+    )  # weights are what they were in every other stream
+    if (
+      changed.any() or len(loop) == 1
+    ):  # the only block's own arrays, which its next digest uses up
       self.acting = self.crew.acting(loop, self.lanes)
     before = self._phase
     self._log(rows, digest)
@@ -182,49 +277,95 @@ class Runner:
     else:
       self.seconds["other"] += digested - begin
       self.compiled = True
-    learning = max(0.0, digested - acted - float(np.median(self.quiet))) if self.quiet and updates.sum() else 0.0
-    self.stream_seconds += (digested - begin - learning) / self.groups + learning * updates / max(1, updates.sum())
+    learning = (
+      max(0.0, digested - acted - float(np.median(self.quiet)))
+      if self.quiet and updates.sum()
+      else 0.0
+    )
+    self.stream_seconds += (digested - begin - learning) / self.groups + learning * updates / max(
+      1, updates.sum()
+    )
     self.seconds["other"] += time.perf_counter() - digested
     self._alarms = self._alarms + digest.fired.sum(0)
-    return Progress(min(now, self.config.steps), self.config.steps, sum(self.seconds.values()), [a for a, _ in self.labels], [s for _, s in self.labels],
-                    digest.phase, digest.signals[:, 2], self._alarms, digest.updates)
+    return Progress(
+      min(now, self.config.steps),
+      self.config.steps,
+      sum(self.seconds.values()),
+      [a for a, _ in self.labels],
+      [s for _, s in self.labels],
+      digest.phase,
+      digest.signals[:, 2],
+      self._alarms,
+      digest.updates,
+    )
 
   def _notice_failures(self, digest, now: int) -> None:
-    """Says which streams are given up for a loss at fault; they live on without learning. A reward that is no number would spoil every figure: that ends the run."""
+    """Says which streams are given up for a loss at fault; they live on without learning. A reward
+    that is no number would spoil every figure: that ends the run.
+    """
     lost = np.flatnonzero(~np.isfinite(digest.signals[:, SIGNALS.index("reward")]))
     if len(lost):
-      raise FileError(f"numeric failure at step {now} in stream {self.labels[lost[0]]}: its reward is not finite; the last checkpoint is intact")
+      raise FileError(
+        f"numeric failure at step {now} in stream {self.labels[lost[0]]}: its reward is not "
+        "finite; the last checkpoint is intact"
+      )
     for g in np.flatnonzero(digest.decision == phase_lib.ABORT_NUMERIC):
       bad = int(digest.failed[g])
-      term = CAUSES[bad] if bad >= 0 else next(name for name, x in zip(SIGNALS[3:], digest.signals[g, 3:]) if not np.isfinite(x))
+      term = (
+        CAUSES[bad]
+        if bad >= 0
+        else next(name for name, x in zip(SIGNALS[3:], digest.signals[g, 3:]) if not np.isfinite(x))
+      )
       arm, seed = self.labels[g]
-      print(f"mjx-cl: numeric failure at step {now} of arm {arm}, seed {seed}: {term} is not finite, or above {EXPLODED:g}; it learns no more, the others go on",
-            file=sys.stderr, flush=True)
+      print(
+        f"mjx-cl: numeric failure at step {now} of arm {arm}, seed {seed}: {term} is not "
+        f"finite, or above {EXPLODED:g}; it learns no more, the others go on",
+        file=sys.stderr,
+        flush=True,
+      )
 
   def _physics_seconds(self) -> float:
-    clocks = {id(getattr(p, "host", p)): p for p in map(envs.physics_of, self.robots)}  # robots of one model share a host
+    clocks = {
+      id(getattr(p, "host", p)): p for p in map(envs.physics_of, self.robots)
+    }  # robots of one model share a host
     return sum(getattr(p, "seconds", 0.0) for p in clocks.values())
 
   def _acceptance(self, streams, now: int):
-    """Level (groups,) of the robot that each stream has after `now` control steps; None where robots stay what they are."""
+    """Level (groups,) of the robot that each stream has after `now` control steps; None where
+    robots stay what they are.
+    """
     if self.other is None:
       return None
-    return jnp.where(streams.after.enter[:, 0] < now, jnp.float32(self.other.spec.acceptance), jnp.float32(self.env.spec.acceptance))
+    return jnp.where(
+      streams.after.enter[:, 0] < now,
+      jnp.float32(self.other.spec.acceptance),
+      jnp.float32(self.env.spec.acceptance),
+    )
 
   def _choices(self, streams) -> Choices:
-    """The arms, with every true onset of their robots that is known by now; arms that are told one begin there even where the fault's severity is 0."""
+    """The arms, with every true onset of their robots that is known by now; arms that are told one
+    begin there even where the fault's severity is 0.
+    """
     c = self.config
     onsets = tuple(c.onset + change.after for change in self.changes if change.fault != "none")
-    moves = [()] * self.groups if self.other is None else [(int(step),) for step in np.asarray(streams.after.enter)[:, 0]]
+    moves = (
+      [()] * self.groups
+      if self.other is None
+      else [(int(step),) for step in np.asarray(streams.after.enter)[:, 0]]
+    )
     return choices(self.labels, c.adapt, c.steps, [own + onsets for own in moves], self.stops)
 
   def onsets(self) -> list[int | None]:
-    """Each stream's onset; where the robot becomes another one: as far as it is known. None: not in this run, an arm whose robot is spared, or a
-    run without a fault or with one of severity 0, which changes nothing."""
+    """Each stream's onset; where the robot becomes another one: as far as it is known. None: not in
+    this run, an arm whose robot is spared, or a run without a fault or with one of severity 0,
+    which changes nothing."""
     if self.other is None:
       met = self.config.onset < self.config.steps and any(acts(change) for change in self.changes)
       return [self.config.onset if breaks and met else None for breaks in self.breaks]
-    return [int(step) if step < self.config.steps else None for step in np.asarray(self.state.streams.after.enter)[:, 0]]
+    return [
+      int(step) if step < self.config.steps else None
+      for step in np.asarray(self.state.streams.after.enter)[:, 0]
+    ]
 
   def _log(self, rows, digest) -> None:
     """Keeps a chunk's rows, (control steps, groups), and its chunk values (groups,)."""
@@ -234,30 +375,55 @@ class Runner:
       out = np.full((CHUNK, self.repeat) + x.shape[1:], np.nan, np.float32)
       out[:, -1] = x
       return out.reshape((-1,) + x.shape[1:])
+
     ends = lambda x: at_end(np.asarray(x).astype(np.float32)) > 0
-    each = lambda x: np.asarray(x)[:, :, 0].swapaxes(1, 2).reshape(-1, self.groups)  # a value per control step
+    each = lambda x: (
+      np.asarray(x)[:, :, 0].swapaxes(1, 2).reshape(-1, self.groups)
+    )  # a value per control step
     rewards = each(rows.rewards)
     part = {
-        "reward": rewards, "severity": control(rows.severity) if rows.severities is None else each(rows.severities), "episode": control(rows.episode),
-        "terminated": ends(np.asarray(rows.terminated)[:, :, 0]), "truncated": ends(np.asarray(rows.truncated)[:, :, 0]),
-        "opr": at_end(digest.residual.opr), "rpr": at_end(digest.residual.rpr), "valid": ends(digest.residual.valid),
-        "score": at_end(digest.score), "alarm": ends(digest.fired),
-        "phase": np.broadcast_to(self._phase.astype(np.int8), rewards.shape).copy(),
-        "updates": np.broadcast_to(self._updates.astype(np.int32), rewards.shape).copy(),
-        **({"parts": at_end(digest.residual.groups)} if self.config.parts else {}),
-        **({"variables": at_end(digest.residual.variables)} if self.config.residuals else {}),
-        "signals": digest.signals[None], "decision": digest.decision[None], "since": digest.since[None], "settled": digest.settled[None],
-        **({"back": digest.back[None], "earned": digest.earned[None], "earns": digest.earns[None]} if digest.back is not None else {})}
+      "reward": rewards,
+      "severity": control(rows.severity) if rows.severities is None else each(rows.severities),
+      "episode": control(rows.episode),
+      "terminated": ends(np.asarray(rows.terminated)[:, :, 0]),
+      "truncated": ends(np.asarray(rows.truncated)[:, :, 0]),
+      "opr": at_end(digest.residual.opr),
+      "rpr": at_end(digest.residual.rpr),
+      "valid": ends(digest.residual.valid),
+      "score": at_end(digest.score),
+      "alarm": ends(digest.fired),
+      "phase": np.broadcast_to(self._phase.astype(np.int8), rewards.shape).copy(),
+      "updates": np.broadcast_to(self._updates.astype(np.int32), rewards.shape).copy(),
+      **({"parts": at_end(digest.residual.groups)} if self.config.parts else {}),
+      **({"variables": at_end(digest.residual.variables)} if self.config.residuals else {}),
+      "signals": digest.signals[None],
+      "decision": digest.decision[None],
+      "since": digest.since[None],
+      "settled": digest.settled[None],
+      **(
+        {"back": digest.back[None], "earned": digest.earned[None], "earns": digest.earns[None]}
+        if digest.back is not None
+        else {}
+      ),
+    }
     if self.endless:  # what the stop rule reads besides the signals
       now = (self.done_chunks + 1) * self.chunk_steps
-      level = self._acceptance(self.state.streams, now) if self.config.adapt.acceptance is None else self.config.adapt.acceptance
+      level = (
+        self._acceptance(self.state.streams, now)
+        if self.config.adapt.acceptance is None
+        else self.config.adapt.acceptance
+      )
       index = (self.env.spec.posture or (0, 0.0))[0]
-      part |= {"posture": np.asarray(rows.final_obs)[:, :, 0, index].mean(0)[None],
-               "acceptance": np.broadcast_to(np.float32(self.env.spec.acceptance if level is None else level), (1, self.groups)).copy()}
+      part |= {
+        "posture": np.asarray(rows.final_obs)[:, :, 0, index].mean(0)[None],
+        "acceptance": np.broadcast_to(
+          np.float32(self.env.spec.acceptance if level is None else level), (1, self.groups)
+        ).copy(),
+      }
     self._phase = digest.phase
     self.parts.append(part)
 
-  # ---- kill and resume -----------------------------------------------------------------------------------------------------------
+  # ---- kill and resume ---------------------------------------------------------------------------
 
   def save(self) -> None:
     """Trace so far and state, so that a killed run goes on from here."""
@@ -271,72 +437,121 @@ class Runner:
       os.replace(tmp, self.work / f"trace-{number:06d}.npz")
     except OSError as e:
       tmp.unlink(missing_ok=True)
-      raise FileError(f"cannot write in {self.work}: {e.strerror or e}; the last checkpoint is intact") from None
+      raise FileError(
+        f"cannot write in {self.work}: {e.strerror or e}; the last checkpoint is intact"
+      ) from None
     self.seconds["other"] += time.perf_counter() - begin
-    meta = {"seconds": self.seconds, "quiet": self.quiet, "stream_seconds": self.stream_seconds.tolist(), "updates": self._updates.tolist(),
-            "alarms": self._alarms.tolist(), "phase": self._phase.tolist()}
-    self.checkpoints.save(number, State(self.state.streams, held(self.crew.join(self.state.loop))), meta)
+    meta = {
+      "seconds": self.seconds,
+      "quiet": self.quiet,
+      "stream_seconds": self.stream_seconds.tolist(),
+      "updates": self._updates.tolist(),
+      "alarms": self._alarms.tolist(),
+      "phase": self._phase.tolist(),
+    }
+    self.checkpoints.save(
+      number, State(self.state.streams, held(self.crew.join(self.state.loop))), meta
+    )
     runtime.give_back()
     for old in sorted(self.work.glob("trace-*.npz"))[:-2]:
       old.unlink()
 
   def _trace(self) -> dict[str, np.ndarray]:
-    return {k: np.concatenate([p[k] for p in self.parts]) for k in self.parts[0]} if self.parts else {}
+    return (
+      {k: np.concatenate([p[k] for p in self.parts]) for k in self.parts[0]} if self.parts else {}
+    )
 
   def resume(self) -> None:
     """Goes on from the newest checkpoint; without one, from the start."""
     if self.checkpoints.latest() is None:
       return
     like = State(self.state.streams, held(self.crew.shapes(self.state.loop)))
-    self.state = self.acting = None  # what the run began with need not lie beside what it goes on with
+    self.state = self.acting = (
+      None  # what the run began with need not lie beside what it goes on with
+    )
     (streams, loop), meta = self.checkpoints.load(like)
     number = self.checkpoints.latest()
     self.state = State(streams, self.crew.split(LoopState(**loop)))
     self.acting = self.crew.acting(self.state.loop, self.lanes)
     self.parts = [store.read_arrays(self.work / f"trace-{number:06d}.npz")]
     self.done_chunks = number
-    self.seconds, self.quiet, self.stream_seconds = meta["seconds"], meta["quiet"], np.asarray(meta["stream_seconds"])
-    self._updates, self._alarms, self._phase = (np.asarray(meta[k]) for k in ("updates", "alarms", "phase"))
+    self.seconds, self.quiet, self.stream_seconds = (
+      meta["seconds"],
+      meta["quiet"],
+      np.asarray(meta["stream_seconds"]),
+    )
+    self._updates, self._alarms, self._phase = (
+      np.asarray(meta[k]) for k in ("updates", "alarms", "phase")
+    )
 
   @property
   def done(self) -> bool:
     return self.done_chunks >= self.chunks
 
-  # ---- result files --------------------------------------------------------------------------------------------------------------
+  # ---- result files ------------------------------------------------------------------------------
 
   def config_dict(self) -> dict:
     """What config.json holds."""
-    return {"command": "run", **identity(self.config),
-            "physics": "+".join(dict.fromkeys(envs.physics_of(robot).name for robot in self.robots)),
-            "agent_card": self.trained.card, **({"arm_cards": {arm: other.card for arm, other in self.others.items()}} if self.others else {}), "agent_path": pathlib.Path(self.trained.path).name, "repeat": self.repeat,
-            "control_s": self.env.spec.control_s, **store.provenance()}
+    return {
+      "command": "run",
+      **identity(self.config),
+      "physics": "+".join(dict.fromkeys(envs.physics_of(robot).name for robot in self.robots)),
+      "agent_card": self.trained.card,
+      **(
+        {"arm_cards": {arm: other.card for arm, other in self.others.items()}}
+        if self.others
+        else {}
+      ),
+      "agent_path": pathlib.Path(self.trained.path).name,
+      "repeat": self.repeat,
+      "control_s": self.env.spec.control_s,
+      **store.provenance(),
+    }
 
   def finish(self, tell=lambda text: None) -> dict:
-    """Writes trace, events, runs, summary and figure, of an arm that never stops also signals, snapshots and stop; removes the working files.
+    """Writes trace, events, runs, summary and figure, of an arm that never stops also signals,
+    snapshots and stop; removes the working files.
 
     Returns summary.json's value.
     """
     from mjx_cl import plots
+
     steps = self.config.steps
     if self.snapshots:
       self.save()  # their evaluation takes a while; one that is cut off goes on from here
     trace = {k: v[:steps] if v.shape[0] >= steps else v for k, v in self._trace().items()}
-    outside = (trace["decision"] == phase_lib.START) & (trace["since"] >= steps)  # the last chunk lives on to its end
+    outside = (trace["decision"] == phase_lib.START) & (
+      trace["since"] >= steps
+    )  # the last chunk lives on to its end
     trace["decision"] = np.where(outside, phase_lib.NOTHING, trace["decision"])
     if self.other is None:
       targets = np.asarray(self.state.streams.injection.target)[:, 0]  # (groups, F)
-      names = ["+".join(f"{f.name}:{f.targets[t]}" for f, t in zip(self.faults, row)) for row in targets]
+      names = [
+        "+".join(f"{f.name}:{f.targets[t]}" for f, t in zip(self.faults, row)) for row in targets
+      ]
     else:
       names = [self.config.fault] * self.groups
     ledger = self._ledger([name if breaks else "none" for name, breaks in zip(names, self.breaks)])
     table, events = ledger.trace(trace), ledger.events(trace)
     runs = ledger.rows(trace, events)
     store.write_table(self.out / "trace.parquet", table)
-    store.write_table(self.out / "events.parquet", {k: [e[k] for e in events] for k in ("stream", "arm", "seed", "step", "kind", "reason", "fault")})
+    store.write_table(
+      self.out / "events.parquet",
+      {
+        k: [e[k] for e in events]
+        for k in ("stream", "arm", "seed", "step", "kind", "reason", "fault")
+      },
+    )
     store.write_table(self.out / "runs.parquet", {k: [r[k] for r in runs] for k in runs[0]})
     if self.config.residuals:
-      store.write_table(self.out / "residuals.parquet", {k: table[k] for k in ("stream", "arm", "seed", "step")} | {
-          v.name: np.ascontiguousarray(trace["variables"][:, :, k].T).reshape(-1) for k, v in enumerate(self.env.spec.obs)})
+      store.write_table(
+        self.out / "residuals.parquet",
+        {k: table[k] for k in ("stream", "arm", "seed", "step")}
+        | {
+          v.name: np.ascontiguousarray(trace["variables"][:, :, k].T).reshape(-1)
+          for k, v in enumerate(self.env.spec.obs)
+        },
+      )
     plots.figure(self.out)
     if self.endless and "posture" in trace:
       store.write_table(self.out / "signals.parquet", ledger.signals(trace))
@@ -344,10 +559,14 @@ class Runner:
     taken = self.snapshots.taken(trace, self.chunk_steps) if self.snapshots else []
     if taken:
       last = self.state.streams if self.other is None else self.state.streams.after
-      columns, summary["wall_s_snapshots"] = self.snapshots.evaluate(taken, np.asarray(last.injection.target)[:, 0], tell)
+      columns, summary["wall_s_snapshots"] = self.snapshots.evaluate(
+        taken, np.asarray(last.injection.target)[:, 0], tell
+      )
       store.write_table(self.out / "snapshots.parquet", columns)
       judged = stop.of_folder(self.out)
-      store.write_table(self.out / "stop.parquet", {k: [r[k] for r in judged] for k in stop.COLUMNS})
+      store.write_table(
+        self.out / "stop.parquet", {k: [r[k] for r in judged] for k in stop.COLUMNS}
+      )
       summary["stop_rule"] = stop.summarise(judged)
     if self.config.keep:
       self.keep()
@@ -357,34 +576,72 @@ class Runner:
     return summary
 
   def _ledger(self, names: list[str]) -> Ledger:
-    return Ledger(self.config, self.env.spec, self.repeat, self.chunk_steps, self.changes, None if self.other is None else self.other.spec.name, self.labels, self.breaks,
-                  names, self.onsets(), self._updates, self.stream_seconds)
+    return Ledger(
+      self.config,
+      self.env.spec,
+      self.repeat,
+      self.chunk_steps,
+      self.changes,
+      None if self.other is None else self.other.spec.name,
+      self.labels,
+      self.breaks,
+      names,
+      self.onsets(),
+      self._updates,
+      self.stream_seconds,
+    )
 
   def keep(self) -> None:
-    """Writes OUT/agents/ARM-SEED for every stream that has learnt: the weights that it acts by at the end, and the moments and counters of its learner.
+    """Writes OUT/agents/ARM-SEED for every stream that has learnt: the weights that it acts by at
+    the end, and the moments and counters of its learner.
 
-    Of a stream that went back (arm `rollback`) the weights are those of before, moments, slow critic and counters those of the learner that was given up.
-    The card is that of the agent it began with but for what that scored, and `adapted`: robot and fault it has lived with, arm, seed, control steps of the run, updates taken.
+    Of a stream that went back (arm `rollback`) the weights are those of before, moments, slow
+    critic and counters those of the learner that was given up. The card is that of the agent it
+    began with but for what that scored, and `adapted`: robot and fault it has lived with, arm,
+    seed, control steps of the run, updates taken.
     """
-    block_of = [(i, g - block.start) for i, block in enumerate(self.crew.blocks) for g in range(block.start, block.stop)]
+    block_of = [
+      (i, g - block.start)
+      for i, block in enumerate(self.crew.blocks)
+      for g in range(block.start, block.stop)
+    ]
     for g, (arm, seed) in enumerate(self.labels):
       if not self._updates[g]:
         continue
       i, at = block_of[g]
-      own = jax.tree.map(lambda x: np.asarray(x[at]), self.state.loop[i].train._replace(params=self.state.loop[i].acting))
-      card = {k: v for k, v in (self.others[arm] if arm in self.others else self.trained).card.items() if k not in ("eval", "demonstrator_return")}
-      adapted = {"env": self.config.env, "becomes": becomes(self.config), "fault": self.config.fault, "arm": arm, "seed": seed, "steps": self.config.steps,
-                 "updates": int(self._updates[g])}
+      own = jax.tree.map(
+        lambda x: np.asarray(x[at]),
+        self.state.loop[i].train._replace(params=self.state.loop[i].acting),
+      )
+      card = {
+        k: v
+        for k, v in (self.others[arm] if arm in self.others else self.trained).card.items()
+        if k not in ("eval", "demonstrator_return")
+      }
+      adapted = {
+        "env": self.config.env,
+        "becomes": becomes(self.config),
+        "fault": self.config.fault,
+        "arm": arm,
+        "seed": seed,
+        "steps": self.config.steps,
+        "updates": int(self._updates[g]),
+      }
       try:
         agents.save(self.out / "agents" / f"{arm}-{seed}", own, {**card, "adapted": adapted})
       except OSError as e:
-        raise FileError(f"cannot write in {self.out / 'agents'}: {e.strerror or e}; --resume writes them again") from None
+        raise FileError(
+          f"cannot write in {self.out / 'agents'}: {e.strerror or e}; --resume writes them again"
+        ) from None
+
 
 def arm_agents(config: RunConfig, env) -> dict[str, agents.Trained]:
-  """Arm -> its own agent, of the arms that bring one: the run's with the arm's word behind its name, or beside the folder that --agent gives.
+  """Arm -> its own agent, of the arms that bring one: the run's with the arm's word behind its
+  name, or beside the folder that --agent gives.
 
   Raises:
-    UserError where there is no such agent, or it differs from the run's in size, obs_scale or repeat.
+    UserError where there is no such agent, or it differs from the run's in size, obs_scale or
+    repeat.
   """
   out = {}
   for arm in (a for a in config.arms if ARMS[a].agent):
@@ -397,7 +654,9 @@ def arm_agents(config: RunConfig, env) -> dict[str, agents.Trained]:
       raise UserError(f"arm {arm!r}: {e}") from None
     same = lambda t: (t.agent.config.size, t.agent.config.obs_scale, int(t.card.get("repeat", 1)))
     if same(other) != same(trained):
-      raise UserError(f"arm {arm!r}: agent {name!r} differs from the run's in size, obs_scale or repeat")
+      raise UserError(
+        f"arm {arm!r}: agent {name!r} differs from the run's in size, obs_scale or repeat"
+      )
     out[arm] = other
   return out
 
@@ -408,66 +667,124 @@ def spared(plan: faults.Plan, breaks) -> faults.Plan:
 
 
 def known_as(env) -> str:
-  """The robot whose agents and figures `env` takes: its own name, or that of the one that it is another fidelity of."""
+  """The robot whose agents and figures `env` takes: its own name, or that of the one that it is
+  another fidelity of.
+  """
   return getattr(env, "agents_of", None) or env.spec.name
 
 
 def threshold_of(config: RunConfig) -> detectors.Threshold | None:
-  """The board's threshold that this run's detector has without having been given one; None where it has another."""
+  """The board's threshold that this run's detector has without having been given one; None where it
+  has another.
+  """
   if "threshold" in config.settings or detectors.split(config.detector)[0] in detectors.PAPER:
     return None
-  return detectors.calibrated(config.detector, known_as(envs.make(config.env, config.physics)), config.settings)
+  return detectors.calibrated(
+    config.detector, known_as(envs.make(config.env, config.physics)), config.settings
+  )
 
 
 def watching(config: RunConfig) -> str | None:
-  """The threshold that a detector has without having been given one, in a line; None where it was, takes none, is one of the paper's rules or looks at
-  nothing."""
+  """The threshold that a detector has without having been given one, in a line; None where it was,
+  takes none, is one of the paper's rules or looks at nothing."""
   name = detectors.split(config.detector)[0]
   build = detectors.factory(config.detector)
-  if (name in detectors.PAPER or getattr(build, "reference", False) or "threshold" in config.settings or "threshold" not in detectors.known_settings(build)
-      or not any(ARMS[arm].trigger.listens for arm in config.arms)):
+  if (
+    name in detectors.PAPER
+    or getattr(build, "reference", False)
+    or "threshold" in config.settings
+    or "threshold" not in detectors.known_settings(build)
+    or not any(ARMS[arm].trigger.listens for arm in config.arms)
+  ):
     return None
   robot = known_as(envs.make(config.env, config.physics))
   found = detectors.calibrated(config.detector, robot, config.settings)
   if found is None:
     default = inspect.signature(build).parameters.get("threshold")
-    own = "its own default threshold" + (f", {default.default:g}" if default and isinstance(default.default, (int, float)) else "")
-    return (f"detector {config.detector} runs at {own}: none was found for {robot} with these settings, and false alarms may be many; --set threshold=... "
-            "(`mjx-cl leaderboard` finds one)")
+    own = "its own default threshold" + (
+      f", {default.default:g}" if default and isinstance(default.default, (int, float)) else ""
+    )
+    return (
+      f"detector {config.detector} runs at {own}: none was found for {robot} with these "
+      "settings, and false alarms may be many; --set threshold=... "
+      "(`mjx-cl leaderboard` finds one)"
+    )
   steps = found.arl0 * found.alarms
   low, high = (steps / n for n in reversed(special.poisson_interval(found.alarms)))
-  plain = {f.name: (f.default,) for f in dataclasses.fields(RunConfig)} | {"env": (robot,), "agent": (None, robot)}
-  other = [k for k in ("env", "agent", "form", "actions", "deterministic") if getattr(config, k) not in plain[k]]
-  return (f"detector {config.detector} at threshold {found.value:.6g}, at which the shipped {robot} gave {found.alarms} false alarms in {steps:,.0f} healthy control steps, "
-          f"one in {found.arl0:,.0f} [{low:,.0f}, {high:,.0f}]" + (f"; this run has another {' and '.join(other)}" if other else ""))
+  plain = {f.name: (f.default,) for f in dataclasses.fields(RunConfig)} | {
+    "env": (robot,),
+    "agent": (None, robot),
+  }
+  other = [
+    k
+    for k in ("env", "agent", "form", "actions", "deterministic")
+    if getattr(config, k) not in plain[k]
+  ]
+  return (
+    f"detector {config.detector} at threshold {found.value:.6g}, at which the shipped {robot} "
+    f"gave {found.alarms} false alarms in {steps:,.0f} healthy control steps, "
+    f"one in {found.arl0:,.0f} [{low:,.0f}, {high:,.0f}]"
+    + (f"; this run has another {' and '.join(other)}" if other else "")
+  )
 
 
 def doubts(config: RunConfig) -> list[str]:
   """What a user may not have meant, one line each."""
   adapt, warmup, said = config.adapt, config.adapt.warmup, []
-  if config.onset >= config.steps and becomes(config) is None and any(acts(change) for change in changes(config)):
-    said.append(f"the run ends at step {config.steps:,}, before its fault at {config.onset:,}: no stream meets it")
+  if (
+    config.onset >= config.steps
+    and becomes(config) is None
+    and any(acts(change) for change in changes(config))
+  ):
+    said.append(
+      f"the run ends at step {config.steps:,}, before its fault at {config.onset:,}: no stream "
+      "meets it"
+    )
   least = max(adapt.least, adapt.patience * CHUNK)
   if adapt.budget < least and any(ARMS[arm].end.rule for arm in config.arms):
-    said.append(f"adapt.budget={adapt.budget:,} ends every finetuning before one may converge, after {least:,} steps (adapt.least, {CHUNK} adapt.patience)")
+    said.append(
+      f"adapt.budget={adapt.budget:,} ends every finetuning before one may converge, after "
+      f"{least:,} steps (adapt.least, {CHUNK} adapt.patience)"
+    )
   if warmup >= config.steps:
-    return said + [f"the run ends at step {config.steps:,}, within adapt.warmup={warmup:,}: no alarm can start anything"]
+    return said + [
+      (
+        f"the run ends at step {config.steps:,}, within adapt.warmup={warmup:,}: no alarm can "
+        "start anything"
+      )
+    ]
   if warmup > config.onset and any(ARMS[arm].trigger.listens for arm in config.arms):
-    return said + [f"onset {config.onset:,} lies within adapt.warmup={warmup:,}: an alarm before its end starts nothing, and without a reward before the onset no stream "
-            "counts as affected or recovered; a later --onset or a smaller --adapt.warmup would do"]
+    return said + [
+      f"onset {config.onset:,} lies within adapt.warmup={warmup:,}: an alarm before its end "
+      "starts nothing, and without a reward before the onset no stream "
+      "counts as affected or recovered; a later --onset or a smaller --adapt.warmup would do"
+    ]
   return said
 
 
-def execute(config: RunConfig, out, resume: bool = False, overwrite: bool = False, progress=lambda p: None, save_every_s: float = 60.0,
-            tell=lambda text: None) -> dict:
-  """Runs `config` into `out` and returns summary.json's value. A kill at any moment loses at most `save_every_s` seconds of work."""
+def execute(
+  config: RunConfig,
+  out,
+  resume: bool = False,
+  overwrite: bool = False,
+  progress=lambda p: None,
+  save_every_s: float = 60.0,
+  tell=lambda text: None,
+) -> dict:
+  """Runs `config` into `out` and returns summary.json's value. A kill at any moment loses at most
+  `save_every_s` seconds of work.
+  """
   fresh = not pathlib.Path(out).exists()
   state, out = store.claim_folder(out, resume, overwrite), pathlib.Path(out)
   if state == "done":
-    check_same(out, {k: v for k, v in identity(config).items() if k != "physics"})  # `auto` is resolved there
+    check_same(
+      out, {k: v for k, v in identity(config).items() if k != "physics"}
+    )  # `auto` is resolved there
     return store.read_json(out / "summary.json")
   try:
-    runner = Runner(config, out)  # refuses wrong names and broken agents before anything of an earlier run is removed
+    runner = Runner(
+      config, out
+    )  # refuses wrong names and broken agents before anything of an earlier run is removed
   except UserError:
     if fresh and not any(out.iterdir()):
       out.rmdir()
@@ -484,7 +801,10 @@ def execute(config: RunConfig, out, resume: bool = False, overwrite: bool = Fals
     store.write_json(out / "config.json", values)
   for text in [*filter(None, [watching(config)]), *doubts(config)]:
     tell(f"note: {text}")
-  tell(f"{len(config.arms) * config.seeds} streams of {config.steps:,} control steps; what is not compiled yet is compiled first, a minute or two")
+  tell(
+    f"{len(config.arms) * config.seeds} streams of {config.steps:,} control steps; what is not "
+    "compiled yet is compiled first, a minute or two"
+  )
   saved = time.monotonic()
   with Interruptible() as interrupt:
     last = None
@@ -494,7 +814,8 @@ def execute(config: RunConfig, out, resume: bool = False, overwrite: bool = Fals
       try:
         interrupt.check()
       except KeyboardInterrupt:
-        runner.save()  # between two chunks; a second signal, in the middle of one, leaves nothing whole to save
+        # between two chunks; a second signal, in the middle of one, leaves nothing whole to save
+        runner.save()
         raise
       if time.monotonic() - saved > save_every_s:
         runner.save()
@@ -519,23 +840,50 @@ def clear(out: pathlib.Path) -> None:
 
 
 def identity(config: RunConfig) -> dict:
-  """What makes a run what it is, as config.json holds it: its settings, `changes`, what a preset's name stood for when it began, the `threshold` that its
-  detector takes from the board, `oracle_stops` that its arms are told, and the SHA-256 of the `files` that robot, fault or detector stand in."""
+  """What makes a run what it is, as config.json holds it: its settings, `changes`, what a preset's
+  name stood for when it began, the `threshold` that its detector takes from the board,
+  `oracle_stops` that its arms are told, and the SHA-256 of the `files` that robot, fault or
+  detector stand in.
+  """
   found, told = threshold_of(config), stop.told(config)
-  sources = {name: plugins.file_of(name) for name in (config.env, config.detector, *(change.fault for change in changes(config)))}
-  files = {name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in sources.items() if path is not None and path.is_file()}
-  return json.loads(json.dumps({**dataclasses.asdict(config), "changes": [dataclasses.asdict(change) for change in changes(config)],
-                                **({"threshold": found._asdict()} if found else {}), **({"oracle_stops": told} if told else {}),
-                                **({"files": files} if files else {})}))
+  sources = {
+    name: plugins.file_of(name)
+    for name in (config.env, config.detector, *(change.fault for change in changes(config)))
+  }
+  files = {
+    name: hashlib.sha256(path.read_bytes()).hexdigest()
+    for name, path in sources.items()
+    if path is not None and path.is_file()
+  }
+  return json.loads(
+    json.dumps(
+      {
+        **dataclasses.asdict(config),
+        "changes": [dataclasses.asdict(change) for change in changes(config)],
+        **({"threshold": found._asdict()} if found else {}),
+        **({"oracle_stops": told} if told else {}),
+        **({"files": files} if files else {}),
+      }
+    )
+  )
 
 
 def differing(old: dict, values: dict) -> list[str]:
-  """Keys of `values` in which the run differs whose config.json holds `old`. A setting that did not exist when it began counts as its default."""
+  """Keys of `values` in which the run differs whose config.json holds `old`. A setting that did not
+  exist when it began counts as its default.
+  """
   skip = ("git_commit", "machine", "python")
   if isinstance(old.get("adapt"), dict):
     old = old | {"adapt": {**dataclasses.asdict(AdaptConfig()), **old["adapt"]}}
-  default = {f.name: f.default for f in dataclasses.fields(RunConfig)}  # nor did `changes` always exist
-  changed = [k for k in values if k not in skip and old.get(k, default.get(k, values[k] if k == "changes" else None)) != values[k]]
+  default = {
+    f.name: f.default for f in dataclasses.fields(RunConfig)
+  }  # nor did `changes` always exist
+  changed = [
+    k
+    for k in values
+    if k not in skip
+    and old.get(k, default.get(k, values[k] if k == "changes" else None)) != values[k]
+  ]
   return changed + ["threshold"] * ("threshold" in old and "threshold" not in values)
 
 
@@ -547,6 +895,12 @@ def check_same(out: pathlib.Path, values: dict) -> None:
     raise FileError(f"{e}; give --overwrite or another --out") from None
   changed = differing(old, values)
   if changed == ["threshold"]:
-    raise UserError(f"--resume: {out} was begun when its detector {old.get('detector')} had another default threshold than today; --overwrite begins anew")
+    raise UserError(
+      f"--resume: {out} was begun when its detector {old.get('detector')} had another default "
+      "threshold than today; --overwrite begins anew"
+    )
   if changed:
-    raise UserError(f"--resume: {out} was begun with another {', '.join(changed)}; give the same settings or --overwrite")
+    raise UserError(
+      f"--resume: {out} was begun with another {', '.join(changed)}; give the same settings or "
+      "--overwrite"
+    )

@@ -1,4 +1,5 @@
 """Result files: Parquet written to a temporary name and renamed, DuckDB views to query them."""
+
 from __future__ import annotations
 
 import functools
@@ -14,7 +15,17 @@ import tomllib
 
 from mjx_cl.errors import FileError, UserError
 
-PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "mjbatch", "flax", "optax", "orbax-checkpoint", "numpy")
+PACKAGES = (
+  "jax",
+  "jaxlib",
+  "mujoco",
+  "mujoco-mjx",
+  "mjbatch",
+  "flax",
+  "optax",
+  "orbax-checkpoint",
+  "numpy",
+)
 
 
 def plain(x):
@@ -38,7 +49,9 @@ def atomic(path, write) -> None:
     os.replace(tmp, path)
   except OSError as e:
     tmp.unlink(missing_ok=True)
-    raise FileError(f"cannot write {path}: {e.strerror or e}; what was there is unchanged") from None
+    raise FileError(
+      f"cannot write {path}: {e.strerror or e}; what was there is unchanged"
+    ) from None
 
 
 def write_json(path, value) -> None:
@@ -60,33 +73,61 @@ def read_json(path) -> dict:
   except ValueError as e:  # of JSON and of UTF-8
     raise FileError(f"{path} is broken: {str(e).splitlines()[0]}") from None
   if not isinstance(value, dict):
-    raise FileError(f"{path} holds {type(value).__name__} in place of an object; it is not of mjx-cl")
+    raise FileError(
+      f"{path} holds {type(value).__name__} in place of an object; it is not of mjx-cl"
+    )
   return value
 
 
-def write_table(path, columns: dict, nan_is_null: bool = True, codec: str = "zstd", level: int | None = None,
-                split: tuple[str, ...] = ()) -> None:
+def write_table(
+  path,
+  columns: dict,
+  nan_is_null: bool = True,
+  codec: str = "zstd",
+  level: int | None = None,
+  split: tuple[str, ...] = (),
+) -> None:
   """Writes columns (name -> 1-D array or list) as Parquet; nan becomes null.
 
   Args:
-    codec, level: of the compression. split: float columns whose bytes are stored apart, which suits rounded values; integers then as differences.
+    codec, level: of the compression. split: float columns whose bytes are stored apart, which suits
+      rounded values; integers then as differences.
   """
   import numpy as np
   import pyarrow
   import pyarrow.parquet
+
   arrays = {}
-  how = {"use_dictionary": False, "column_encoding": {name: "BYTE_STREAM_SPLIT" for name in split}
-         | {name: "DELTA_BINARY_PACKED" for name in ("stream", "step") if name in columns}} if split else {}
+  how = (
+    {
+      "use_dictionary": False,
+      "column_encoding": {name: "BYTE_STREAM_SPLIT" for name in split}
+      | {name: "DELTA_BINARY_PACKED" for name in ("stream", "step") if name in columns},
+    }
+    if split
+    else {}
+  )
   for name, values in columns.items():
     floating = isinstance(values, np.ndarray) and values.dtype.kind == "f"
-    arrays[name] = pyarrow.array(values, mask=np.isnan(values) if floating and nan_is_null else None)
-  atomic(path, lambda file: pyarrow.parquet.write_table(pyarrow.table(arrays), file, compression=codec, compression_level=level, **how))
+    arrays[name] = pyarrow.array(
+      values, mask=np.isnan(values) if floating and nan_is_null else None
+    )
+  atomic(
+    path,
+    lambda file: pyarrow.parquet.write_table(
+      pyarrow.table(arrays), file, compression=codec, compression_level=level, **how
+    ),
+  )
 
 
 def write_arrow(path, table) -> None:
   """Writes a pyarrow Table as Parquet, compressed as `write_table` does."""
   import pyarrow.parquet
-  atomic(path, lambda file: pyarrow.parquet.write_table(table, file, compression="zstd", use_dictionary=False))
+
+  atomic(
+    path,
+    lambda file: pyarrow.parquet.write_table(table, file, compression="zstd", use_dictionary=False),
+  )
 
 
 def read_suite(name: str, folder: pathlib.Path) -> tuple[pathlib.Path, dict]:
@@ -99,7 +140,10 @@ def read_suite(name: str, folder: pathlib.Path) -> tuple[pathlib.Path, dict]:
   if not path.exists():
     path = pathlib.Path(name)
     if path.suffix != ".toml":
-      raise UserError(f"unknown suite {name!r}; choose from: {', '.join(sorted(p.stem for p in folder.glob('*.toml')))}; or give a .toml file")
+      raise UserError(
+        f"unknown suite {name!r}; choose from: "
+        f"{', '.join(sorted(p.stem for p in folder.glob('*.toml')))}; or give a .toml file"
+      )
   try:
     return path, tomllib.loads(path.read_text())
   except OSError as e:
@@ -116,6 +160,7 @@ def read_arrow(path):
   """
   import pyarrow
   import pyarrow.parquet
+
   try:
     return pyarrow.parquet.read_table(path)
   except FileNotFoundError:
@@ -125,10 +170,13 @@ def read_arrow(path):
 
 
 def read_arrays(path) -> dict:
-  """Arrays of an .npz file by name; FileError where there is none or it is broken. Nothing is unpickled."""
+  """Arrays of an .npz file by name; FileError where there is none or it is broken. Nothing is
+  unpickled.
+  """
   import zipfile
   import zlib
   import numpy as np
+
   try:
     with np.load(path, allow_pickle=False) as z:
       return {k: z[k] for k in z.files}
@@ -154,10 +202,12 @@ def read_rows(path) -> list[dict]:
 
 
 def views(folders: tuple[str, ...] = (), results: str = "results") -> dict[str, pathlib.Path]:
-  """Names of result tables, each after its path: results/leaderboard.parquet is leaderboard, results/walker_gear/runs.parquet walker_gear_runs.
+  """Names of result tables, each after its path: results/leaderboard.parquet is leaderboard,
+  results/walker_gear/runs.parquet walker_gear_runs.
 
   Args:
-    folders: more folders, DIR or NAME=DIR; tables in them, at any depth, carry NAME in front, by default the folder's own name.
+    folders: more folders, DIR or NAME=DIR; tables in them, at any depth, carry NAME in front, by
+      default the folder's own name.
     results: the folder whose name is left out; it need not exist.
   Raises:
     UserError where a folder is missing, nothing is found, or two tables would have one name.
@@ -177,34 +227,55 @@ def views(folders: tuple[str, ...] = (), results: str = "results") -> dict[str, 
       if file.resolve() in seen:
         continue
       seen.add(file.resolve())
-      name = "_".join(re.sub(r"\W+", "_", part) for part in (*first, *file.relative_to(at).with_suffix("").parts)).lower()
+      name = "_".join(
+        re.sub(r"\W+", "_", part) for part in (*first, *file.relative_to(at).with_suffix("").parts)
+      ).lower()
       name = "_" + name if name[:1].isdigit() else name  # no SQL word begins with a digit
       if name in found:
-        raise UserError(f"{found[name]} and {file} would both be the view {name}; give one of their folders a name by --in NAME=DIR, "
-                        "or rename a file")
+        raise UserError(
+          f"{found[name]} and {file} would both be the view {name}; give one of their folders "
+          "a name by --in NAME=DIR, "
+          "or rename a file"
+        )
       found[name] = file
   if not found:
-    raise UserError(f"no .parquet file in {' or '.join((results, *folders))}; give a folder, or --in DIR")
+    raise UserError(
+      f"no .parquet file in {' or '.join((results, *folders))}; give a folder, or --in DIR"
+    )
   return found
 
 
 def query(tables, sql: str | None = None) -> tuple[list[str], list[tuple]]:
-  """Runs SQL over result files, which it can read and not change: SELECT statements alone (FROM, DESCRIBE, SHOW and SUMMARIZE are such), no
-  file outside the views, no settings, no extensions.
+  """Runs SQL over result files, which it can read and not change: SELECT statements alone (FROM,
+  DESCRIBE, SHOW and SUMMARIZE are such), no file outside the views, no settings, no extensions.
 
   Args:
-    tables: a folder, every FOLDER/*.parquet is a view of its own name; or views by name, see `views`.
+    tables: a folder, every FOLDER/*.parquet is a view of its own name; or views by name, see
+      `views`.
     sql: None lists the views.
   Returns:
     (names of columns, rows).
   """
   import duckdb
+
   if not isinstance(tables, dict):
-    tables = {file.stem: file for file in sorted(pathlib.Path(tables).glob("*.parquet"))} or _none(tables)
-  names = ", ".join(list(tables)[:20]) + (f" and {len(tables) - 20} more, listed by mjx-cl query without SQL" if len(tables) > 20 else "")
-  # nothing is spilled to disk; without external access no Python variable is taken for a table either
-  with duckdb.connect(config={"temp_directory": "", "autoinstall_known_extensions": False, "autoload_known_extensions": False}) as db:
-    # a path is a pattern to read_parquet; a sign in brackets means itself, so that a folder may be called a[1]
+    tables = {file.stem: file for file in sorted(pathlib.Path(tables).glob("*.parquet"))} or _none(
+      tables
+    )
+  names = ", ".join(list(tables)[:20]) + (
+    f" and {len(tables) - 20} more, listed by mjx-cl query without SQL" if len(tables) > 20 else ""
+  )
+  # nothing is spilled to disk; without external access no Python variable is taken for a table
+  # either
+  with duckdb.connect(
+    config={
+      "temp_directory": "",
+      "autoinstall_known_extensions": False,
+      "autoload_known_extensions": False,
+    }
+  ) as db:
+    # a path is a pattern to read_parquet; a sign in brackets means itself, so that a folder may be
+    # called a[1]
     paths = {name: re.sub(r"([*?\[])", r"[\1]", str(file)) for name, file in tables.items()}
     for name, file in tables.items():
       quoted, at = name.replace('"', '""'), paths[name].replace("'", "''")
@@ -221,7 +292,9 @@ def query(tables, sql: str | None = None) -> tuple[list[str], list[tuple]]:
       statements = duckdb.extract_statements(sql)
       for statement in statements:
         if statement.type != duckdb.StatementType.SELECT:
-          kind = {"MULTI": "PIVOT without a list of values"}.get(statement.type.name, statement.type.name)
+          kind = {"MULTI": "PIVOT without a list of values"}.get(
+            statement.type.name, statement.type.name
+          )
           raise UserError(f"query: results are read-only, and {kind} is no select; views: {names}")
       if not statements:
         raise UserError(f"query: no statement; views: {names}")
@@ -239,27 +312,49 @@ def _none(folder):
 def _describe(db, name: str) -> tuple[str, int, str]:
   quoted = '"' + name.replace('"', '""') + '"'
   rows = db.execute(f"select count(*) from {quoted}").fetchone()[0]
-  return name, rows, ", ".join(c[0] for c in db.execute(f"select * from {quoted} limit 0").description)
+  return (
+    name,
+    rows,
+    ", ".join(c[0] for c in db.execute(f"select * from {quoted} limit 0").description),
+  )
 
 
 def provenance() -> dict:
   """Versions, machine and commit of this process, for config.json; cores: those that it may use."""
   from mjx_cl import workers
+
   versions = {}
   for name in PACKAGES:
     try:
       versions[name] = importlib.metadata.version(name)
     except importlib.metadata.PackageNotFoundError:
       versions[name] = None
-  return {"versions": versions, "python": platform.python_version(), "git_commit": _commit(),
-          "machine": {"cpu": _cpu(), "cores": len(workers.cores()), "system": platform.system(), "arch": platform.machine()}}
+  return {
+    "versions": versions,
+    "python": platform.python_version(),
+    "git_commit": _commit(),
+    "machine": {
+      "cpu": _cpu(),
+      "cores": len(workers.cores()),
+      "system": platform.system(),
+      "arch": platform.machine(),
+    },
+  }
 
 
 @functools.cache
 def _commit() -> str | None:
-  """Commit of the source tree this package runs from, None outside a checkout; asked once, since a later one is not what this process has loaded."""
+  """Commit of the source tree this package runs from, None outside a checkout; asked once, since a
+  later one is not what this process has loaded.
+  """
   try:
-    out = subprocess.run(["git", "rev-parse", "HEAD"], cwd=pathlib.Path(__file__).parent, capture_output=True, text=True, timeout=5)
+    out = subprocess.run(
+      ["git", "rev-parse", "HEAD"],
+      cwd=pathlib.Path(__file__).parent,
+      capture_output=True,
+      text=True,
+      timeout=5,
+    )
   except (OSError, subprocess.SubprocessError):
     return None
   return out.stdout.strip() or None
@@ -276,7 +371,9 @@ def _cpu() -> str:
 
 
 def probe(out) -> None:
-  """Makes the folder `out` and refuses one that cannot be written to, before what goes there is computed. An empty folder that was not there is left."""
+  """Makes the folder `out` and refuses one that cannot be written to, before what goes there is
+  computed. An empty folder that was not there is left.
+  """
   if not str(out):
     raise UserError("--out is a folder; got an empty name")
   out = pathlib.Path(out)
@@ -291,14 +388,36 @@ def probe(out) -> None:
 
 
 # what a run or training leaves beside config.json
-RESULTS = ("trace.parquet", "events.parquet", "runs.parquet", "residuals.parquet", "summary.json", "figure.png", "metrics.parquet", "signals.parquet", "snapshots.parquet", "stop.parquet")
+RESULTS = (
+  "trace.parquet",
+  "events.parquet",
+  "runs.parquet",
+  "residuals.parquet",
+  "summary.json",
+  "figure.png",
+  "metrics.parquet",
+  "signals.parquet",
+  "snapshots.parquet",
+  "stop.parquet",
+)
 
 
 def _foreign(out: pathlib.Path) -> str | None:
-  """What a run or training would replace in a folder without config.json that is not one's own, which was cut off while it began: its name, or None."""
-  left = {"work": r"checkpoints|snapshots|trace(-\d+|\.tmp)\.npz", "work/checkpoints": r"\d.*", "checkpoints": r"\d.*"}
+  """What a run or training would replace in a folder without config.json that is not one's own,
+  which was cut off while it began: its name, or None.
+  """
+  left = {
+    "work": r"checkpoints|snapshots|trace(-\d+|\.tmp)\.npz",
+    "work/checkpoints": r"\d.*",
+    "checkpoints": r"\d.*",
+  }
   strange = [name for name in (*RESULTS, "agent") if (out / name).exists()]
-  strange += [f"{folder}/{path.name}" for folder, known in left.items() for path in sorted((out / folder).glob("*")) if not re.fullmatch(known, path.name)]
+  strange += [
+    f"{folder}/{path.name}"
+    for folder, known in left.items()
+    for path in sorted((out / folder).glob("*"))
+    if not re.fullmatch(known, path.name)
+  ]
   return strange[0] if strange else None
 
 
@@ -321,12 +440,18 @@ def claim_folder(out, resume: bool, overwrite: bool, done_marker: str = "summary
     if resume:
       return "done" if (out / done_marker).exists() else "resume"
     if not overwrite:
-      raise UserError(f"{out} holds another run; give --resume to go on with it, --overwrite to replace it, or another --out")
+      raise UserError(
+        f"{out} holds another run; give --resume to go on with it, --overwrite to replace it, "
+        "or another --out"
+      )
   elif out.is_dir() and any(out.iterdir()):
     if not (resume or overwrite):
       raise UserError(f"{out} is not empty and holds no run of mjx-cl; give another --out")
     if name := _foreign(out):
-      raise UserError(f"{out} holds no config.json of mjx-cl, but {name}, which would be replaced; give another --out")
+      raise UserError(
+        f"{out} holds no config.json of mjx-cl, but {name}, which would be replaced; give "
+        "another --out"
+      )
   try:
     out.mkdir(parents=True, exist_ok=True)
   except OSError as e:

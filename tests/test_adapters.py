@@ -1,4 +1,7 @@
-"""Adapters: gymnasium's checker, its own vectorisation of our single environment and a loop by hand as oracles of the vector one."""
+"""Adapters: gymnasium's checker, its own vectorisation of our single environment and a loop by hand
+as oracles of the vector one.
+"""
+
 import copy
 import sys
 import warnings
@@ -15,7 +18,9 @@ from mjx_cl import adapters
 from mjx_cl.errors import UserError
 
 ROBOTS, STEPS, SEED = 3, 30, 11
-FAULT = dict(fault="gear", target="left_hip", severity=0.5, onset=7)  # inside the first episode of 12 steps
+FAULT = dict(
+  fault="gear", target="left_hip", severity=0.5, onset=7
+)  # inside the first episode of 12 steps
 
 
 def actions_of(steps=STEPS, seed=0):
@@ -23,7 +28,9 @@ def actions_of(steps=STEPS, seed=0):
 
 
 def live(env, actions, seed=SEED):
-  """First observation and the lists obs, reward, terminated, truncated, infos of the steps, stacked where they are arrays."""
+  """First observation and the lists obs, reward, terminated, truncated, infos of the steps, stacked
+  where they are arrays.
+  """
   first, info = env.reset(seed=seed)
   assert info == {}
   *arrays, infos = zip(*(env.step(a) for a in actions))
@@ -45,36 +52,61 @@ def life(vector):
   return live(vector, actions_of())
 
 
-# ---- gymnasium's word ----------------------------------------------------------------------------------------------------------------
+# ---- gymnasium's word ----------------------------------------------------------------------------
+
 
 def test_checker_passes_the_single_environment(single):
   with warnings.catch_warnings(record=True) as caught:
     warnings.simplefilter("always")
     check_env(single)
-  allowed = ("infinity", "not having a spec")  # speeds have no bounds; it is made by a function, not registered
+  allowed = (
+    "infinity",
+    "not having a spec",
+  )  # speeds have no bounds; it is made by a function, not registered
   assert [str(w.message) for w in caught if not any(a in str(w.message) for a in allowed)] == []
 
 
 def test_vector_environment_keeps_the_contract_of_its_base_class(vector, life):
   """gymnasium has no checker for vector environments; this is what its base class writes down."""
-  assert isinstance(vector, gymnasium.vector.VectorEnv) and vector.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
-  assert (vector.num_envs, vector.single_observation_space.shape, vector.single_action_space.shape) == (ROBOTS, (24,), (6,))
-  assert vector.observation_space == gymnasium.vector.utils.batch_space(vector.single_observation_space, ROBOTS)
-  assert vector.action_space == gymnasium.vector.utils.batch_space(vector.single_action_space, ROBOTS)
+  assert (
+    isinstance(vector, gymnasium.vector.VectorEnv)
+    and vector.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
+  )
+  assert (
+    vector.num_envs,
+    vector.single_observation_space.shape,
+    vector.single_action_space.shape,
+  ) == (ROBOTS, (24,), (6,))
+  assert vector.observation_space == gymnasium.vector.utils.batch_space(
+    vector.single_observation_space, ROBOTS
+  )
+  assert vector.action_space == gymnasium.vector.utils.batch_space(
+    vector.single_action_space, ROBOTS
+  )
   first, (obs, reward, terminated, truncated), infos = life
   assert first in vector.observation_space and all(o in vector.observation_space for o in obs)
-  assert reward.shape == terminated.shape == truncated.shape == (STEPS, ROBOTS) and np.issubdtype(reward.dtype, np.floating)
+  assert reward.shape == terminated.shape == truncated.shape == (STEPS, ROBOTS) and np.issubdtype(
+    reward.dtype, np.floating
+  )
   assert terminated.dtype == truncated.dtype == np.bool_
   check_step_determinism(_Unbatched(vector))
-  gymnasium.wrappers.vector.RecordEpisodeStatistics(vector).reset(seed=0)  # wrappers of both kinds take it
+  gymnasium.wrappers.vector.RecordEpisodeStatistics(vector).reset(
+    seed=0
+  )  # wrappers of both kinds take it
   gymnasium.wrappers.vector.FlattenObservation(vector).reset(seed=0)
 
 
 class _Unbatched(gymnasium.Env):
-  """A vector environment as one whose rewards are summed: gymnasium's determinism check then applies to it."""
+  """A vector environment as one whose rewards are summed: gymnasium's determinism check then
+  applies to it.
+  """
 
   def __init__(self, env):
-    self.env, self.observation_space, self.action_space = env, env.observation_space, env.action_space
+    self.env, self.observation_space, self.action_space = (
+      env,
+      env.observation_space,
+      env.action_space,
+    )
 
   def reset(self, *, seed=None, options=None):
     super().reset(seed=seed)
@@ -85,14 +117,19 @@ class _Unbatched(gymnasium.Env):
     return obs, float(reward.sum()), bool(terminated.any()), bool(truncated.any()), info
 
 
-# ---- autoreset -----------------------------------------------------------------------------------------------------------------------
+# ---- autoreset -----------------------------------------------------------------------------------
+
 
 def test_equals_gymnasiums_own_vectorisation(single, life):
-  """SyncVectorEnv over single robots defines next-step autoreset; observations differ by the batch size of one XLA program alone."""
+  """SyncVectorEnv over single robots defines next-step autoreset; observations differ by the batch
+  size of one XLA program alone.
+  """
+
   def another():
     env = copy.copy(single)
     env.robots = copy.copy(single.robots)  # shares the compiled programs alone
     return env
+
   sync = SyncVectorEnv([another] * ROBOTS, autoreset_mode=AutoresetMode.NEXT_STEP)
   first, arrays, infos = live(sync, actions_of())
   ours, our_arrays, our_infos = life
@@ -107,7 +144,9 @@ def test_equals_gymnasiums_own_vectorisation(single, life):
 
 
 def test_equals_a_hand_stepped_environment(short_walker, life):
-  """Robot 1: episodes of 12 steps, then one call that resets; the fault clock counts control steps alone and halves the hip's gear from 7 on."""
+  """Robot 1: episodes of 12 steps, then one call that resets; the fault clock counts control steps
+  alone and halves the hip's gear from 7 on.
+  """
   env, robot = short_walker, 1
   step = jax.jit(env.step)
   key_env, _, key = jax.random.split(jax.random.key(SEED + robot), 3)
@@ -123,7 +162,9 @@ def test_equals_a_hand_stepped_environment(short_walker, life):
     else:
       severity = 0.5 * (t >= FAULT["onset"])
       gear = env.model.mj["actuator_gear"].at[3].multiply(1 - severity)
-      state, out = step(env.model._replace(mj=env.model.mj | {"actuator_gear": gear}), state, action)
+      state, out = step(
+        env.model._replace(mj=env.model.mj | {"actuator_gear": gear}), state, action
+      )
       obs, reward, over = out.final_obs, float(out.reward), bool(out.truncated)
       assert infos[k]["_t"][robot] and infos[k]["t"][robot] == t
       t += 1
@@ -150,7 +191,8 @@ def test_robots_that_end_apart_are_reset_apart(vector):
   np.testing.assert_array_equal(vector.robots.streams.episode, [[0, 1, 0]])
 
 
-# ---- seeds ---------------------------------------------------------------------------------------------------------------------------
+# ---- seeds ---------------------------------------------------------------------------------------
+
 
 def test_seeds_reproduce(vector, life, same):
   again = live(vector, actions_of())
@@ -184,11 +226,13 @@ def test_the_first_reset_takes_the_seed_of_the_maker(vector, life):
   np.testing.assert_array_equal(fresh.reset()[0], life[0])
 
 
-# ---- brax ----------------------------------------------------------------------------------------------------------------------------
+# ---- brax ----------------------------------------------------------------------------------------
+
 
 def test_brax_environment_keeps_its_fault_over_an_autoreset(short_walker):
   """brax's wrappers restart the robot; severity goes by the control steps since the start."""
   from brax.envs.wrappers import training
+
   env = training.wrap(adapters.brax_env(short_walker, **FAULT), episode_length=5)
   state = jax.jit(env.reset)(jax.random.split(jax.random.PRNGKey(0), 2))
   first, step, severity, done, obs = state.obs, jax.jit(env.step), [], [], []
@@ -203,25 +247,49 @@ def test_brax_environment_keeps_its_fault_over_an_autoreset(short_walker):
 
 
 def test_schedules_and_presets_act(short_walker):
-  """A repaired preset, then a cycle by hand: severity (1 - cos(2 pi (t - onset + 1) / period)) / 2 of 0.8."""
+  """A repaired preset, then a cycle by hand: severity (1 - cos(2 pi (t - onset + 1) / period)) / 2
+  of 0.8.
+  """
+
   def severities(**fault):
     robots = adapters.gymnasium_env(short_walker, **fault)
     robots.reset(seed=SEED)
     return [robots.step(np.zeros(6, np.float32))[4]["severity"] for _ in range(10)]
+
   t = np.arange(10)
-  assert severities(fault="walker/gear-half", onset=3, duration=4) == [0.5 * (3 <= k < 7) for k in t]
-  cycle = severities(fault="gear", target="left_hip", severity=0.8, onset=2, schedule="cyclic", period=4)
-  np.testing.assert_allclose(cycle, np.where(t < 2, 0, 0.4 * (1 - np.cos(np.pi / 2 * (t - 1)))), atol=1e-6)  # float32 cosine
+  assert severities(fault="walker/gear-half", onset=3, duration=4) == [
+    0.5 * (3 <= k < 7) for k in t
+  ]
+  cycle = severities(
+    fault="gear", target="left_hip", severity=0.8, onset=2, schedule="cyclic", period=4
+  )
+  np.testing.assert_allclose(
+    cycle, np.where(t < 2, 0, 0.4 * (1 - np.cos(np.pi / 2 * (t - 1)))), atol=1e-6
+  )  # float32 cosine
 
 
-# ---- refusals ------------------------------------------------------------------------------------------------------------------------
+# ---- refusals ------------------------------------------------------------------------------------
 
-@pytest.mark.parametrize("bad, word", [
-    (dict(num_envs=0), "num_envs"), (dict(severity=1.5), "severity"), (dict(onset=-1), "onset"), (dict(duration=0), "duration"),
-    (dict(fault="geer"), "geer"), (dict(fault="gear", target="elbow"), "elbow"), (dict(env="wlker"), "wlker"),
-    (dict(fault="walker/gear-half", severity=0.5), "brings its own severity"), (dict(fault="gear", schedule="sine"), "sine"),
-    (dict(fault="gear", period=0), "period"), (dict(fault="walker/gear-haf"), "gear-half"), (dict(fault="quadruped/rh-velocity-third"), "quadruped"),
-    (dict(fault="walker/gear-half-twice", onset=2**31 - 2), "onset"), (dict(env="car", fault="car/sim-to-real"), "car_real")])
+
+@pytest.mark.parametrize(
+  "bad, word",
+  [
+    (dict(num_envs=0), "num_envs"),
+    (dict(severity=1.5), "severity"),
+    (dict(onset=-1), "onset"),
+    (dict(duration=0), "duration"),
+    (dict(fault="geer"), "geer"),
+    (dict(fault="gear", target="elbow"), "elbow"),
+    (dict(env="wlker"), "wlker"),
+    (dict(fault="walker/gear-half", severity=0.5), "brings its own severity"),
+    (dict(fault="gear", schedule="sine"), "sine"),
+    (dict(fault="gear", period=0), "period"),
+    (dict(fault="walker/gear-haf"), "gear-half"),
+    (dict(fault="quadruped/rh-velocity-third"), "quadruped"),
+    (dict(fault="walker/gear-half-twice", onset=2**31 - 2), "onset"),
+    (dict(env="car", fault="car/sim-to-real"), "car_real"),
+  ],
+)
 def test_bad_arguments_are_named(short_walker, bad, word):
   with pytest.raises(UserError, match=word):
     adapters.gymnasium_vector(**{"env": short_walker, "num_envs": 2} | bad)
@@ -241,7 +309,14 @@ def test_wrong_calls_are_refused(short_walker, vector):
     vector.reset(options={"height": 2})
 
 
-@pytest.mark.parametrize("package, call", [("gymnasium", adapters.gymnasium_vector), ("gymnasium", adapters.gymnasium_env), ("brax", adapters.brax_env)])
+@pytest.mark.parametrize(
+  "package, call",
+  [
+    ("gymnasium", adapters.gymnasium_vector),
+    ("gymnasium", adapters.gymnasium_env),
+    ("brax", adapters.brax_env),
+  ],
+)
 def test_a_missing_package_is_one_line(short_walker, monkeypatch, package, call):
   for name in [n for n in sys.modules if n.split(".")[0] == package] + [package, "brax.envs"]:
     monkeypatch.setitem(sys.modules, name, None)

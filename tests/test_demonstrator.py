@@ -1,4 +1,7 @@
-"""The demonstrator: our plain policy equals brax's network, files round trip, the adapter keeps brax's contract."""
+"""The demonstrator: our plain policy equals brax's network, files round trip, the adapter keeps
+brax's contract.
+"""
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,10 +14,16 @@ from mjx_cl.errors import FileError
 
 
 def brax_policy(obs_size, act_size):
-  """A random brax PPO network with a normaliser that is not the identity, and its deterministic inference."""
-  net = networks.make_ppo_networks(obs_size, act_size, running_statistics.normalize, policy_hidden_layer_sizes=(16, 16))
+  """A random brax PPO network with a normaliser that is not the identity, and its deterministic
+  inference.
+  """
+  net = networks.make_ppo_networks(
+    obs_size, act_size, running_statistics.normalize, policy_hidden_layer_sizes=(16, 16)
+  )
   normalizer = running_statistics.init_state(specs.Array((obs_size,), jnp.float32))
-  normalizer = running_statistics.update(normalizer, 3.0 + 2.0 * jax.random.normal(jax.random.key(1), (50, obs_size)))
+  normalizer = running_statistics.update(
+    normalizer, 3.0 + 2.0 * jax.random.normal(jax.random.key(1), (50, obs_size))
+  )
   params = (normalizer, net.policy_network.init(jax.random.key(2)))
   return params, networks.make_inference_fn(net)(params, deterministic=True)
 
@@ -25,7 +34,9 @@ def test_policy_equals_brax():
   ours = demonstrator._to_policy(params)(obs)
   theirs, _ = infer(obs, jax.random.key(4))
   assert np.ptp(np.asarray(theirs)) > 0.01  # a network that says something
-  np.testing.assert_allclose(ours, theirs, atol=1e-6)  # the same float32 products, grouped otherwise
+  np.testing.assert_allclose(
+    ours, theirs, atol=1e-6
+  )  # the same float32 products, grouped otherwise
 
 
 def test_round_trip(tmp_path):
@@ -58,19 +69,41 @@ def test_shaped_reward_is_the_demonstrators_alone():
   shaped = demonstrator.Shaped(env, own["weights"], own["bonus"])
   state, _ = env.init(env.model, jax.random.key(0))
   action = jnp.linspace(-1, 1, 12)
-  terms = dict(zip(env.reward_terms, np.asarray(shaped.model.task["reward_weights"] / jnp.where(env.model.task["reward_weights"] == 0, 1, env.model.task["reward_weights"]))))
+  terms = dict(
+    zip(
+      env.reward_terms,
+      np.asarray(
+        shaped.model.task["reward_weights"]
+        / jnp.where(env.model.task["reward_weights"] == 0, 1, env.model.task["reward_weights"])
+      ),
+    )
+  )
   assert {k: round(float(v), 3) for k, v in terms.items() if v not in (0, 1)} == own["weights"]
-  (_, plain), (_, other) = env.step(shaped.model, state, action), shaped.step(shaped.model, state, action)
+  (_, plain), (_, other) = (
+    env.step(shaped.model, state, action),
+    shaped.step(shaped.model, state, action),
+  )
   np.testing.assert_allclose(other.reward, plain.reward + own["bonus"], rtol=1e-6)
   np.testing.assert_array_equal(other.final_obs, plain.final_obs)
   assert shaped.spec is env.spec and demonstrator.brax_env(shaped).observation_size == 48
 
 
 def test_ppo_trains_the_walker_through_the_adapter(short_walker, tmp_path):
-  """A short run of brax's PPO: every layer of the policy moves, its statistics are those of what the robots saw."""
-  small = dict(num_envs=8, unroll_length=6, num_minibatches=2, batch_size=8, num_updates_per_batch=2, num_eval_envs=4)
+  """A short run of brax's PPO: every layer of the policy moves, its statistics are those of what
+  the robots saw.
+  """
+  small = dict(
+    num_envs=8,
+    unroll_length=6,
+    num_minibatches=2,
+    batch_size=8,
+    num_updates_per_batch=2,
+    num_eval_envs=4,
+  )
   rows = demonstrator.train(short_walker, tmp_path, steps=384, evals=2, **small)
-  assert [r["step"] for r in rows] == [0, 384] and all(0 <= r["return"] <= 12 for r in rows)  # episodes of 12 steps, at most 1 a step
+  assert [r["step"] for r in rows] == [0, 384] and all(
+    0 <= r["return"] <= 12 for r in rows
+  )  # episodes of 12 steps, at most 1 a step
   first, last = (demonstrator.load(p) for p in sorted(tmp_path.glob("policy_*.npz")))
   assert all(np.abs(a - b).max() > 1e-4 for (a, _), (b, _) in zip(first.layers, last.layers))
   assert not np.asarray(first.mean).any() and np.asarray(last.mean).any()

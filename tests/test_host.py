@@ -1,4 +1,5 @@
 """Detectors in plain Python: river's as they are, one's own, and what a mistake in them prints."""
+
 import sys
 
 import jax
@@ -13,6 +14,7 @@ from mjx_cl.monitor import unknown
 
 class Above:
   """Fires above a level; the score is the running mean."""
+
   def __init__(self, level=3.0):
     self.level, self.seen, self.score = level, [], None
 
@@ -34,6 +36,7 @@ class Number:
 
 class Breaks:
   """Fails at its third sample, in two lines."""
+
   n = 0
 
   def update(self, x):
@@ -45,6 +48,7 @@ class Breaks:
 
 class Shared:
   """What one stream saw is known to the next."""
+
   seen = []
 
   def update(self, x):
@@ -74,6 +78,7 @@ def streams(steps=200, n=3, seed=0):
 def river_loop(x, **settings):
   """Steps at which river says that the stream has changed."""
   from river.drift import PageHinkley
+
   detector, steps = PageHinkley(**settings), []
   for t, v in enumerate(x):
     detector.update(v)
@@ -82,12 +87,16 @@ def river_loop(x, **settings):
   return steps
 
 
-# ---- examples of the documentation -----------------------------------------------------------------------------------------------------
+# ---- examples of the documentation ---------------------------------------------------------------
+
 
 def test_example_river():
   """A river detector over recorded residuals."""
   from mjx_cl.detectors import host
-  page_hinkley = host.load("river.drift:PageHinkley", {"delta": 0.5, "threshold": 15.0, "mode": "up"})
+
+  page_hinkley = host.load(
+    "river.drift:PageHinkley", {"delta": 0.5, "threshold": 15.0, "mode": "up"}
+  )
   xs = np.random.default_rng(0).normal(size=(1000, 2))
   xs[600:, 1] += 2.0  # the second robot changes
   fired, score = host.run_host(page_hinkley.factory, xs)
@@ -108,6 +117,7 @@ class Runs:
     return self.score == self.patience
 """)
   from mjx_cl.detectors import host
+
   runs = host.load(f"{tmp_path}/mine.py:Runs", {"patience": 2})
   xs = np.array([[0.0], [3.0], [3.0], [3.0], [np.nan], [0.0]])
   host.check_causal(runs.factory, xs)
@@ -116,11 +126,20 @@ class Runs:
   assert score[[0, 1, 2, 3, 5], 0].tolist() == [0, 1, 2, 3, 0] and np.isnan(score[4, 0])
 
 
-# ---- runs ------------------------------------------------------------------------------------------------------------------------------
+# ---- runs ----------------------------------------------------------------------------------------
 
-@pytest.mark.parametrize("settings", [{}, {"threshold": 5.0, "delta": 0.1, "mode": "up"}, {"min_instances": 5, "threshold": 3.0, "mode": "down"}])
+
+@pytest.mark.parametrize(
+  "settings",
+  [
+    {},
+    {"threshold": 5.0, "delta": 0.1, "mode": "up"},
+    {"min_instances": 5, "threshold": 3.0, "mode": "down"},
+  ],
+)
 def test_river_alarms_where_river_does(settings):
   from river.drift import PageHinkley
+
   xs = streams(600)
   xs[300:, 1] += 3.0
   xs[200:400, 2] -= 2.0
@@ -137,7 +156,7 @@ def test_samples_that_are_no_number_are_skipped():
   for s in range(2):
     good = np.isfinite(xs[:, s])
     assert not fired[~good, s].any() and np.isnan(score[~good, s]).all()
-    cut = host.run_host(Above, xs[good, s:s + 1])
+    cut = host.run_host(Above, xs[good, s : s + 1])
     np.testing.assert_array_equal(fired[good, s], cut[0][:, 0])
     np.testing.assert_array_equal(score[good, s], cut[1][:, 0])
 
@@ -146,7 +165,9 @@ def test_an_object_for_each_stream_and_its_score():
   xs = streams(50)
   fired, score = host.run_host(lambda: Above(1.0), xs)
   np.testing.assert_array_equal(fired, xs > 1.0)
-  np.testing.assert_allclose(score, np.cumsum(xs, 0) / np.arange(1, 51)[:, None], rtol=1e-12, atol=1e-12)  # float64, another order of sums
+  np.testing.assert_allclose(
+    score, np.cumsum(xs, 0) / np.arange(1, 51)[:, None], rtol=1e-12, atol=1e-12
+  )  # float64, another order of sums
   only = Above()
   with pytest.raises(UserError, match="same object twice"):
     host.run_host(lambda: only, xs)
@@ -161,12 +182,22 @@ def test_a_score_that_is_a_method_or_none_is_unknown():
 
     def update(self, x):
       return False
+
   assert np.isnan(host.run_host(Method, streams(5))[1]).all()
 
 
-@pytest.mark.parametrize("cls, words", [
-    (Breaks, ["Breaks", "step 3 of stream 1", "ZeroDivisionError: first second"]),  # one sample of stream 1 is missing
-    (Silent, ["Silent", "step 0", "drift_detected"]), (Number, ["Number", "step 0", "int"]), (NoUpdate, ["NoUpdate", "update"])])
+@pytest.mark.parametrize(
+  "cls, words",
+  [
+    (
+      Breaks,
+      ["Breaks", "step 3 of stream 1", "ZeroDivisionError: first second"],
+    ),  # one sample of stream 1 is missing
+    (Silent, ["Silent", "step 0", "drift_detected"]),
+    (Number, ["Number", "step 0", "int"]),
+    (NoUpdate, ["NoUpdate", "update"]),
+  ],
+)
 def test_a_failing_class_is_one_line(cls, words):
   xs = streams(10, 2)
   xs[2:, 0], xs[1, 1] = np.nan, np.nan
@@ -180,10 +211,12 @@ def test_streams_have_two_axes():
     host.run_host(Above, np.zeros(5))
 
 
-# ---- causality -------------------------------------------------------------------------------------------------------------------------
+# ---- causality -----------------------------------------------------------------------------------
+
 
 def test_causality_of_a_sound_class():
   from river.drift import ADWIN, PageHinkley
+
   xs = streams(300)
   xs[150:] += 2.0
   xs[40, 1] = np.nan
@@ -212,31 +245,48 @@ def test_causality_finds_a_look_ahead():
     def update(self, x):
       self.t += 1
       return bool(x == self.all.max())
+
   honest = host.run_host
   with pytest.MonkeyPatch.context() as patch:  # each run opens what it is run on
+
     def run(factory, part, host_name=None):
       record["xs"] = part[:, 0]
       return honest(factory, part, host_name)
+
     patch.setattr(host, "run_host", run)
     with pytest.raises(UserError, match="at step 1 of stream 0.*ends after 2 samples"):
       host.check_causal(Ahead, xs, cuts=(2,))
 
 
-# ---- loading ---------------------------------------------------------------------------------------------------------------------------
+# ---- loading -------------------------------------------------------------------------------------
+
 
 def test_load_names_and_settings(tmp_path):
   (tmp_path / "a").mkdir()
-  (tmp_path / "mine.py").write_text("class D:\n  def __init__(self, k=1): self.score = k\n  def update(self, x): return False\n")
-  (tmp_path / "a" / "mine.py").write_text("class D:\n  score = 7\n  def update(self, x): return True\n")
+  (tmp_path / "mine.py").write_text(
+    "class D:\n  def __init__(self, k=1): self.score = k\n  def update(self, x): return False\n"
+  )
+  (tmp_path / "a" / "mine.py").write_text(
+    "class D:\n  score = 7\n  def update(self, x): return True\n"
+  )
   score = lambda h: host.run_host(h.factory, np.zeros((1, 1)))[1][0, 0]
-  first, second = host.load(f"{tmp_path}/mine.py:D", {"k": 3}, host_name="mine"), host.load(f"{tmp_path}/a/mine.py:D")
-  assert (first.host_name, second.host_name, first.channel, first.log) == ("mine", "D", "opr", False)
+  first, second = (
+    host.load(f"{tmp_path}/mine.py:D", {"k": 3}, host_name="mine"),
+    host.load(f"{tmp_path}/a/mine.py:D"),
+  )
+  assert (first.host_name, second.host_name, first.channel, first.log) == (
+    "mine",
+    "D",
+    "opr",
+    False,
+  )
   assert (score(first), score(second)) == (3, 7)  # two files of one name
   assert host.load("river.drift:PageHinkley").host_name == "PageHinkley"
 
 
 class Leaves:
   """Ends the program at its third sample."""
+
   n = 0
 
   def update(self, x):
@@ -251,20 +301,41 @@ def test_a_class_that_ends_the_program_is_one_line():
     host.run_host(Leaves, streams(10, 1))
 
 
-FILES = {"syntax.py": "class D(:\n", "raises.py": "raise RuntimeError('first\\nsecond')\n", "imports.py": "import no_such_module_here\n",
-         "leaves.py": "import sys\nsys.exit()\n", "unbuilt.py": "class D:\n  def __init__(self): raise SystemExit(3)\n",
-         "plain.py": "class D:\n  pass\nclass Needs:\n  def __init__(self, k): pass\n  def update(self, x): return False\nx = 3\n"}
+FILES = {
+  "syntax.py": "class D(:\n",
+  "raises.py": "raise RuntimeError('first\\nsecond')\n",
+  "imports.py": "import no_such_module_here\n",
+  "leaves.py": "import sys\nsys.exit()\n",
+  "unbuilt.py": "class D:\n  def __init__(self): raise SystemExit(3)\n",
+  "plain.py": (
+    "class D:\n  pass\nclass Needs:\n  def __init__(self, k): pass\n  def update(self, x): "
+    "return False\nx = 3\n"
+  ),
+}
 
 
-@pytest.mark.parametrize("source, settings, code, words", [
-    ("PageHinkley", {}, 2, ["module:Name"]), (":X", {}, 2, ["module:Name"]), ("river.drift:", {}, 2, ["module:Name"]),
-    ("no_such_module_here:X", {}, 2, ["no_such_module_here", "path/to/file.py"]), ("river.no_part:X", {}, 2, ["river.no_part"]),
-    ("river.drift:Nothing", {}, 2, ["Nothing", "river.drift"]), ("river.drift:PageHinkley", {"thresh": 1}, 2, ["thresh", "cannot be built"]),
-    ("{}/none.py:D", {}, 1, ["none.py"]), ("{}/syntax.py:D", {}, 2, ["SyntaxError"]), ("{}/raises.py:D", {}, 2, ["RuntimeError: first second"]),
-    ("{}/leaves.py:D", {}, 2, ["importing", "SystemExit"]), ("leaves_mjx:D", {}, 2, ["importing leaves_mjx failed", "SystemExit"]),
+@pytest.mark.parametrize(
+  "source, settings, code, words",
+  [
+    ("PageHinkley", {}, 2, ["module:Name"]),
+    (":X", {}, 2, ["module:Name"]),
+    ("river.drift:", {}, 2, ["module:Name"]),
+    ("no_such_module_here:X", {}, 2, ["no_such_module_here", "path/to/file.py"]),
+    ("river.no_part:X", {}, 2, ["river.no_part"]),
+    ("river.drift:Nothing", {}, 2, ["Nothing", "river.drift"]),
+    ("river.drift:PageHinkley", {"thresh": 1}, 2, ["thresh", "cannot be built"]),
+    ("{}/none.py:D", {}, 1, ["none.py"]),
+    ("{}/syntax.py:D", {}, 2, ["SyntaxError"]),
+    ("{}/raises.py:D", {}, 2, ["RuntimeError: first second"]),
+    ("{}/leaves.py:D", {}, 2, ["importing", "SystemExit"]),
+    ("leaves_mjx:D", {}, 2, ["importing leaves_mjx failed", "SystemExit"]),
     ("{}/unbuilt.py:D", {}, 2, ["D cannot be built", "SystemExit: 3"]),
-    ("{}/imports.py:D", {}, 2, ["no_such_module_here"]), ("{}/plain.py:D", {}, 2, ["D has no method update"]),
-    ("{}/plain.py:x", {}, 2, ["nothing of the name 'x'"]), ("{}/plain.py:Needs", {}, 2, ["Needs cannot be built", "'k'"])])
+    ("{}/imports.py:D", {}, 2, ["no_such_module_here"]),
+    ("{}/plain.py:D", {}, 2, ["D has no method update"]),
+    ("{}/plain.py:x", {}, 2, ["nothing of the name 'x'"]),
+    ("{}/plain.py:Needs", {}, 2, ["Needs cannot be built", "'k'"]),
+  ],
+)
 def test_what_cannot_be_loaded_is_one_line(tmp_path, monkeypatch, source, settings, code, words):
   for name, text in FILES.items():
     (tmp_path / name).write_text(text)
@@ -281,22 +352,37 @@ def test_an_unknown_channel_is_refused():
     host.load("river.drift:PageHinkley", channel="oppr")
 
 
-# ---- recorded residuals ----------------------------------------------------------------------------------------------------------------
+# ---- recorded residuals --------------------------------------------------------------------------
 
-@pytest.mark.parametrize("channel, log", [("opr", True), ("opr", False), ("reward", False), ("group_2", True)])
+
+@pytest.mark.parametrize(
+  "channel, log", [("opr", True), ("opr", False), ("reward", False), ("group_2", True)]
+)
 def test_watch_masks_as_other_detectors_do(channel, log):
   """Rows that are invalid are skipped, but the reward, which is known all the same."""
   rng = np.random.default_rng(0)
   shape = (40, 3)
   values = rng.uniform(0.5, 2.0, shape).astype(np.float32)
   valid = rng.random(shape) < 0.7
-  residual = unknown(shape, 4)._replace(valid=jnp.asarray(valid), opr=jnp.asarray(values), reward=jnp.asarray(values),
-                                        groups=jnp.broadcast_to(values[..., None], shape + (8,)))
+  residual = unknown(shape, 4)._replace(
+    valid=jnp.asarray(valid),
+    opr=jnp.asarray(values),
+    reward=jnp.asarray(values),
+    groups=jnp.broadcast_to(values[..., None], shape + (8,)),
+  )
   residual = residual._replace(reward=residual.reward.at[5].set(jnp.nan))
-  used = np.where(np.arange(40)[:, None] == 5, False, True) & np.ones(shape, bool) if channel == "reward" else valid
+  used = (
+    np.where(np.arange(40)[:, None] == 5, False, True) & np.ones(shape, bool)
+    if channel == "reward"
+    else valid
+  )
   want = np.where(used, np.log(values) if log else values, np.nan)
   one = host.HostDetector(Above, "Above", channel, log)
-  np.testing.assert_allclose(host.samples(one, residual), want, rtol=1e-6, atol=1e-7)  # float32 logarithm
+  np.testing.assert_allclose(
+    host.samples(one, residual), want, rtol=1e-6, atol=1e-7
+  )  # float32 logarithm
   fired, score = host.watch(one, residual)
   assert fired.shape == shape and np.array_equal(np.isfinite(score), used)
-  np.testing.assert_array_equal(fired, host.run_host(Above, host.samples(one, jax.tree.map(np.asarray, residual)))[0])
+  np.testing.assert_array_equal(
+    fired, host.run_host(Above, host.samples(one, jax.tree.map(np.asarray, residual)))[0]
+  )

@@ -1,4 +1,7 @@
-"""Memory that is stated: bytes against what is really allocated, and what would not fit is refused with the number that would."""
+"""Memory that is stated: bytes against what is really allocated, and what would not fit is refused
+with the number that would.
+"""
+
 import re
 
 import jax
@@ -35,8 +38,13 @@ def test_need_is_what_is_allocated():
 
 def test_the_number_that_is_named_fits_and_the_next_does_not(monkeypatch):
   monkeypatch.setattr(memory, "free", lambda: int((memory.PROCESS + 200 * 2**20) / memory.MARGIN))
-  ask = lambda capacity: memory.check("size1m", OBS, ACT, 8 * capacity, 3, ("capacity", lambda n: 8 * n))
-  with pytest.raises(UserError, match="3 seeds of size1m with 8,000,000 records each need 42.3 GiB a device, 1.9 GiB may be used") as e:
+  ask = lambda capacity: memory.check(
+    "size1m", OBS, ACT, 8 * capacity, 3, ("capacity", lambda n: 8 * n)
+  )
+  with pytest.raises(
+    UserError,
+    match="3 seeds of size1m with 8,000,000 records each need 42.3 GiB a device, 1.9 GiB may be used",
+  ) as e:
     ask(1_000_000)
   fits = int(re.search(r"capacity=([\d,]+) would fit", str(e.value))[1].replace(",", ""))
   ask(fits)
@@ -58,7 +66,11 @@ def test_an_accelerator_holds_weights_and_replays_alone(monkeypatch):
   assert runtime.seeds_by() == "vmap"
   need = memory.need("size1m", OBS, ACT, 1000)
   for short in (0, 2):  # all seeds are at work at once: twice the weights of each
-    monkeypatch.setattr(memory, "free", lambda: int((3 * (2 * need.weights + need.replay) - short) / memory.MARGIN) + 1)
+    monkeypatch.setattr(
+      memory,
+      "free",
+      lambda: int((3 * (2 * need.weights + need.replay) - short) / memory.MARGIN) + 1,
+    )
     ask = lambda: memory.check("size1m", OBS, ACT, 1000, 3, ("capacity", lambda n: n))
     if short:
       with pytest.raises(UserError):
@@ -76,7 +88,9 @@ def test_an_accelerator_holds_weights_and_replays_alone(monkeypatch):
 
 def test_devices_share_the_seeds(monkeypatch):
   need = memory.need("size1m", OBS, ACT, 1000)
-  monkeypatch.setattr(memory, "free", lambda: int(memory.resident(need.total(2)) / memory.MARGIN) + 2)
+  monkeypatch.setattr(
+    memory, "free", lambda: int(memory.resident(need.total(2)) / memory.MARGIN) + 2
+  )
   memory.check("size1m", OBS, ACT, 1000, 4, ("capacity", lambda n: n), shards=2)
   with pytest.raises(UserError):
     memory.check("size1m", OBS, ACT, 1000, 4, ("capacity", lambda n: n))
@@ -84,6 +98,7 @@ def test_devices_share_the_seeds(monkeypatch):
 
 def test_trainer_and_runner_refuse_before_they_allocate(monkeypatch, short_walker, tmp_path):
   from mjx_cl import run, train
+
   monkeypatch.setattr(memory, "free", lambda: int((memory.PROCESS + 10 * 2**20) / memory.MARGIN))
   with pytest.raises(UserError, match="capacity=[0-9,]+ would fit"):
     train.Trainer(short_walker, PRESETS["tiny"].dreamer, TrainConfig(capacity=10**7), tmp_path)
@@ -99,17 +114,36 @@ def test_a_process_takes_more_than_its_replays(need, measured):
 
 
 GIB = 2**30
-V2 = {"memory.max": 8 * GIB, "memory.current": 5 * GIB, "memory.stat": f"anon {GIB}\nfile {4 * GIB}\nactive_file {GIB}\ninactive_file {3 * GIB}\n"}
-V1 = {"memory.limit_in_bytes": 8 * GIB, "memory.usage_in_bytes": 5 * GIB, "memory.stat": f"inactive_file {GIB}\ntotal_inactive_file {3 * GIB}\n"}
+V2 = {
+  "memory.max": 8 * GIB,
+  "memory.current": 5 * GIB,
+  "memory.stat": f"anon {GIB}\nfile {4 * GIB}\nactive_file {GIB}\ninactive_file {3 * GIB}\n",
+}
+V1 = {
+  "memory.limit_in_bytes": 8 * GIB,
+  "memory.usage_in_bytes": 5 * GIB,
+  "memory.stat": f"inactive_file {GIB}\ntotal_inactive_file {3 * GIB}\n",
+}
 
 
-@pytest.mark.parametrize("mount, path, sign, files, left", [
-    ("", "", "0::/", V2, 6 * GIB), ("memory", "", "9:memory:/", V1, 6 * GIB), ("", "job/7", "0::/job/7", V2, 6 * GIB), ("memory", "job/7", "4:memory:/job/7", V1, 6 * GIB),
+@pytest.mark.parametrize(
+  "mount, path, sign, files, left",
+  [
+    ("", "", "0::/", V2, 6 * GIB),
+    ("memory", "", "9:memory:/", V1, 6 * GIB),
+    ("", "job/7", "0::/job/7", V2, 6 * GIB),
+    ("memory", "job/7", "4:memory:/job/7", V1, 6 * GIB),
     ("", "", "0::/elsewhere", V2, 6 * GIB),  # as a container without a namespace of its own sees it
-    ("", "", "0::/", V2 | {"memory.max": "max"}, None), ("memory", "", "9:memory:/", V1 | {"memory.limit_in_bytes": 9223372036854771712}, None),
-    ("", "", "0::/", V2 | {"memory.stat": ""}, 3 * GIB), ("memory", "", "9:memory:/", V1 | {"memory.stat": f"inactive_file {GIB}\n"}, 4 * GIB),
-    ("", "", "0::/", V2 | {"memory.current": 9 * GIB, "memory.stat": ""}, 0), ("", "", "0::/", {"memory.max": "garbage", "memory.current": ""}, None),
-    ("", "", "", {}, None), ("", "", "", V2, 6 * GIB)])
+    ("", "", "0::/", V2 | {"memory.max": "max"}, None),
+    ("memory", "", "9:memory:/", V1 | {"memory.limit_in_bytes": 9223372036854771712}, None),
+    ("", "", "0::/", V2 | {"memory.stat": ""}, 3 * GIB),
+    ("memory", "", "9:memory:/", V1 | {"memory.stat": f"inactive_file {GIB}\n"}, 4 * GIB),
+    ("", "", "0::/", V2 | {"memory.current": 9 * GIB, "memory.stat": ""}, 0),
+    ("", "", "0::/", {"memory.max": "garbage", "memory.current": ""}, None),
+    ("", "", "", {}, None),
+    ("", "", "", V2, 6 * GIB),
+  ],
+)
 def test_a_containers_limit(tmp_path, mount, path, sign, files, left):
   """Limit less what is used, the page cache that can be reclaimed apart."""
   folder = tmp_path / "cgroup" / mount / path
@@ -131,6 +165,7 @@ def test_a_limit_around_the_group_binds_too(tmp_path):
 
 def test_what_is_free_is_the_less_of_machine_and_container(monkeypatch):
   import psutil
+
   monkeypatch.setattr(psutil, "virtual_memory", lambda: type("Memory", (), {"available": 10 * GIB}))
   for limited, least in ((None, 10), (3 * GIB, 3), (20 * GIB, 10)):
     monkeypatch.setattr(memory, "container", lambda: limited)
@@ -151,4 +186,8 @@ def test_what_is_held_already_need_not_be_free(monkeypatch):
 
 def test_table_has_every_size():
   table = memory.table()
-  assert list(table) == list(memory.SIZES) and "640,867 parameters" in table["size1m"] and "1,208 bytes a record" in table["size1m"]
+  assert (
+    list(table) == list(memory.SIZES)
+    and "640,867 parameters" in table["size1m"]
+    and "1,208 bytes a record" in table["size1m"]
+  )

@@ -1,4 +1,7 @@
-"""Named faults: they exist on their robots, say the figures that they claim, and reach `run` as their faults, targets and clocks."""
+"""Named faults: they exist on their robots, say the figures that they claim, and reach `run` as
+their faults, targets and clocks.
+"""
+
 import json
 import pathlib
 
@@ -27,15 +30,26 @@ def test_every_preset_can_be_built_on_its_robot(name, robots):
       made, plan, targets = faults.build(preset.changes, env, onset=7)
       assert [f.name for f in made] == [c.fault for c in preset.changes]
       np.testing.assert_allclose(plan.severity, [c.severity for c in preset.changes], rtol=1e-6)
-      assert (np.asarray(plan.onset) == [7 + c.after for c in preset.changes]).all() and (np.asarray(plan.severity) <= 1).all()
-      assert [(-1 if c.target is None else f.targets.index(c.target)) for f, c in zip(made, preset.changes)] == np.asarray(targets).tolist()
+      assert (np.asarray(plan.onset) == [7 + c.after for c in preset.changes]).all() and (
+        np.asarray(plan.severity) <= 1
+      ).all()
+      assert [
+        (-1 if c.target is None else f.targets.index(c.target))
+        for f, c in zip(made, preset.changes)
+      ] == np.asarray(targets).tolist()
 
 
 def after(env, name, leaf):
   """Value of a leaf under the preset, in force."""
   made, plan, targets = faults.build(PRESETS[name].changes, env)
   injection = faults.begin(made, jax.random.key(0), plan, targets)
-  ports = faults.drive(made, injection, 5, jax.random.key(0), faults.Ports(env.model, ctrl=np.zeros(len(env.spec.act), np.float32)))[1]
+  ports = faults.drive(
+    made,
+    injection,
+    5,
+    jax.random.key(0),
+    faults.Ports(env.model, ctrl=np.zeros(len(env.spec.act), np.float32)),
+  )[1]
   kind, key = leaf.split(".")
   return np.asarray(getattr(ports.model, kind)[key])
 
@@ -54,21 +68,29 @@ def test_the_papers_presets_have_the_papers_figures(robots):
 
 
 def test_the_socks_cost_what_the_papers_cost():
-  """Of all coefficients that were tried on tuning seeds the preset's comes nearest to a loss of 20 %."""
+  """Of all coefficients that were tried on tuning seeds the preset's comes nearest to a loss of 20
+  %.
+  """
   found = json.loads((pathlib.Path(__file__).parent.parent / "results" / "socks.json").read_text())
   assert min(found["seeds"]) >= 100
   assert min(found["rows"], key=lambda row: abs(row["lost"] - 0.2))["grip"] == SOCKS_GRIP
 
 
 def test_a_preset_that_means_something_else_by_now_is_refused(tmp_path):
-  """A run is what its preset stood for when it began; one from before that was written down is let pass."""
+  """A run is what its preset stood for when it began; one from before that was written down is let
+  pass.
+  """
   wanted = run.identity(RunConfig("car_real", fault="car/socks"))
   (tmp_path / "config.json").write_text(json.dumps(wanted))
   run.check_same(tmp_path, wanted)
-  (tmp_path / "config.json").write_text(json.dumps(wanted | {"changes": [wanted["changes"][0] | {"severity": 0.567}]}))
+  (tmp_path / "config.json").write_text(
+    json.dumps(wanted | {"changes": [wanted["changes"][0] | {"severity": 0.567}]})
+  )
   with pytest.raises(UserError, match="begun with another changes"):
     run.check_same(tmp_path, wanted)
-  (tmp_path / "config.json").write_text(json.dumps({k: v for k, v in wanted.items() if k != "changes"}))
+  (tmp_path / "config.json").write_text(
+    json.dumps({k: v for k, v in wanted.items() if k != "changes"})
+  )
   run.check_same(tmp_path, wanted)
 
 
@@ -81,13 +103,30 @@ def test_delays_of_the_levels_are_3_6_9_steps():
 
 def test_run_takes_a_preset_and_refuses_what_contradicts_it():
   c = RunConfig("walker", fault="any/all-easy", duration=50)
-  assert [x.fault for x in config.changes(c)] == ["delay", "command_delay", "noise", "command_noise", "dropout_burst", "freeze_burst"]
+  assert [x.fault for x in config.changes(c)] == [
+    "delay",
+    "command_delay",
+    "noise",
+    "command_noise",
+    "dropout_burst",
+    "freeze_burst",
+  ]
   assert all(x.duration == 50 for x in config.changes(c))
   assert config.changes(RunConfig("walker"))[0] == Change("gear", None, 0.5)
-  assert config.changes(RunConfig("walker", severity=0.25, schedule="ramp", period=9))[0] == Change("gear", None, 0.25, schedule="ramp", period=9)
-  for kw, words in (({"fault": "any/all-easy", "severity": 0.3}, "brings its own severity"), ({"fault": "walker/nothing"}, "walker/gear-half"),
-                    ({"fault": "car/socks"}, "of robot 'car_real'"), ({"schedule": "now"}, "abrupt, ramp"), ({"fault": "any/all-easy", "schedule": "ramp"}, "brings its own schedule"),
-                    ({"duration": 3_000_000_000}, "duration must be a whole"), ({"period": 2**31}, "period must be a whole"), ({"period": 0}, "period"), ({"share": 1.5}, "share")):
+  assert config.changes(RunConfig("walker", severity=0.25, schedule="ramp", period=9))[0] == Change(
+    "gear", None, 0.25, schedule="ramp", period=9
+  )
+  for kw, words in (
+    ({"fault": "any/all-easy", "severity": 0.3}, "brings its own severity"),
+    ({"fault": "walker/nothing"}, "walker/gear-half"),
+    ({"fault": "car/socks"}, "of robot 'car_real'"),
+    ({"schedule": "now"}, "abrupt, ramp"),
+    ({"fault": "any/all-easy", "schedule": "ramp"}, "brings its own schedule"),
+    ({"duration": 3_000_000_000}, "duration must be a whole"),
+    ({"period": 2**31}, "period must be a whole"),
+    ({"period": 0}, "period"),
+    ({"share": 1.5}, "share"),
+  ):
     with pytest.raises(UserError, match=words):
       RunConfig("walker", **kw)
 
@@ -105,21 +144,34 @@ def test_a_robot_of_ones_own_takes_presets_of_shipped_ones():
         fault_presets.find(name, "mine.py:Mine")
     else:
       assert fault_presets.find(name, "mine.py:Mine") is preset
-  assert fault_presets.resolve("mine.py:Mine", "walker/gear-half") == fault_presets.resolve("walker", "walker/gear-half")
-  with pytest.raises(UserError, match="unknown preset 'walker/fly'; choose from: (?!.*car/sim-to-real).*walker/gear-half"):
+  assert fault_presets.resolve("mine.py:Mine", "walker/gear-half") == fault_presets.resolve(
+    "walker", "walker/gear-half"
+  )
+  with pytest.raises(
+    UserError,
+    match="unknown preset 'walker/fly'; choose from: (?!.*car/sim-to-real).*walker/gear-half",
+  ):
     fault_presets.find("walker/fly", "mine.py:Mine")
-  for robot in {p.robot for p in PRESETS.values()} - {"*", "walker"}:  # among shipped robots each has its own
+  for robot in {p.robot for p in PRESETS.values()} - {
+    "*",
+    "walker",
+  }:  # among shipped robots each has its own
     with pytest.raises(UserError, match=f"is of robot 'walker', not of '{robot}'"):
       fault_presets.find("walker/gear-half", robot)
 
 
-@pytest.mark.parametrize("level, chance, steps", [("easy", 0.01, 1), ("medium", 0.05, 5), ("hard", 0.1, 10)])
+@pytest.mark.parametrize(
+  "level, chance, steps", [("easy", 0.01, 1), ("medium", 0.05, 5), ("hard", 0.1, 10)]
+)
 @pytest.mark.parametrize("kind, fault", [("dropout", "dropout_burst"), ("stuck", "freeze_burst")])
 def test_lost_and_stuck_readings_are_those_of_realworldrl_suite(kind, fault, level, chance, steps):
-  """Probability and length of the suite's levels (facts 4.5), against a loop by hand with the same draws: 500 steps of a walker's 24 readings, an episode's start among them."""
+  """Probability and length of the suite's levels (facts 4.5), against a loop by hand with the same
+  draws: 500 steps of a walker's 24 readings, an episode's start among them.
+  """
   import jax
   import jax.numpy as jnp
   from mjx_cl import envs, faults
+
   (change,) = fault_presets.resolve("walker", f"any/observation-{kind}-{level}")
   assert (change.fault, change.target) == (fault, "all")
   env = envs.make("walker")
@@ -129,9 +181,16 @@ def test_lost_and_stuck_readings_are_those_of_realworldrl_suite(kind, fault, lev
 
   def step(state, x):
     key, obs, first = x
-    state, ports = made.apply(state, jnp.float32(change.severity), key, faults.Ports(env.model, obs=obs, first=first))
+    state, ports = made.apply(
+      state, jnp.float32(change.severity), key, faults.Ports(env.model, obs=obs, first=first)
+    )
     return state, ports.obs
-  got = np.asarray(jax.jit(lambda xs: jax.lax.scan(step, made.init(jax.random.key(0), made.targets.index("all")), xs)[1])((keys, readings, starts)))
+
+  got = np.asarray(
+    jax.jit(
+      lambda xs: jax.lax.scan(step, made.init(jax.random.key(0), made.targets.index("all")), xs)[1]
+    )((keys, readings, starts))
+  )
   draws = np.asarray(jax.vmap(lambda key: jax.random.uniform(key, (size,)))(keys))
   begun, left, held = 0, np.zeros(size, int), np.zeros(size, np.float32)
   for t in range(length):

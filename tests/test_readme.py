@@ -1,4 +1,5 @@
 """What the README shows as Python runs as it stands there."""
+
 import pathlib
 import re
 import subprocess
@@ -23,15 +24,20 @@ def test_short_examples_run(block, tmp_path):
 
 
 def test_the_learner_learns_the_environment_of_the_example(tmp_path):
-  """An untrained policy scores about 8 of 20; the example must end well above, and push towards the goal."""
+  """An untrained policy scores about 8 of 20; the example must end well above, and push towards the
+  goal.
+  """
   (block,) = [b for b in BLOCKS if "Trainer" in b]
   out = run(block + "\nprint(float(action[0]))\n", tmp_path).split("\n")
   assert float(re.search(r"return ([-0-9.]+) of 20", out[0])[1]) > 14 and float(out[1]) > 0
 
 
 def test_the_detector_of_the_example(tmp_path):
-  """The class as `--add` takes it: it knows the level after 500 samples, sees what rises above, and its setting works as `--threshold` needs."""
+  """The class as `--add` takes it: it knows the level after 500 samples, sees what rises above, and
+  its setting works as `--threshold` needs.
+  """
   from mjx_cl.detectors import host
+
   (block,) = [b for b in BLOCKS if "# mine.py" in b]
   (tmp_path / "mine.py").write_text(block)
   x = np.random.default_rng(0).uniform(0.5, 1.5, 2000)
@@ -40,13 +46,21 @@ def test_the_detector_of_the_example(tmp_path):
   for level in (1.2, 2.0, 20.0):
     detector = host.load(f"{tmp_path / 'mine.py'}:Mine", {"level": level}).factory()
     alarms[level] = [t for t, sample in enumerate(x) if detector.update(sample)]
-  assert alarms[2.0] == [1500] and alarms[20.0] == [] and len(alarms[1.2]) > 100 and min(alarms[1.2]) >= 500
+  assert (
+    alarms[2.0] == [1500]
+    and alarms[20.0] == []
+    and len(alarms[1.2]) > 100
+    and min(alarms[1.2]) >= 500
+  )
 
 
 def test_the_track_of_the_example(tmp_path, monkeypatch):
-  """The class drives the file's track and no other; what is wrong with the file is one line, of the command as of the class."""
+  """The class drives the file's track and no other; what is wrong with the file is one line, of the
+  command as of the class.
+  """
   from mjx_cl import cli, envs
   from mjx_cl.errors import FileError
+
   monkeypatch.chdir(tmp_path)
   (block,) = [b for b in BLOCKS if "OnMine" in b]
   pathlib.Path("tracks.py").write_text(block)
@@ -55,7 +69,9 @@ def test_the_track_of_the_example(tmp_path, monkeypatch):
   np.savetxt("my_track.csv", points, delimiter=", ")
   env = envs.make("tracks.py:OnMine")
   (track,) = env.course.tracks
-  assert env.spec.name == "car" and track.name == "my_track" and 38 < track.length < 42  # Ramanujan's perimeter of the ellipse: 41.4 m
+  assert (
+    env.spec.name == "car" and track.name == "my_track" and 38 < track.length < 42
+  )  # Ramanujan's perimeter of the ellipse: 41.4 m
   np.savetxt("my_track.csv", points[:40], delimiter=", ")
   with pytest.raises(FileError, match="not closed"):
     envs.make("tracks.py:OnMine")

@@ -1,4 +1,7 @@
-"""The replay against plain Python deques. Every record carries its stream and its absolute number in `obs`."""
+"""The replay against plain Python deques. Every record carries its stream and its absolute number
+in `obs`.
+"""
+
 import collections
 
 import jax
@@ -25,11 +28,24 @@ def make_records(rng, numbers):
   n = lambda *size: rng.standard_normal(shape + size).astype(np.float32)
   flag = lambda p: rng.random(shape) < p
   obs = np.stack([np.broadcast_to(np.arange(ENVS)[:, None], shape), numbers], -1).astype(np.float32)
-  return Record(obs, n(2), n(), flag(0.2), flag(0.1), flag(0.1), n(4), rng.integers(0, 256, shape + (3,)).astype(np.uint8), n(2), flag(0.5))
+  return Record(
+    obs,
+    n(2),
+    n(),
+    flag(0.2),
+    flag(0.1),
+    flag(0.1),
+    n(4),
+    rng.integers(0, 256, shape + (3,)).astype(np.uint8),
+    n(2),
+    flag(0.5),
+  )
 
 
 def filled(chunks, seed=0, keep=0.8):
-  """A replay after some chunks with random gaps, and its model: per stream a deque of (number, record) and the count."""
+  """A replay after some chunks with random gaps, and its model: per stream a deque of (number,
+  record) and the count.
+  """
   rng, replay = np.random.default_rng(seed), empty()
   model, count = [collections.deque(maxlen=CAPACITY) for _ in range(ENVS)], np.zeros(ENVS, int)
   for _ in range(chunks):
@@ -55,7 +71,9 @@ def queue_off(replay):
   return replay._replace(queue=replay.count)
 
 
-@pytest.mark.parametrize("chunks", [1, 2, 9])  # below the capacity, at its edge, wrapped several times
+@pytest.mark.parametrize(
+  "chunks", [1, 2, 9]
+)  # below the capacity, at its edge, wrapped several times
 def test_windows_equal_the_model(chunks):
   replay, model, count = filled(chunks)
   np.testing.assert_array_equal(replay.count, count)
@@ -77,8 +95,14 @@ def test_windows_equal_the_model(chunks):
 
 def test_types_out():
   _, batch, _ = sample(filled(2)[0], jax.random.key(0), BATCH, LENGTH)
-  assert batch.stoch.dtype == jnp.int32 and batch.deter.dtype == jnp.float16 and batch.obs.dtype == jnp.float32
-  assert batch.first.dtype == batch.last.dtype == batch.terminal.dtype == batch.has_demo.dtype == bool
+  assert (
+    batch.stoch.dtype == jnp.int32
+    and batch.deter.dtype == jnp.float16
+    and batch.obs.dtype == jnp.float32
+  )
+  assert (
+    batch.first.dtype == batch.last.dtype == batch.terminal.dtype == batch.has_demo.dtype == bool
+  )
   assert int(batch.stoch.max()) > 127  # indices are unsigned
 
 
@@ -89,20 +113,29 @@ def test_uniform_over_all_windows():
   times, valid = collections.Counter(starts(address)), valid_starts(model)
   assert set(times) == valid  # each is reached and nothing else is
   mean = draws / len(valid)
-  assert max(abs(n - mean) for n in times.values()) < 5 * np.sqrt(mean)  # 5 standard deviations of a count
+  assert max(abs(n - mean) for n in times.values()) < 5 * np.sqrt(
+    mean
+  )  # 5 standard deviations of a count
 
 
 def test_streams_weigh_by_their_windows():
   replay = empty()
   kept = np.arange(CHUNK) < np.array([[8], [6], [3]])  # 4, 2 and 0 windows of 5
   numbers = np.broadcast_to(np.arange(CHUNK), (ENVS, CHUNK))
-  replay = add(replay, jax.tree.map(jnp.asarray, make_records(np.random.default_rng(0), numbers)), jnp.asarray(kept))
+  replay = add(
+    replay,
+    jax.tree.map(jnp.asarray, make_records(np.random.default_rng(0), numbers)),
+    jnp.asarray(kept),
+  )
   _, _, address = sample(queue_off(replay), jax.random.key(0), 20_000, LENGTH)
   times = np.bincount(np.asarray(address[0]), minlength=ENVS)
-  assert times[2] == 0 and abs(times[0] / 20_000 - 2 / 3) < 5 * np.sqrt(2 / 9 / 20_000)  # 5 standard deviations
+  assert times[2] == 0 and abs(times[0] / 20_000 - 2 / 3) < 5 * np.sqrt(
+    2 / 9 / 20_000
+  )  # 5 standard deviations
 
 
-# ---- online queue ----------------------------------------------------------------------------------------------------------------
+# ---- online queue --------------------------------------------------------------------------------
+
 
 def drawn_in_order(replay, calls):
   out = []
@@ -113,39 +146,62 @@ def drawn_in_order(replay, calls):
 
 
 def serves_fresh_windows_first(replay, model, calls=4):
-  """True where the first draws are every non-overlapping window exactly once, oldest first in each stream."""
+  """True where the first draws are every non-overlapping window exactly once, oldest first in each
+  stream.
+  """
   waiting = [[rows[i][0] for i in range(0, len(rows) - LENGTH + 1, LENGTH)] for rows in model]
   total = sum(map(len, waiting))
   assert 0 < total < calls * BATCH
   _, drawn = drawn_in_order(replay, calls)
-  return all([n for e, n in drawn[:total] if e == stream] == numbers for stream, numbers in enumerate(waiting))
+  return all(
+    [n for e, n in drawn[:total] if e == stream] == numbers
+    for stream, numbers in enumerate(waiting)
+  )
 
 
 @pytest.mark.parametrize("chunks", [2, 9])  # nothing evicted; unseen records evicted
 def test_queue_serves_each_fresh_window_once(chunks):
   replay, model, _ = filled(chunks)
   assert serves_fresh_windows_first(replay, model)
-  assert not serves_fresh_windows_first(queue_off(replay), model)  # the check notices a queue that is off
+  assert not serves_fresh_windows_first(
+    queue_off(replay), model
+  )  # the check notices a queue that is off
 
 
 def test_queue_goes_on_where_it_stopped():
   replay, model, count = filled(2, keep=1.0)
   replay, first = drawn_in_order(replay, 4)
-  np.testing.assert_array_equal(replay.queue, count // LENGTH * LENGTH)  # 15 of 16 records are served, the 16th waits for its window
-  fresh = make_records(np.random.default_rng(1), np.broadcast_to(16 + np.arange(CHUNK), (ENVS, CHUNK)))
+  np.testing.assert_array_equal(
+    replay.queue, count // LENGTH * LENGTH
+  )  # 15 of 16 records are served, the 16th waits for its window
+  fresh = make_records(
+    np.random.default_rng(1), np.broadcast_to(16 + np.arange(CHUNK), (ENVS, CHUNK))
+  )
   replay = add(replay, jax.tree.map(jnp.asarray, fresh), jnp.ones((ENVS, CHUNK), bool))
   _, second = drawn_in_order(replay, 1)
-  assert set(first[:9]) == {(e, n) for e in range(ENVS) for n in (0, 5, 10)} and second[:3] == [(e, 15) for e in range(ENVS)]
+  assert set(first[:9]) == {(e, n) for e in range(ENVS) for n in (0, 5, 10)} and second[:3] == [
+    (e, 15) for e in range(ENVS)
+  ]
 
 
-# ---- latent refresh --------------------------------------------------------------------------------------------------------------
+# ---- latent refresh ------------------------------------------------------------------------------
+
 
 def test_refresh_writes_the_right_records_and_skips_evicted_ones():
   replay, model, count = filled(3, keep=1.0)  # numbers 4..23 are held
   address = (jnp.array([0, 2]), jnp.array([5, 19]))
-  fresh = make_records(np.random.default_rng(1), np.broadcast_to(24 + np.arange(CHUNK), (ENVS, CHUNK)))
-  held = add(replay, jax.tree.map(jnp.asarray, fresh), jnp.asarray(np.arange(CHUNK) < np.array([[4], [0], [0]])))  # stream 0 holds 8..27
-  deter, stoch = 10 + jnp.arange(2 * 4 * 4.0).reshape(2, 4, 4), (100 + jnp.arange(2 * 4 * 3)).reshape(2, 4, 3)
+  fresh = make_records(
+    np.random.default_rng(1), np.broadcast_to(24 + np.arange(CHUNK), (ENVS, CHUNK))
+  )
+  held = add(
+    replay,
+    jax.tree.map(jnp.asarray, fresh),
+    jnp.asarray(np.arange(CHUNK) < np.array([[4], [0], [0]])),
+  )  # stream 0 holds 8..27
+  deter, stoch = (
+    10 + jnp.arange(2 * 4 * 4.0).reshape(2, 4, 4),
+    (100 + jnp.arange(2 * 4 * 3)).reshape(2, 4, 3),
+  )
   new = refresh(held, address, (deter, stoch))
   want_deter, want_stoch = np.array(held.data.deter), np.array(held.data.stoch)
   for row, (e, start) in enumerate(starts(address)):
@@ -153,23 +209,34 @@ def test_refresh_writes_the_right_records_and_skips_evicted_ones():
       if start + 1 + i >= int(held.count[e]) - CAPACITY:
         slot = (start + 1 + i) % CAPACITY
         want_deter[e, slot], want_stoch[e, slot] = deter[row, i], stoch[row, i]
-  assert np.sum(want_deter != np.asarray(held.data.deter)) == (2 + 4) * 4  # 6 and 7 of stream 0 are gone
+  assert (
+    np.sum(want_deter != np.asarray(held.data.deter)) == (2 + 4) * 4
+  )  # 6 and 7 of stream 0 are gone
   np.testing.assert_array_equal(new.data.deter, want_deter)
   np.testing.assert_array_equal(new.data.stoch, want_stoch)
   rest = lambda r: r.data._replace(deter=0, stoch=0)
-  assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(rest(new)), jax.tree.leaves(rest(held))))
+  assert all(
+    np.array_equal(a, b) for a, b in zip(jax.tree.leaves(rest(new)), jax.tree.leaves(rest(held)))
+  )
 
 
 def test_refreshed_latents_are_sampled_again():
   replay, _, _ = filled(2, keep=1.0)
   replay, batch, address = sample(replay, jax.random.key(0), BATCH, LENGTH)
   replay = refresh(replay, address, (batch.deter[:, 1:] * 0 + 0.5, batch.stoch[:, 1:] * 0 + 7))
-  _, again, _ = sample(replay._replace(queue=jnp.zeros(ENVS, jnp.int32)), jax.random.key(1), BATCH, LENGTH)  # the queue serves the same windows
-  assert np.all(np.asarray(again.deter[:, 1:]) == 0.5) and np.all(np.asarray(again.stoch[:, 1:]) == 7)
-  np.testing.assert_array_equal(again.deter[:, 0], batch.deter[:, 0])  # the context's latent is another update's
+  _, again, _ = sample(
+    replay._replace(queue=jnp.zeros(ENVS, jnp.int32)), jax.random.key(1), BATCH, LENGTH
+  )  # the queue serves the same windows
+  assert np.all(np.asarray(again.deter[:, 1:]) == 0.5) and np.all(
+    np.asarray(again.stoch[:, 1:]) == 7
+  )
+  np.testing.assert_array_equal(
+    again.deter[:, 0], batch.deter[:, 0]
+  )  # the context's latent is another update's
 
 
-# ---- the rest --------------------------------------------------------------------------------------------------------------------
+# ---- the rest ------------------------------------------------------------------------------------
+
 
 def test_left_out_records_change_nothing():
   replay, _, _ = filled(3)
@@ -180,7 +247,11 @@ def test_left_out_records_change_nothing():
 
 def test_clear_forgets():
   replay = replay_lib.clear(filled(9)[0])
-  assert int(replay_lib.windows(replay, LENGTH)) == 0 and not np.any(replay.count) and not np.any(replay.queue)
+  assert (
+    int(replay_lib.windows(replay, LENGTH)) == 0
+    and not np.any(replay.count)
+    and not np.any(replay.queue)
+  )
   records = make_records(np.random.default_rng(1), np.broadcast_to(np.arange(CHUNK), (ENVS, CHUNK)))
   replay = add(replay, jax.tree.map(jnp.asarray, records), jnp.ones((ENVS, CHUNK), bool))
   assert int(replay_lib.windows(replay, LENGTH)) == ENVS * (CHUNK - LENGTH + 1)
@@ -197,7 +268,9 @@ def test_record_bytes_is_what_init_allocates():
 def test_vmap_over_seeds_equals_a_loop():
   replays = [filled(3, seed)[0] for seed in range(2)]
   keys = jax.random.split(jax.random.key(0), 2)
-  many = jax.vmap(lambda r, k: replay_lib.sample(r, k, BATCH, LENGTH))(jax.tree.map(lambda *x: jnp.stack(x), *replays), keys)
+  many = jax.vmap(lambda r, k: replay_lib.sample(r, k, BATCH, LENGTH))(
+    jax.tree.map(lambda *x: jnp.stack(x), *replays), keys
+  )
   for i in range(2):
     one = sample(replays[i], keys[i], BATCH, LENGTH)
     assert all(np.array_equal(a[i], b) for a, b in zip(jax.tree.leaves(many), jax.tree.leaves(one)))

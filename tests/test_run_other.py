@@ -1,4 +1,7 @@
-"""`run` where nothing else runs it: on MJX, with an agent that holds each action for two control steps, cut off and gone on from its checkpoint."""
+"""`run` where nothing else runs it: on MJX, with an agent that holds each action for two control
+steps, cut off and gone on from its checkpoint.
+"""
+
 import dataclasses
 import json
 import shutil
@@ -16,8 +19,16 @@ from mjx_cl.config import CHUNK, PRESETS, AdaptConfig, RunConfig, replace
 from mjx_cl.dreamer.agent import Agent
 from mjx_cl.types import EnvState, Model, Spec, Step, Var
 
-STEPS, ONSET, EPISODE, WARMUP, REPEAT = 1024, 201, 150, 60, 2  # the onset is the second control step of a decision
-ADAPT = AdaptConfig(warmup=WARMUP, start_windows=40, patience=4, least=64, trend=1e9, fluctuation=1e9, refit=100)
+STEPS, ONSET, EPISODE, WARMUP, REPEAT = (
+  1024,
+  201,
+  150,
+  60,
+  2,
+)  # the onset is the second control step of a decision
+ADAPT = AdaptConfig(
+  warmup=WARMUP, start_windows=40, patience=4, least=64, trend=1e9, fluctuation=1e9, refit=100
+)
 
 
 XML = """<mujoco><option timestep="0.02"/><worldbody><body><joint name="hinge" type="hinge" axis="0 1 0" damping="0.1"/>
@@ -25,12 +36,23 @@ XML = """<mujoco><option timestep="0.02"/><worldbody><body><joint name="hinge" t
 
 
 class Pendulum:
-  """One hinge, small enough for MJX to compile in seconds; hanging still earns 1. Its task counts as done whatever it does: random weights can converge."""
+  """One hinge, small enough for MJX to compile in seconds; hanging still earns 1. Its task counts
+  as done whatever it does: random weights can converge.
+  """
 
   def __init__(self, physics="auto"):
     self.mj_model = mujoco.MjModel.from_xml_string(XML)
     self.physics = physics_lib.make(physics, self.mj_model, substeps=2)
-    self.spec = Spec("pendulum", (Var("cos", "1"), Var("sin", "1"), Var("speed", "rad/s")), (Var("hinge", "1", -1, 1),), 0.04, EPISODE, 0.0, None, ("hinge",))
+    self.spec = Spec(
+      "pendulum",
+      (Var("cos", "1"), Var("sin", "1"), Var("speed", "rad/s")),
+      (Var("hinge", "1", -1, 1),),
+      0.04,
+      EPISODE,
+      0.0,
+      None,
+      ("hinge",),
+    )
     self.model = Model(physics_lib.leaves(self.mj_model, "actuator_gear"), {})
 
   def init(self, model, key):
@@ -43,12 +65,16 @@ class Pendulum:
   def step(self, model, state, action):
     inner, out = self.physics.step(model.mj, state.physics, jnp.clip(action, -1.0, 1.0))
     obs, step = self.observe(out["qpos"], out["qvel"]), state.step + 1
-    return EnvState(inner, step), Step(obs, (1.0 + obs[0]) / 2.0, jnp.bool_(False), step >= EPISODE, obs)
+    return EnvState(inner, step), Step(
+      obs, (1.0 + obs[0]) / 2.0, jnp.bool_(False), step >= EPISODE, obs
+    )
 
 
 @pytest.fixture(scope="module")
 def lived(tmp_path_factory):
-  """(config, folder of a run in one go, folder of one that was cut off after two chunks and went on, chunks that the latter lived then)."""
+  """(config, folder of a run in one go, folder of one that was cut off after two chunks and went
+  on, chunks that the latter lived then).
+  """
   with pytest.MonkeyPatch.context() as patch:
     patch.setitem(envs.ENVS, "pendulum", Pendulum)
     yield live(patch, tmp_path_factory)
@@ -58,9 +84,29 @@ def live(patch, tmp_path_factory):
   agent, folder = tmp_path_factory.mktemp("agents") / "agent", tmp_path_factory.mktemp("runs")
   whole, cut = folder / "whole", folder / "cut"
   tiny = Agent(PRESETS["tiny"].dreamer, 3, 1)
-  agents.save(agent, jax.jit(tiny.init)(jax.random.key(0)), {"env": "pendulum", "preset": "tiny", "repeat": REPEAT, "dreamer": dataclasses.asdict(tiny.config)})
-  config = RunConfig("pendulum", onset=ONSET, steps=STEPS, seeds=1, first_seed=3, arms=("oracle",), detector="rolling_sigma_plain",
-                     settings=dict(window=100, warmup=30), physics="mjx", adapt=ADAPT, agent=str(agent))
+  agents.save(
+    agent,
+    jax.jit(tiny.init)(jax.random.key(0)),
+    {
+      "env": "pendulum",
+      "preset": "tiny",
+      "repeat": REPEAT,
+      "dreamer": dataclasses.asdict(tiny.config),
+    },
+  )
+  config = RunConfig(
+    "pendulum",
+    onset=ONSET,
+    steps=STEPS,
+    seeds=1,
+    first_seed=3,
+    arms=("oracle",),
+    detector="rolling_sigma_plain",
+    settings=dict(window=100, warmup=30),
+    physics="mjx",
+    adapt=ADAPT,
+    agent=str(agent),
+  )
   runner = run.Runner(config, whole)
   whole.mkdir()
   runner.open()
@@ -71,7 +117,9 @@ def live(patch, tmp_path_factory):
       shutil.copytree(whole, cut)
     runner.step()
   runner.finish()
-  assert runner.crew.loop._program._cache_size() == runner.rollout.chunk._cache_size() == 1  # arrays that MJX binds to a device would be a second compilation of each
+  assert (
+    runner.crew.loop._program._cache_size() == runner.rollout.chunk._cache_size() == 1
+  )  # arrays that MJX binds to a device would be a second compilation of each
   step, later = run.Runner.step, []
   patch.setattr(run.Runner, "step", lambda self: (later.append(self.done_chunks), step(self))[1])
   assert run.execute(config, cut, resume=True)["arms"]["oracle"]["updates_mean"] > 0
@@ -85,7 +133,9 @@ def table(folder, name):
 def test_it_goes_on_where_it_was_cut_off(lived):
   """Every column of what was lived, to the last bit; wall times aside."""
   _, whole, cut, later = lived
-  assert later == list(range(2, STEPS // (CHUNK * REPEAT)))  # what lay in the checkpoint was not lived again
+  assert later == list(
+    range(2, STEPS // (CHUNK * REPEAT))
+  )  # what lay in the checkpoint was not lived again
   for name in ("trace", "events", "runs"):
     a, b = table(whole, name), table(cut, name)
     assert list(a) == list(b)
@@ -96,12 +146,20 @@ def test_it_goes_on_where_it_was_cut_off(lived):
 def test_clock_episodes_and_fault_are_those_of_control_steps(lived):
   config, whole, _, _ = lived
   trace, steps = table(whole, "trace"), np.arange(STEPS)
-  assert trace["step"] == steps.tolist() and json.loads((whole / "config.json").read_text())["physics"] == config.physics
+  assert (
+    trace["step"] == steps.tolist()
+    and json.loads((whole / "config.json").read_text())["physics"] == config.physics
+  )
   np.testing.assert_array_equal(trace["severity"], np.where(steps >= ONSET, 0.5, 0.0))
   np.testing.assert_array_equal(trace["episode"], steps // EPISODE)
   np.testing.assert_array_equal(trace["truncated"], steps % EPISODE == EPISODE - 1)
   reward = np.asarray(trace["reward"])
-  assert np.isfinite(reward).all() and (reward >= 0).all() and (reward <= 1).all() and len(np.unique(reward)) > STEPS / 2  # of each step, not of each decision
+  assert (
+    np.isfinite(reward).all()
+    and (reward >= 0).all()
+    and (reward <= 1).all()
+    and len(np.unique(reward)) > STEPS / 2
+  )  # of each step, not of each decision
 
 
 def test_residuals_are_known_once_a_decision(lived):
@@ -111,12 +169,17 @@ def test_residuals_are_known_once_a_decision(lived):
   valid = np.asarray(trace["valid"])
   known = np.asarray([x is not None and np.isfinite(x) for x in trace["opr"]])
   np.testing.assert_array_equal(known, valid)
-  assert set(np.flatnonzero(valid) % REPEAT) == {REPEAT - 1} and np.flatnonzero(valid)[0] == 15 * REPEAT - 1
-  assert valid[REPEAT - 1::REPEAT].mean() > 0.8
+  assert (
+    set(np.flatnonzero(valid) % REPEAT) == {REPEAT - 1}
+    and np.flatnonzero(valid)[0] == 15 * REPEAT - 1
+  )
+  assert valid[REPEAT - 1 :: REPEAT].mean() > 0.8
 
 
 def test_finetuning_starts_with_the_chunk_of_the_onset_and_is_paid_by_decisions(lived):
-  """Chunks are of CHUNK decisions. Updates: the train ratio times the records since the start, over the records of an update."""
+  """Chunks are of CHUNK decisions. Updates: the train ratio times the records since the start, over
+  the records of an update.
+  """
   config, whole, _, _ = lived
   events, trace = table(whole, "events"), table(whole, "trace")
   chunk = CHUNK * REPEAT
@@ -125,21 +188,39 @@ def test_finetuning_starts_with_the_chunk_of_the_onset_and_is_paid_by_decisions(
   stop = [s for s, k in zip(events["step"], events["kind"]) if k == "stop"]
   assert stop == [start[0] + ADAPT.patience * chunk] and stop[0] < STEPS - 1
   phase = np.asarray(trace["phase"])
-  assert set(phase[:start[0] + 1]) == {"nominal"} and set(phase[start[0] + 1:stop[0] + 1]) == {"adapting"} and set(phase[stop[0] + 1:]) == {"converged"}
-  updates, (row,) = np.asarray(trace["updates"]), pyarrow.parquet.read_table(whole / "runs.parquet").to_pylist()
-  assert not updates[:start[0] + 1].any() and 0 < row["updates"] <= ADAPT.ratio * (stop[0] - start[0]) / REPEAT / (config.adapt.batch * PRESETS["tiny"].dreamer.length)
+  assert (
+    set(phase[: start[0] + 1]) == {"nominal"}
+    and set(phase[start[0] + 1 : stop[0] + 1]) == {"adapting"}
+    and set(phase[stop[0] + 1 :]) == {"converged"}
+  )
+  updates, (row,) = (
+    np.asarray(trace["updates"]),
+    pyarrow.parquet.read_table(whole / "runs.parquet").to_pylist(),
+  )
+  assert not updates[: start[0] + 1].any() and 0 < row["updates"] <= ADAPT.ratio * (
+    stop[0] - start[0]
+  ) / REPEAT / (config.adapt.batch * PRESETS["tiny"].dreamer.length)
 
 
 @pytest.mark.slow
 def test_training_on_mjx_is_read_back_to_the_bit(tmp_path):
   """Environment states of MJX hold arrays without an element."""
   tiny = PRESETS["tiny"]
-  make = lambda: train.Trainer(Pendulum("mjx"), tiny.dreamer, replace(tiny.train, updates=96), tmp_path / "out", seeds=2)
+  make = lambda: train.Trainer(
+    Pendulum("mjx"), tiny.dreamer, replace(tiny.train, updates=96), tmp_path / "out", seeds=2
+  )
   trainer = make()
   while not trainer.done:
     trainer.step()
   trainer.save()
   again = make()
   again.resume()
-  bits = lambda tree: [np.asarray(jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x).tobytes() for x in jax.tree.leaves(tree)]
-  assert any(x.size == 0 for x in jax.tree.leaves(trainer.state)) and bits(trainer.state) == bits(again.state)
+  bits = lambda tree: [
+    np.asarray(
+      jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x
+    ).tobytes()
+    for x in jax.tree.leaves(tree)
+  ]
+  assert any(x.size == 0 for x in jax.tree.leaves(trainer.state)) and bits(trainer.state) == bits(
+    again.state
+  )

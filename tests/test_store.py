@@ -1,4 +1,5 @@
 """Result files: written whole or not at all, nan as null, SQL views, who may write where."""
+
 import errno
 import json
 import math
@@ -14,8 +15,13 @@ import pytest
 from mjx_cl import store, workers
 from mjx_cl.errors import FileError, UserError
 
-TABLE = {"a": np.array([1.5, np.nan, 3.0], np.float32), "b": np.array([1, 2, 3], np.int32), "c": ["x", None, "z"], "d": [None, 2, None],
-         "e": np.array([True, False, True])}
+TABLE = {
+  "a": np.array([1.5, np.nan, 3.0], np.float32),
+  "b": np.array([1, 2, 3], np.int32),
+  "c": ["x", None, "z"],
+  "d": [None, 2, None],
+  "e": np.array([True, False, True]),
+}
 
 
 def full(*_, **__):
@@ -29,11 +35,18 @@ def one_line(error):
   return text
 
 
-# ---- JSON ----------------------------------------------------------------------------------------------------------------------------
+# ---- JSON ----------------------------------------------------------------------------------------
+
 
 def test_json_round_trip(tmp_path):
-  store.write_json(tmp_path / "x.json", {"a": [1, None, "b"], "n": np.float32(0.5), "v": np.arange(3)})
-  assert json.loads((tmp_path / "x.json").read_text()) == {"a": [1, None, "b"], "n": 0.5, "v": [0, 1, 2]}
+  store.write_json(
+    tmp_path / "x.json", {"a": [1, None, "b"], "n": np.float32(0.5), "v": np.arange(3)}
+  )
+  assert json.loads((tmp_path / "x.json").read_text()) == {
+    "a": [1, None, "b"],
+    "n": 0.5,
+    "v": [0, 1, 2],
+  }
   assert os.listdir(tmp_path) == ["x.json"]
 
 
@@ -45,7 +58,8 @@ def test_json_refuses_what_it_cannot_say(tmp_path, value):
   assert (tmp_path / "x.json").read_text() == "1\n" and os.listdir(tmp_path) == ["x.json"]
 
 
-# ---- a full disk ---------------------------------------------------------------------------------------------------------------------
+# ---- a full disk ---------------------------------------------------------------------------------
+
 
 def half_written(file):
   """A write that fills the disk: some bytes arrive, then the error."""
@@ -57,7 +71,10 @@ def half_written(file):
 @pytest.mark.parametrize("kind", ["json", "table"])
 def test_a_full_disk_leaves_the_earlier_file(tmp_path, monkeypatch, kind, where):
   path = tmp_path / f"x.{kind}"
-  write = {"json": lambda v: store.write_json(path, {"v": v}), "table": lambda v: store.write_table(path, {"v": [v]})}[kind]
+  write = {
+    "json": lambda v: store.write_json(path, {"v": v}),
+    "table": lambda v: store.write_table(path, {"v": [v]}),
+  }[kind]
   write(1)
   before = path.read_bytes()
   if where == "rename":
@@ -82,12 +99,19 @@ def test_a_missing_folder_is_one_line(tmp_path):
     assert "No such file" in one_line(error)
 
 
-# ---- tables --------------------------------------------------------------------------------------------------------------------------
+# ---- tables --------------------------------------------------------------------------------------
+
 
 def test_nan_becomes_null(tmp_path):
   store.write_table(tmp_path / "x.parquet", TABLE)
   table = pyarrow.parquet.read_table(tmp_path / "x.parquet")
-  assert table.to_pydict() == {"a": [1.5, None, 3.0], "b": [1, 2, 3], "c": ["x", None, "z"], "d": [None, 2, None], "e": [True, False, True]}
+  assert table.to_pydict() == {
+    "a": [1.5, None, 3.0],
+    "b": [1, 2, 3],
+    "c": ["x", None, "z"],
+    "d": [None, 2, None],
+    "e": [True, False, True],
+  }
   assert [str(t) for t in table.schema.types] == ["float", "int32", "string", "int64", "bool"]
   store.write_table(tmp_path / "x.parquet", TABLE, nan_is_null=False)
   assert pyarrow.parquet.read_table(tmp_path / "x.parquet")["a"].null_count == 0
@@ -112,7 +136,8 @@ def test_read_table_of_no_table_is_one_line(tmp_path, content):
   assert "x.parquet" in one_line(error)
 
 
-# ---- queries -------------------------------------------------------------------------------------------------------------------------
+# ---- queries -------------------------------------------------------------------------------------
+
 
 @pytest.fixture
 def folder(tmp_path):
@@ -125,7 +150,13 @@ def folder(tmp_path):
 
 
 def test_query_joins_the_views(folder):
-  names, rows = store.query(folder, "select seed, latency, sum(reward) as total from runs join trace using (seed) group by all order by seed")
+  names, rows = store.query(
+    folder,
+    (
+      "select seed, latency, sum(reward) as total from runs join trace using (seed) group by all "
+      "order by seed"
+    ),
+  )
   assert names == ["seed", "latency", "total"] and rows == [(0, 5.0, 3.0), (1, None, 4.0)]
 
 
@@ -134,7 +165,9 @@ def test_query_takes_a_name_that_is_no_plain_word(folder):
   assert store.query(folder, 'select x from "my-order"')[1] == [(7,)]
 
 
-@pytest.mark.parametrize("sql", ["select nothing from runs", "selec 1", "select * from elsewhere", ""])
+@pytest.mark.parametrize(
+  "sql", ["select nothing from runs", "selec 1", "select * from elsewhere", ""]
+)
 def test_a_bad_query_is_one_line_that_names_the_views(folder, sql):
   with pytest.raises(UserError) as error:
     store.query(folder, sql)
@@ -159,8 +192,15 @@ def test_query_of_a_broken_table_is_one_line(folder):
 def tree(tmp_path, monkeypatch):
   """A working folder with results/, a run folder beside it, and a file that no query may see."""
   monkeypatch.chdir(tmp_path)
-  for name, rows in (("results/leaderboard", 2), ("results/walker_gear/runs", 3), ("results/my-suite/2026", 4), ("runs/latest/trace", 5), ("runs/other/trace", 6),
-                     ("runs/a[1]/trace", 7), ("runs/a1/trace", 8)):
+  for name, rows in (
+    ("results/leaderboard", 2),
+    ("results/walker_gear/runs", 3),
+    ("results/my-suite/2026", 4),
+    ("runs/latest/trace", 5),
+    ("runs/other/trace", 6),
+    ("runs/a[1]/trace", 7),
+    ("runs/a1/trace", 8),
+  ):
     path = pathlib.Path(name + ".parquet")
     path.parent.mkdir(parents=True, exist_ok=True)
     store.write_table(path, {"x": list(range(rows)), "y": ["z"] * rows})
@@ -173,20 +213,42 @@ def every_file(folder):
 
 
 def test_views_are_named_by_their_paths(tree):
-  named = {"leaderboard": "results/leaderboard.parquet", "walker_gear_runs": "results/walker_gear/runs.parquet", "my_suite_2026": "results/my-suite/2026.parquet"}
+  named = {
+    "leaderboard": "results/leaderboard.parquet",
+    "walker_gear_runs": "results/walker_gear/runs.parquet",
+    "my_suite_2026": "results/my-suite/2026.parquet",
+  }
   assert store.views() == {k: pathlib.Path(v) for k, v in named.items()}
-  more = store.views(("runs/latest", "B=runs/other", "results/walker_gear"))  # what is there already keeps its name
-  assert more == store.views() | {"latest_trace": pathlib.Path("runs/latest/trace.parquet"), "b_trace": pathlib.Path("runs/other/trace.parquet")}
-  assert store.query(more) == (["view", "rows", "columns"], [("leaderboard", 2, "x, y"), ("my_suite_2026", 4, "x, y"), ("walker_gear_runs", 3, "x, y"),
-                                                             ("latest_trace", 5, "x, y"), ("b_trace", 6, "x, y")])
-  assert store.query(more, "select (select count(*) from leaderboard) + count(*) as n from b_trace") == (["n"], [(8,)])
+  more = store.views(
+    ("runs/latest", "B=runs/other", "results/walker_gear")
+  )  # what is there already keeps its name
+  assert more == store.views() | {
+    "latest_trace": pathlib.Path("runs/latest/trace.parquet"),
+    "b_trace": pathlib.Path("runs/other/trace.parquet"),
+  }
+  assert store.query(more) == (
+    ["view", "rows", "columns"],
+    [
+      ("leaderboard", 2, "x, y"),
+      ("my_suite_2026", 4, "x, y"),
+      ("walker_gear_runs", 3, "x, y"),
+      ("latest_trace", 5, "x, y"),
+      ("b_trace", 6, "x, y"),
+    ],
+  )
+  assert store.query(
+    more, "select (select count(*) from leaderboard) + count(*) as n from b_trace"
+  ) == (["n"], [(8,)])
 
 
 def test_two_tables_of_one_name_are_named(tree):
   store.write_table("results/walker_gear_runs.parquet", {"x": [1]})
   with pytest.raises(UserError) as error:
     store.views()
-  assert all(word in one_line(error) for word in ("results/walker_gear/runs.parquet", "results/walker_gear_runs.parquet", "NAME=DIR"))
+  assert all(
+    word in one_line(error)
+    for word in ("results/walker_gear/runs.parquet", "results/walker_gear_runs.parquet", "NAME=DIR")
+  )
   os.remove("results/walker_gear_runs.parquet")
   (tree / "more" / "latest").mkdir(parents=True)
   store.write_table("more/latest/Trace.parquet", {"x": [1]})  # SQL does not tell trace from Trace
@@ -203,37 +265,93 @@ def test_views_of_nothing(tmp_path, monkeypatch):
     store.views(("none",))
 
 
-@pytest.mark.parametrize("sql", ["select x from leaderboard", "from leaderboard select x", "with t as (select x from leaderboard) select * from t", "values (0), (1)",
-                                 "select 7; select x from leaderboard"])
+@pytest.mark.parametrize(
+  "sql",
+  [
+    "select x from leaderboard",
+    "from leaderboard select x",
+    "with t as (select x from leaderboard) select * from t",
+    "values (0), (1)",
+    "select 7; select x from leaderboard",
+  ],
+)
 def test_a_reading_statement_is_run(tree, sql):
   assert store.query(store.views(), sql)[1] == [(0,), (1,)]
 
 
 def test_a_summary_is_a_reading_statement(tree):
   assert [r[0] for r in store.query(store.views(), "describe leaderboard")[1]] == ["x", "y"]
-  assert [r[:3] for r in store.query(store.views(), "summarize leaderboard")[1]] == [("x", "BIGINT", "0"), ("y", "VARCHAR", "z")]
+  assert [r[:3] for r in store.query(store.views(), "summarize leaderboard")[1]] == [
+    ("x", "BIGINT", "0"),
+    ("y", "VARCHAR", "z"),
+  ]
 
 
-@pytest.mark.parametrize("sql", [
-    "copy leaderboard to 'out.csv'", "copy (select 1) to 'results/leaderboard.parquet' (format parquet)", "create table t as select 1", "create view t as select 1",
-    "insert into leaderboard values (1, 'z')", "update leaderboard set x = 1", "delete from leaderboard", "drop view leaderboard", "alter view leaderboard rename to l",
-    "attach 'new.db'", "install json", "load json", "export database 'out'", "import database 'out'", "pragma enable_profiling", "set threads = 1",
-    "set enable_external_access = true", "reset lock_configuration", "checkpoint", "call duckdb_settings()", "begin", "vacuum", "use memory",
-    "explain analyze copy leaderboard to 'out.csv'", "prepare p as select 1", "select 1; copy leaderboard to 'out.csv'", "pivot leaderboard on y using sum(x)"])
+@pytest.mark.parametrize(
+  "sql",
+  [
+    "copy leaderboard to 'out.csv'",
+    "copy (select 1) to 'results/leaderboard.parquet' (format parquet)",
+    "create table t as select 1",
+    "create view t as select 1",
+    "insert into leaderboard values (1, 'z')",
+    "update leaderboard set x = 1",
+    "delete from leaderboard",
+    "drop view leaderboard",
+    "alter view leaderboard rename to l",
+    "attach 'new.db'",
+    "install json",
+    "load json",
+    "export database 'out'",
+    "import database 'out'",
+    "pragma enable_profiling",
+    "set threads = 1",
+    "set enable_external_access = true",
+    "reset lock_configuration",
+    "checkpoint",
+    "call duckdb_settings()",
+    "begin",
+    "vacuum",
+    "use memory",
+    "explain analyze copy leaderboard to 'out.csv'",
+    "prepare p as select 1",
+    "select 1; copy leaderboard to 'out.csv'",
+    "pivot leaderboard on y using sum(x)",
+  ],
+)
 def test_a_writing_statement_is_refused(tree, sql):
   before = every_file(tree)
   with pytest.raises(UserError) as error:
     store.query(store.views(), sql)
-  assert "read-only" in one_line(error) and "leaderboard" in one_line(error) and error.value.exit_code == 2
+  assert (
+    "read-only" in one_line(error)
+    and "leaderboard" in one_line(error)
+    and error.value.exit_code == 2
+  )
   assert every_file(tree) == before
 
 
-@pytest.mark.parametrize("sql", [
-    "select * from 'secret.csv'", "select * from read_csv('secret.csv')", "select * from read_text('{}/secret.csv')", "select * from read_blob('results/../secret.csv')",
-    "select * from 'results/leaderboard.parquet/../../secret.csv'", "select * from sniff_csv('secret.csv')", "select * from glob('*')",
-    "select * from read_parquet('runs/latest/trace.parquet')", "select * from read_parquet('results/*.parquet')", "select * from 'results/../runs/latest/trace.parquet'",
-    "select * from read_parquet('http://localhost:1/x.parquet')", "select * from query('copy (select 1) to ''out.csv''')",
-    "select * from query_table('secret.csv')", "with q as (insert into leaderboard values (1, 'z') returning x) select * from q", "select * from store", "select getenv('HOME')"])
+@pytest.mark.parametrize(
+  "sql",
+  [
+    "select * from 'secret.csv'",
+    "select * from read_csv('secret.csv')",
+    "select * from read_text('{}/secret.csv')",
+    "select * from read_blob('results/../secret.csv')",
+    "select * from 'results/leaderboard.parquet/../../secret.csv'",
+    "select * from sniff_csv('secret.csv')",
+    "select * from glob('*')",
+    "select * from read_parquet('runs/latest/trace.parquet')",
+    "select * from read_parquet('results/*.parquet')",
+    "select * from 'results/../runs/latest/trace.parquet'",
+    "select * from read_parquet('http://localhost:1/x.parquet')",
+    "select * from query('copy (select 1) to ''out.csv''')",
+    "select * from query_table('secret.csv')",
+    "with q as (insert into leaderboard values (1, 'z') returning x) select * from q",
+    "select * from store",
+    "select getenv('HOME')",
+  ],
+)
 def test_a_path_trick_is_refused(tree, sql):
   before = every_file(tree)
   with pytest.raises(UserError) as error:
@@ -245,7 +363,10 @@ def test_a_path_trick_is_refused(tree, sql):
 def test_a_folder_whose_name_is_a_pattern(tree):
   """runs/a[1] as a pattern means runs/a1."""
   assert store.query("runs/a[1]", "select count(*) from trace")[1] == [(7,)]
-  assert store.query(store.views(("runs/a[1]", "runs/a1")))[1][-2:] == [("a_1__trace", 7, "x, y"), ("a1_trace", 8, "x, y")]
+  assert store.query(store.views(("runs/a[1]", "runs/a1")))[1][-2:] == [
+    ("a_1__trace", 7, "x, y"),
+    ("a1_trace", 8, "x, y"),
+  ]
 
 
 def test_query_on_the_command_line(tree, capsys):
@@ -256,20 +377,43 @@ def test_query_on_the_command_line(tree, capsys):
     out, err = capsys.readouterr()
     assert code == 0 and err == ""
     return out
-  assert json.loads(call("select x, x from leaderboard order by x", "--json")) == [{"x": 0, "x_1": 0}, {"x": 1, "x_1": 1}]
+
+  assert json.loads(call("select x, x from leaderboard order by x", "--json")) == [
+    {"x": 0, "x_1": 0},
+    {"x": 1, "x_1": 1},
+  ]
   assert json.loads(call("select 'nan'::float as x", "--json")) == [{"x": None}]
-  assert json.loads(call("--in", "runs/latest", "--in", "B=runs/other", "select max(x) - (select max(x) from latest_trace) as d from b_trace", "--json")) == [{"d": 1}]
-  assert json.loads(call("--json")) == [{"view": k, "rows": n, "columns": "x, y"} for k, n in (("leaderboard", 2), ("my_suite_2026", 4), ("walker_gear_runs", 3))]
-  assert json.loads(call("runs/latest", "--json")) == [{"view": "trace", "rows": 5, "columns": "x, y"}]
+  assert json.loads(
+    call(
+      "--in",
+      "runs/latest",
+      "--in",
+      "B=runs/other",
+      "select max(x) - (select max(x) from latest_trace) as d from b_trace",
+      "--json",
+    )
+  ) == [{"d": 1}]
+  assert json.loads(call("--json")) == [
+    {"view": k, "rows": n, "columns": "x, y"}
+    for k, n in (("leaderboard", 2), ("my_suite_2026", 4), ("walker_gear_runs", 3))
+  ]
+  assert json.loads(call("runs/latest", "--json")) == [
+    {"view": "trace", "rows": 5, "columns": "x, y"}
+  ]
   assert json.loads(call("runs/latest", "select count(*) as n from trace", "--json")) == [{"n": 5}]
   assert "[red]x" in call("select '[red]x' as x")  # no markup
-  for argv, word in ((["a", "b", "c"], "quotes"), (["runs/latest", "select 1", "--in", "runs/other"], "not both"), (["drop view leaderboard"], "DROP")):
+  for argv, word in (
+    (["a", "b", "c"], "quotes"),
+    (["runs/latest", "select 1", "--in", "runs/other"], "not both"),
+    (["drop view leaderboard"], "DROP"),
+  ):
     assert cli.main(["query", *argv]) == 2
     out, err = capsys.readouterr()
     assert out == "" and err.count("\n") == 1 and word in err
 
 
-# ---- the output folder ---------------------------------------------------------------------------------------------------------------
+# ---- the output folder ---------------------------------------------------------------------------
+
 
 def claim(out, resume=False, overwrite=False):
   return store.claim_folder(out, resume, overwrite)
@@ -298,22 +442,42 @@ def test_claim_of_a_folder_of_something_else(tmp_path):
   with pytest.raises(UserError) as error:
     claim(tmp_path)
   assert "holds no run" in one_line(error)
-  assert claim(tmp_path, overwrite=True) == "new" and (tmp_path / "thesis.tex").read_text() == "years"
+  assert (
+    claim(tmp_path, overwrite=True) == "new" and (tmp_path / "thesis.tex").read_text() == "years"
+  )
 
 
-@pytest.mark.parametrize("name", ["summary.json", "work/thesis.txt", "work/checkpoints/mine", "checkpoints/mine.txt", "agent/agent.npz"])
+@pytest.mark.parametrize(
+  "name",
+  [
+    "summary.json",
+    "work/thesis.txt",
+    "work/checkpoints/mine",
+    "checkpoints/mine.txt",
+    "agent/agent.npz",
+  ],
+)
 def test_what_is_somebody_elses_is_not_replaced(tmp_path, name):
   (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
   (tmp_path / name).write_text("years")
   for flags in ({"overwrite": True}, {"resume": True}):
     with pytest.raises(UserError) as error:
       claim(tmp_path, **flags)
-    assert re.search(f"but {name.split('/mine')[0].removesuffix('/agent.npz')}\\b", one_line(error)) and "another --out" in one_line(error)
+    assert re.search(
+      f"but {name.split('/mine')[0].removesuffix('/agent.npz')}\\b", one_line(error)
+    ) and "another --out" in one_line(error)
   assert (tmp_path / name).read_text() == "years"
 
 
 def test_what_was_cut_off_at_its_begin_goes_on(tmp_path):
-  for name in ("work/checkpoints/5/state", "work/trace-000005.npz", "work/trace.tmp.npz", "work/snapshots/x", "checkpoints/3/state", "demonstrator/policy_1.npz"):
+  for name in (
+    "work/checkpoints/5/state",
+    "work/trace-000005.npz",
+    "work/trace.tmp.npz",
+    "work/snapshots/x",
+    "checkpoints/3/state",
+    "demonstrator/policy_1.npz",
+  ):
     (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
     (tmp_path / name).write_text("")
   assert claim(tmp_path, resume=True) == "new" and claim(tmp_path, overwrite=True) == "new"
@@ -324,7 +488,10 @@ def test_claim_refuses_an_empty_name():
     claim("")
 
 
-@pytest.mark.parametrize("text, says", [("{", "broken"), ("", "broken"), ("[1]", "list"), ("null", "NoneType"), (None, "No such file")])
+@pytest.mark.parametrize(
+  "text, says",
+  [("{", "broken"), ("", "broken"), ("[1]", "list"), ("null", "NoneType"), (None, "No such file")],
+)
 def test_json_that_is_no_object_is_one_line(tmp_path, text, says):
   if text is not None:
     (tmp_path / "x.json").write_text(text)
@@ -361,7 +528,9 @@ def test_claim_that_cannot_make_the_folder(tmp_path, monkeypatch):
 def test_a_long_process_names_the_commit_that_it_began_with(monkeypatch):
   """Commits may come while it runs, and it has loaded none of them."""
   first = store.provenance()["git_commit"]
-  monkeypatch.setattr(store.subprocess, "run", lambda *a, **k: types.SimpleNamespace(stdout="another\n"))
+  monkeypatch.setattr(
+    store.subprocess, "run", lambda *a, **k: types.SimpleNamespace(stdout="another\n")
+  )
   assert store.provenance()["git_commit"] == first
   store._commit.cache_clear()
   assert store.provenance()["git_commit"] == "another"
@@ -370,6 +539,9 @@ def test_a_long_process_names_the_commit_that_it_began_with(monkeypatch):
 
 def test_provenance_names_versions_and_machine():
   import jax
+
   value = store.provenance()
-  assert value["versions"]["jax"] == jax.__version__ and value["machine"]["cores"] == len(workers.cores())
+  assert value["versions"]["jax"] == jax.__version__ and value["machine"]["cores"] == len(
+    workers.cores()
+  )
   json.dumps(value, allow_nan=False)

@@ -1,4 +1,7 @@
-"""Pretraining: exact resume, the train ratio, phases with a demonstrator, checkpoints that survive kills and refuse damage."""
+"""Pretraining: exact resume, the train ratio, phases with a demonstrator, checkpoints that survive
+kills and refuse damage.
+"""
+
 import copy
 import dataclasses
 import json
@@ -28,7 +31,12 @@ _collect = {}
 
 def make_trainer(env, out, dreamer=DREAMER, **config):
   """A small Trainer; those of one kind share their compiled rollout."""
-  trainer = train.Trainer(env, dreamer, TrainConfig(**dict(dict(envs=ENVS, updates=10_000, ratio=1.0, capacity=256), **config)), out)
+  trainer = train.Trainer(
+    env,
+    dreamer,
+    TrainConfig(**dict(dict(envs=ENVS, updates=10_000, ratio=1.0, capacity=256), **config)),
+    out,
+  )
   key = (id(env), bool(trainer.expert), trainer.config.demo_noise)
   trainer.collect = _collect.setdefault(key, trainer.collect)
   return trainer
@@ -43,7 +51,12 @@ class Counted:
   def __call__(self, state, replay, key, weights, active, updates):
     self.calls.append((updates, weights))
     bad = CAUSES.index("loss/rew") if np.isnan(self.metric) else -1
-    return state._replace(updates=state.updates + updates), replay, {"loss/rew": np.full(1, self.metric)}, np.full(1, bad)
+    return (
+      state._replace(updates=state.updates + updates),
+      replay,
+      {"loss/rew": np.full(1, self.metric)},
+      np.full(1, bad),
+    )
 
 
 def counted(trainer, **kwargs):
@@ -56,14 +69,24 @@ def counted(trainer, **kwargs):
 def expert_path(tmp_path_factory):
   """A demonstrator of random weights."""
   rng = np.random.default_rng(0)
-  layer = lambda a, b: (rng.standard_normal((a, b)).astype(np.float32) / np.sqrt(a), np.zeros(b, np.float32))
+  layer = lambda a, b: (
+    rng.standard_normal((a, b)).astype(np.float32) / np.sqrt(a),
+    np.zeros(b, np.float32),
+  )
   path = tmp_path_factory.mktemp("demo") / "policy.npz"
-  demonstrator.save(path, demonstrator.Policy(np.zeros(24, np.float32), np.ones(24, np.float32), (layer(24, 8), layer(8, 12))))
+  demonstrator.save(
+    path,
+    demonstrator.Policy(
+      np.zeros(24, np.float32), np.ones(24, np.float32), (layer(24, 8), layer(8, 12))
+    ),
+  )
   return str(path)
 
 
 def test_an_update_refreshes_the_latents_that_it_was_taken_on(short_walker, tmp_path):
-  """Stored latents are put to nought: after updates the sampled windows hold new ones, other records none."""
+  """Stored latents are put to nought: after updates the sampled windows hold new ones, other
+  records none.
+  """
   trainer = make_trainer(short_walker, tmp_path, ratio=0.25)
   while not trainer.updates:
     trainer.step()
@@ -71,12 +94,19 @@ def test_an_update_refreshes_the_latents_that_it_was_taken_on(short_walker, tmp_
   blank = data._replace(deter=jnp.zeros_like(data.deter), stoch=jnp.zeros_like(data.stoch))
   state = trainer.state
   updates = trainer.updates
-  _, replay, _, _ = trainer.learn["pure"](*jax.tree.map(jnp.copy, (state.train, state.replay._replace(data=blank))), jax.random.key(5), trainer._weights(), np.ones(1, bool), updates)
+  _, replay, _, _ = trainer.learn["pure"](
+    *jax.tree.map(jnp.copy, (state.train, state.replay._replace(data=blank))),
+    jax.random.key(5),
+    trainer._weights(),
+    np.ones(1, bool),
+    updates,
+  )
   fresh = np.asarray(replay.data.deter)[0].any(-1)
   assert LENGTH < fresh.sum() <= updates * BATCH * LENGTH and not fresh.all()
 
 
-# ---- resume ----------------------------------------------------------------------------------------------------------------------
+# ---- resume --------------------------------------------------------------------------------------
+
 
 def test_resume_gives_the_same_bits(short_walker, tmp_path, same):
   whole = make_trainer(short_walker, tmp_path / "whole", ratio=0.25)
@@ -100,14 +130,28 @@ def test_resume_gives_the_same_bits(short_walker, tmp_path, same):
   assert programs() == known  # a training that goes on compiles nothing anew
   assert second.updates == whole.updates == 8
   np.testing.assert_array_equal(second.returns.sums, whole.returns.sums)
-  assert (second.phase, second.owed, second.own) == (whole.phase, whole.owed, whole.own) and whole.own
-  timeless = lambda rows: [{k: v for k, v in row.items() if not k.endswith(("_s", "seconds")) and v is not None} for row in rows]
+  assert (second.phase, second.owed, second.own) == (
+    whole.phase,
+    whole.owed,
+    whole.own,
+  ) and whole.own
+  timeless = lambda rows: [
+    {k: v for k, v in row.items() if not k.endswith(("_s", "seconds")) and v is not None}
+    for row in rows
+  ]
   assert timeless(second.rows) == timeless(whole.rows)
 
 
 def test_randomised_faults_are_drawn_anew_with_each_episode(short_walker, tmp_path, same):
-  """Targets and severities of 40 robots whose episodes last 12 of 64 steps: new ones each chunk, uniform below the given severity; the same after resume."""
-  make = lambda: train.Trainer(short_walker, DREAMER, TrainConfig(envs=40, updates=10_000, ratio=0.001, capacity=256, fault="gear", severity=0.5), tmp_path)
+  """Targets and severities of 40 robots whose episodes last 12 of 64 steps: new ones each chunk,
+  uniform below the given severity; the same after resume.
+  """
+  make = lambda: train.Trainer(
+    short_walker,
+    DREAMER,
+    TrainConfig(envs=40, updates=10_000, ratio=0.001, capacity=256, fault="gear", severity=0.5),
+    tmp_path,
+  )
   trainer, drawn = make(), []
   severity = lambda t: np.asarray(t.state.streams.injection.plan.severity)[0, :, 0]
   for k in range(3):
@@ -117,15 +161,22 @@ def test_randomised_faults_are_drawn_anew_with_each_episode(short_walker, tmp_pa
       trainer.save()
   drawn = np.array(drawn)
   assert drawn.min() >= 0 and drawn.max() <= 0.5 and (np.diff(drawn, axis=0) != 0).all()
-  # 120 draws of a uniform: mean 0.25, its error 0.013; the largest of them below 0.45 with probability 0.9^120 = 3e-6
+  # 120 draws of a uniform: mean 0.25, its error 0.013; the largest of them below 0.45 with
+  # probability 0.9^120 = 3e-6
   assert abs(drawn.mean() - 0.25) < 0.05 and drawn.max() > 0.45
-  assert set(np.asarray(trainer.state.streams.injection.target)[0, :, 0]) == set(range(6))  # (5 / 6)^40 = 7e-4 to miss a given joint
+  assert set(np.asarray(trainer.state.streams.injection.target)[0, :, 0]) == set(
+    range(6)
+  )  # (5 / 6)^40 = 7e-4 to miss a given joint
   ended = np.zeros((1, 40), bool)
   ended[0, 3] = True
-  later = trainer.state.streams._replace(t=trainer.state.streams.t + 1)  # what is drawn follows from the clock
+  later = trainer.state.streams._replace(
+    t=trainer.state.streams.t + 1
+  )  # what is drawn follows from the clock
   some = trainer._redraw(later, ended)
   kept = np.arange(40) != 3
-  assert (severity(trainer)[kept] == np.asarray(some.injection.plan.severity)[0, kept, 0]).all() and severity(trainer)[3] != some.injection.plan.severity[0, 3, 0]
+  assert (
+    severity(trainer)[kept] == np.asarray(some.injection.plan.severity)[0, kept, 0]
+  ).all() and severity(trainer)[3] != some.injection.plan.severity[0, 3, 0]
   again = make()
   again.collect, again.learn = trainer.collect, trainer.learn
   again.resume()
@@ -136,17 +187,35 @@ def test_randomised_faults_are_drawn_anew_with_each_episode(short_walker, tmp_pa
 
 
 def test_a_preset_is_trained_under_as_it_is(short_walker, tmp_path):
-  """Severities, clocks and the targets that it names, for every robot, and still after a new draw; a target that it leaves open is drawn."""
-  trainer = train.Trainer(short_walker, DREAMER, TrainConfig(envs=3, fault="walker/gear-half-twice"), tmp_path)
+  """Severities, clocks and the targets that it names, for every robot, and still after a new draw;
+  a target that it leaves open is drawn.
+  """
+  trainer = train.Trainer(
+    short_walker, DREAMER, TrainConfig(envs=3, fault="walker/gear-half-twice"), tmp_path
+  )
   knee = trainer.fault[0].targets.index("right_knee")
-  for streams in (trainer.state.streams, trainer._redraw(trainer.state.streams, np.ones((1, 3), bool))):
+  for streams in (
+    trainer.state.streams,
+    trainer._redraw(trainer.state.streams, np.ones((1, 3), bool)),
+  ):
     injection = streams.injection
-    assert (np.asarray(injection.target) == knee).all() and (np.asarray(injection.plan.severity) == 0.5).all()
-    assert (np.asarray(injection.plan.onset) == [0, 20_000]).all() and (np.asarray(injection.plan.duration)[..., 0] == 10_000).all()
-  drawn = train.Trainer(short_walker, DREAMER, TrainConfig(envs=24, fault="walker/gear-half"), tmp_path)
-  assert set(np.asarray(drawn.state.streams.injection.target)[0, :, 0]) == set(range(6))  # 6 (5 / 6)^24 = 0.08 to miss one; the seed is fixed
-  for bad, text in ((dict(fault="walker/gear-half", severity=0.3), "brings its own severity"), (dict(fault="walker/gear-haf"), "walker/gear-half"),
-                    (dict(fault="quadruped/rh-velocity-third"), "of robot 'quadruped'")):
+    assert (np.asarray(injection.target) == knee).all() and (
+      np.asarray(injection.plan.severity) == 0.5
+    ).all()
+    assert (np.asarray(injection.plan.onset) == [0, 20_000]).all() and (
+      np.asarray(injection.plan.duration)[..., 0] == 10_000
+    ).all()
+  drawn = train.Trainer(
+    short_walker, DREAMER, TrainConfig(envs=24, fault="walker/gear-half"), tmp_path
+  )
+  assert set(np.asarray(drawn.state.streams.injection.target)[0, :, 0]) == set(
+    range(6)
+  )  # 6 (5 / 6)^24 = 0.08 to miss one; the seed is fixed
+  for bad, text in (
+    (dict(fault="walker/gear-half", severity=0.3), "brings its own severity"),
+    (dict(fault="walker/gear-haf"), "walker/gear-half"),
+    (dict(fault="quadruped/rh-velocity-third"), "of robot 'quadruped'"),
+  ):
     with pytest.raises(UserError, match=text):
       train.Trainer(short_walker, DREAMER, TrainConfig(**bad), tmp_path)
 
@@ -154,8 +223,10 @@ def test_a_preset_is_trained_under_as_it_is(short_walker, tmp_path):
 @pytest.fixture
 def begun(tmp_path, monkeypatch):
   """(arguments, folder) of a training that was cut off before its first chunk."""
+
   def cut(self):
     raise KeyboardInterrupt
+
   monkeypatch.setattr(train.Trainer, "step", cut)
   argv = ["train", "walker", "--preset", "tiny", "--out", str(tmp_path / "out")]
   assert cli.main(argv) == 130
@@ -169,7 +240,14 @@ def test_an_agent_of_before_is_gone_once_overwrite_begins(begun, capsys):
     (out / name).parent.mkdir(exist_ok=True)
     (out / name).write_text("old")
   assert cli.main([*argv, "--overwrite"]) == 130
-  assert not [p.name for p in (*(out / "agent").iterdir(), *(out / "demonstrator").iterdir()) if p.name != "notes.txt"] and (out / "agent/notes.txt").exists()
+  assert (
+    not [
+      p.name
+      for p in (*(out / "agent").iterdir(), *(out / "demonstrator").iterdir())
+      if p.name != "notes.txt"
+    ]
+    and (out / "agent/notes.txt").exists()
+  )
   capsys.readouterr()
   assert cli.main([*argv, "--resume"]) == 130 and "finished" not in capsys.readouterr().err
 
@@ -178,33 +256,61 @@ def test_overwrite_of_the_folder_that_the_agent_lies_in_is_refused(begun, capsys
   argv, out = begun
   config = (out / "config.json").read_text()
   shutil.copytree(agents.HERE / "walker", out / "agent")
-  assert cli.main([*argv, "--overwrite", "--agent", str(out / "agent"), "--set", "size=size1m", "bins=255"]) == 2
-  assert "another --out" in capsys.readouterr().err and (out / "agent/agent.npz").exists() and (out / "config.json").read_text() == config
+  assert (
+    cli.main(
+      [*argv, "--overwrite", "--agent", str(out / "agent"), "--set", "size=size1m", "bins=255"]
+    )
+    == 2
+  )
+  assert (
+    "another --out" in capsys.readouterr().err
+    and (out / "agent/agent.npz").exists()
+    and (out / "config.json").read_text() == config
+  )
 
 
 def test_what_a_demonstrator_asks_for_is_said_before_an_earlier_training_is_gone(begun, capsys):
   argv, out = begun
   before = (out / "config.json").read_text()
   assert cli.main([*argv, "--overwrite", "--demonstrator", "ppo", "--set", "clone=1000"]) == 2
-  assert "exceeds updates" in capsys.readouterr().err and (out / "config.json").read_text() == before
+  assert (
+    "exceeds updates" in capsys.readouterr().err and (out / "config.json").read_text() == before
+  )
 
 
 def test_a_shipped_agent_does_not_lie_in_the_folder_of_the_command(begun, monkeypatch, capsys):
   argv, out = begun
   monkeypatch.chdir(out)
-  assert cli.main([*argv[:-1], ".", "--overwrite", "--agent", "walker", "--set", "size=size1m", "bins=255"]) == 130, capsys.readouterr().err
+  assert (
+    cli.main(
+      [*argv[:-1], ".", "--overwrite", "--agent", "walker", "--set", "size=size1m", "bins=255"]
+    )
+    == 130
+  ), capsys.readouterr().err
 
 
 def test_the_demonstrator_of_a_resumed_training_may_be_named_in_another_way(tmp_path, monkeypatch):
-  """As a relative path, from another folder, and where its folder has moved; another file of the same name is another."""
+  """As a relative path, from another folder, and where its folder has moved; another file of the
+  same name is another.
+  """
   env, dreamer = envs.make("walker"), PRESETS["tiny"].dreamer
   config = replace(PRESETS["tiny"].train, clone=10, fade=10, pure=10)
   for name in ("a", "b"):
     (tmp_path / name).mkdir()
     (tmp_path / name / "policy.npz").write_text("")
   begun = dataclasses.replace(config, demonstrator=str(tmp_path / "a/policy.npz"))
-  (tmp_path / "config.json").write_text(json.dumps({"env": "walker", "seed": 0, "seeds": 1, "started_from": None, "dreamer": dataclasses.asdict(dreamer),
-                                                    "train": dataclasses.asdict(begun)}))
+  (tmp_path / "config.json").write_text(
+    json.dumps(
+      {
+        "env": "walker",
+        "seed": 0,
+        "seeds": 1,
+        "started_from": None,
+        "dreamer": dataclasses.asdict(dreamer),
+        "train": dataclasses.asdict(begun),
+      }
+    )
+  )
   same = lambda name: train.check_same(tmp_path, env, dreamer, config, 0, 1, name, None)
   monkeypatch.chdir(tmp_path / "b")
   assert same("../a/policy.npz") == same("elsewhere/policy.npz") == config.updates
@@ -224,26 +330,54 @@ def test_a_training_is_resumed_with_its_own_settings(begun, capsys):
   assert "another seed, lr, repeat;" in said and (out / "config.json").read_text() == before
   assert cli.main([*argv, "--resume", "--set", "updates=300"]) == 130  # more of the same
   assert json.loads((out / "config.json").read_text())["train"]["updates"] == 300
-  assert cli.main([*argv, "--resume", "--seeds", "2"]) == 2 and "another seeds;" in capsys.readouterr().err
+  assert (
+    cli.main([*argv, "--resume", "--seeds", "2"]) == 2
+    and "another seeds;" in capsys.readouterr().err
+  )
   ratio = json.loads((out / "config.json").read_text())["train"]["ratio"]
-  assert cli.main([*argv, "--resume", "--set", f"ratio={ratio:g}", "updates=300"]) == 130  # 16 is 16.0
+  assert (
+    cli.main([*argv, "--resume", "--set", f"ratio={ratio:g}", "updates=300"]) == 130
+  )  # 16 is 16.0
   (out / "agent").mkdir()
   (out / "agent/card.json").write_text("{}")
-  assert cli.main([*argv, "--resume", "--set", "updates=300"]) == 0 and "is finished" in capsys.readouterr().err
-  assert cli.main([*argv, "--resume", "--set", "updates=400"]) == 2 and "finished its 300 updates; go on with --agent" in capsys.readouterr().err
+  assert (
+    cli.main([*argv, "--resume", "--set", "updates=300"]) == 0
+    and "is finished" in capsys.readouterr().err
+  )
+  assert (
+    cli.main([*argv, "--resume", "--set", "updates=400"]) == 2
+    and "finished its 300 updates; go on with --agent" in capsys.readouterr().err
+  )
   (out / "config.json").write_text('{"command": "run"}')
   assert cli.main([*argv, "--resume"]) == 1 and "not a training's" in capsys.readouterr().err
 
 
 def test_resume_without_a_checkpoint(short_walker, tmp_path):
-  """One that was killed before its first checkpoint begins anew: as a fresh one, with the agent that it was to start from."""
+  """One that was killed before its first checkpoint begins anew: as a fresh one, with the agent
+  that it was to start from.
+  """
   with pytest.raises(FileError, match="no checkpoint"):
     make_trainer(short_walker, tmp_path).resume()
-  build = lambda resume: train.build(short_walker, DREAMER, TrainConfig(envs=4, updates=8, ratio=1.0, capacity=128), tmp_path / "cut", 3, 1, None, None, "tiny", "", resume)
+  build = lambda resume: train.build(
+    short_walker,
+    DREAMER,
+    TrainConfig(envs=4, updates=8, ratio=1.0, capacity=128),
+    tmp_path / "cut",
+    3,
+    1,
+    None,
+    None,
+    "tiny",
+    "",
+    resume,
+  )
   first = build(False)
   again = build(True)
   assert again.updates == 0 and json.loads((tmp_path / "cut/config.json").read_text())["seed"] == 3
-  assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(first.state.train), jax.tree.leaves(again.state.train)))
+  assert all(
+    np.array_equal(a, b)
+    for a, b in zip(jax.tree.leaves(first.state.train), jax.tree.leaves(again.state.train))
+  )
 
 
 @pytest.fixture
@@ -256,9 +390,16 @@ def trained(short_walker, tmp_path):
   return tmp_path, trainer
 
 
-META = {"without phase": lambda m: m.pop("phase"), "without owed": lambda m: m.pop("owed"), "without sums": lambda m: m.pop("sums"), "of words": lambda m: m.update(owed="x"),
-        "of None": lambda m: m.update(own=None), "another phase": lambda m: m.update(phase="clone"), "other robots": lambda m: m.update(sums=[[0.0]]),
-        "failed": lambda m: m.update(failed=[1])}
+META = {
+  "without phase": lambda m: m.pop("phase"),
+  "without owed": lambda m: m.pop("owed"),
+  "without sums": lambda m: m.pop("sums"),
+  "of words": lambda m: m.update(owed="x"),
+  "of None": lambda m: m.update(own=None),
+  "another phase": lambda m: m.update(phase="clone"),
+  "other robots": lambda m: m.update(sums=[[0.0]]),
+  "failed": lambda m: m.update(failed=[1]),
+}
 
 
 @pytest.mark.parametrize("kind", META)
@@ -267,11 +408,19 @@ def test_a_checkpoint_without_what_a_training_needs_is_one_line(trained, kind, s
   meta = trainer.checkpoints.load(trainer.state)[1]
   META[kind](meta)
   trainer.checkpoints.save(2, trainer.state, meta)
-  before = {k: v for k, v in vars(trainer).items() if k in ("rows", "failed", "phase", "phase_start", "owed", "own", "chunks", "seconds")}
+  before = {
+    k: v
+    for k, v in vars(trainer).items()
+    if k in ("rows", "failed", "phase", "phase_start", "owed", "own", "chunks", "seconds")
+  }
   state = trainer.state
   with pytest.raises(FileError, match="checkpoint 2 in .* is not a training's") as e:
     trainer.resume()
-  assert "\n" not in str(e.value) and trainer.state is state and before == {k: vars(trainer)[k] for k in before}
+  assert (
+    "\n" not in str(e.value)
+    and trainer.state is state
+    and before == {k: vars(trainer)[k] for k in before}
+  )
   if kind.startswith("without"):
     assert f"(no '{kind.split()[1]}')" in str(e.value)
 
@@ -289,13 +438,21 @@ def test_damaged_metrics_are_one_line(trained, damage):
 
 
 def test_actions_in_other_bounds_are_refused(short_walker, tmp_path):
-  """The policy lives in about -1 to 1, so an action that goes further or less far is named, with the remedy."""
+  """The policy lives in about -1 to 1, so an action that goes further or less far is named, with
+  the remedy.
+  """
   for low, high in ((-2, 2), (0, 1), (float("-inf"), float("inf"))):
     robot = copy.copy(short_walker)
     act = list(robot.spec.act)
     act[2] = act[2]._replace(low=low, high=high)
     robot.spec = robot.spec._replace(act=tuple(act))
-    with pytest.raises(UserError, match=f"action '{act[2].name}' of robot 'walker' has bounds {low:g} and {high:g}.* scale in the environment's `step`") as e:
+    with pytest.raises(
+      UserError,
+      match=(
+        f"action '{act[2].name}' of robot 'walker' has bounds {low:g} and {high:g}.* scale in "
+        "the environment's `step`"
+      ),
+    ) as e:
       train.Trainer(robot, DREAMER, TrainConfig(), tmp_path / "none")
     assert "\n" not in str(e.value) and not (tmp_path / "none").exists()
   for name in envs.ENVS:
@@ -303,7 +460,9 @@ def test_actions_in_other_bounds_are_refused(short_walker, tmp_path):
 
 
 def test_a_second_signal_saves_no_half_of_a_chunk(tmp_path):
-  """The first interrupt lets the chunk end and saves; one more, in the middle of it, leaves nothing whole to save."""
+  """The first interrupt lets the chunk end and saves; one more, in the middle of it, leaves nothing
+  whole to save.
+  """
   notes = []
 
   class Half:
@@ -316,32 +475,42 @@ def test_a_second_signal_saves_no_half_of_a_chunk(tmp_path):
 
     def save(self):
       notes.append("save")
+
   with pytest.raises(KeyboardInterrupt):
     train.run(Half())
   assert notes == ["step", "step"]
 
 
-# ---- train ratio -----------------------------------------------------------------------------------------------------------------
+# ---- train ratio ---------------------------------------------------------------------------------
 
-@pytest.mark.parametrize("ratio", [0.1, 1.0, 3.0])  # less than one update a chunk; a power of two; not a power of two
+
+@pytest.mark.parametrize(
+  "ratio", [0.1, 1.0, 3.0]
+)  # less than one update a chunk; a power of two; not a power of two
 def test_updates_follow_the_ratio(short_walker, tmp_path, ratio):
   trainer, chunks = make_trainer(short_walker, tmp_path, ratio=ratio), 20
   learn = counted(trainer)
   for _ in range(chunks):
     trainer.step()
   per_chunk = PER_CHUNK * ratio
-  assert chunks * per_chunk - per_chunk - 1 <= trainer.updates <= chunks * per_chunk  # at most a chunk's worth is owed
+  assert (
+    chunks * per_chunk - per_chunk - 1 <= trainer.updates <= chunks * per_chunk
+  )  # at most a chunk's worth is owed
   assert trainer.updates == sum(n for n, _ in learn.calls)
   assert all(n & (n - 1) == 0 for n, _ in learn.calls)  # powers of two: few programs
 
 
 def test_first_update_waits_for_windows_and_pays_no_backlog(short_walker, tmp_path):
-  trainer = make_trainer(short_walker, tmp_path, replace(DREAMER, batch=64), ratio=16.0)  # 512 windows; 8 updates a chunk
+  trainer = make_trainer(
+    short_walker, tmp_path, replace(DREAMER, batch=64), ratio=16.0
+  )  # 512 windows; 8 updates a chunk
   counted(trainer)
   counts, before = [], 0
   for _ in range(5):
     trainer.step()
-    windows = int(replay_lib.windows(jax.tree.map(lambda x: x[0], trainer.state.replay), LENGTH + 1))
+    windows = int(
+      replay_lib.windows(jax.tree.map(lambda x: x[0], trainer.state.replay), LENGTH + 1)
+    )
     counts.append((windows >= 64 * LENGTH, trainer.updates - before))
     before = trainer.updates
   assert not counts[0][0] and counts[-1][0]
@@ -349,18 +518,41 @@ def test_first_update_waits_for_windows_and_pays_no_backlog(short_walker, tmp_pa
 
 
 def test_published_protocol_starts_after_2048_records(tmp_path):
-  """16 robots, windows of 65: 1,024 of them exist after 128 vector steps. From there one update per record at ratio 1,024: about 498k by 500k records."""
+  """16 robots, windows of 65: 1,024 of them exist after 128 vector steps. From there one update per
+  record at ratio 1,024: about 498k by 500k records.
+  """
   from mjx_cl import envs
+
   dreamer = replace(PRESETS["tiny"].dreamer, batch=16, length=64)
-  trainer = train.Trainer(envs.make("walker", "native"), dreamer, TrainConfig(envs=16, updates=10**6, ratio=1024.0, capacity=1024), tmp_path)
+  trainer = train.Trainer(
+    envs.make("walker", "native"),
+    dreamer,
+    TrainConfig(envs=16, updates=10**6, ratio=1024.0, capacity=1024),
+    tmp_path,
+  )
   learn = counted(trainer)
   rows = [trainer.step() for _ in range(3)]
-  assert [r["records"] for r in rows] == [1024, 2048, 3072] and [u for u, _ in learn.calls] == [1024, 1024]
-  again = jax.tree.map(jnp.zeros_like, trainer.collect["pure"].chunk(trainer.state.train.params, trainer.state.streams, train.CHUNK)[1])
-  trainer.collect = {"pure": types.SimpleNamespace(chunk=lambda params, streams, steps, *_: (streams._replace(t=streams.t + steps), again))}  # time alone goes on
+  assert [r["records"] for r in rows] == [1024, 2048, 3072] and [u for u, _ in learn.calls] == [
+    1024,
+    1024,
+  ]
+  again = jax.tree.map(
+    jnp.zeros_like,
+    trainer.collect["pure"].chunk(trainer.state.train.params, trainer.state.streams, train.CHUNK)[
+      1
+    ],
+  )
+  trainer.collect = {
+    "pure": types.SimpleNamespace(
+      chunk=lambda params, streams, steps, *_: (streams._replace(t=streams.t + steps), again)
+    )
+  }  # time alone goes on
   while (row := trainer.step())["records"] < 499_000:
     pass
-  assert row["records"] == 488 * 1024 and row["updates"] == trainer.updates == sum(u for u, _ in learn.calls) == 487 * 1024  # 498,688 of 499,712
+  assert (
+    row["records"] == 488 * 1024
+    and row["updates"] == trainer.updates == sum(u for u, _ in learn.calls) == 487 * 1024
+  )  # 498,688 of 499,712
 
 
 def test_last_chunk_stops_at_the_last_update(short_walker, tmp_path):
@@ -376,33 +568,44 @@ def test_learning_rate_falls_over_the_last_updates(short_walker, tmp_path):
   learn = counted(trainer)
   while not trainer.done:
     trainer.step()
-  np.testing.assert_allclose([w.lr for _, w in learn.calls], [1, 1, 1, 1, 1, 0.8125, 0.625, 0.4375])  # a line from 1 at 32 to 0.25 at 64
+  np.testing.assert_allclose(
+    [w.lr for _, w in learn.calls], [1, 1, 1, 1, 1, 0.8125, 0.625, 0.4375]
+  )  # a line from 1 at 32 to 0.25 at 64
 
 
-# ---- phases ----------------------------------------------------------------------------------------------------------------------
+# ---- phases --------------------------------------------------------------------------------------
+
 
 def phases(env, out, expert_path, **config):
-  trainer = make_trainer(env, out, demonstrator=expert_path, clone_until=1.0, clone_weight=0.4, **config)
+  trainer = make_trainer(
+    env, out, demonstrator=expert_path, clone_until=1.0, clone_weight=0.4, **config
+  )
   learn = counted(trainer)
   trainer.expert_return = 1e9  # out of reach: the phases end by their update counts
   return trainer, learn
 
 
 def test_phases_follow_one_another(short_walker, tmp_path, expert_path):
-  trainer, learn = phases(short_walker, tmp_path, expert_path, updates=64, clone=16, fade=16, pure=32)
+  trainer, learn = phases(
+    short_walker, tmp_path, expert_path, updates=64, clone=16, fade=16, pure=32
+  )
   held = []
   while not trainer.done:
     labelled = trainer.step()["phase"] != "pure"
     replay = trainer.state.replay
     held.append(int(np.max(replay.count)))
-    written = np.asarray(replay.data.has_demo) & (np.arange(256) < np.asarray(replay.count)[..., None])
+    written = np.asarray(replay.data.has_demo) & (
+      np.arange(256) < np.asarray(replay.count)[..., None]
+    )
     if labelled and held[-1]:
       assert written.any()
     if not labelled:
       assert not written.any() and not trainer._drive().any()
   names = [row["phase"] for row in trainer.rows]
   assert names == ["clone"] * 2 + ["fade"] * 2 + ["pure"] * 4
-  assert held[3] == 0 and 0 < held[4] < held[2]  # emptied on entering the last phase, then filled anew
+  assert (
+    held[3] == 0 and 0 < held[4] < held[2]
+  )  # emptied on entering the last phase, then filled anew
   clone, policy = ([float(getattr(w, n)) for _, w in learn.calls] for n in ("clone", "policy"))
   np.testing.assert_allclose(clone, [0.4, 0.4, 0.4, 0.2, 0, 0, 0, 0])
   assert policy == [0, 0, 1, 1, 1, 1, 1, 1]
@@ -410,22 +613,38 @@ def test_phases_follow_one_another(short_walker, tmp_path, expert_path):
 
 
 def test_at_least_pure_updates_are_pure(short_walker, tmp_path, expert_path):
-  trainer, learn = phases(short_walker, tmp_path, expert_path, updates=100, clone=20, fade=30, pure=50)
+  trainer, learn = phases(
+    short_walker, tmp_path, expert_path, updates=100, clone=20, fade=30, pure=50
+  )
   while not trainer.done:
     trainer.step()
   assert sum(n for n, w in learn.calls if w.clone == 0.0) >= 50
 
 
 def test_expert_drives_its_share_and_is_labelled_everywhere(short_walker, tmp_path, expert_path):
-  trainer, _ = phases(short_walker, tmp_path, expert_path, updates=64, clone=16, fade=16, pure=32, demo_noise=0.0, demo_share=0.5)
+  trainer, _ = phases(
+    short_walker,
+    tmp_path,
+    expert_path,
+    updates=64,
+    clone=16,
+    fade=16,
+    pure=32,
+    demo_noise=0.0,
+    demo_share=0.5,
+  )
   trainer.step()
   data = jax.tree.map(lambda x: np.asarray(x)[0], trainer.state.replay.data)
   at = np.asarray(data.has_demo)
   assert at[:, :60].sum() > 0.8 * at[:, :60].size  # all but the last records of episodes
   for e in range(ENVS):
-    followed = np.allclose(data.action[e][at[e]], data.demo[e][at[e]], atol=1e-5)  # the expert's own action, without noise
+    followed = np.allclose(
+      data.action[e][at[e]], data.demo[e][at[e]], atol=1e-5
+    )  # the expert's own action, without noise
     assert followed == (e < 2), e
-  np.testing.assert_allclose(data.demo[at], demonstrator.load(expert_path)(data.obs[at]), atol=1e-5)  # float32 in another order
+  np.testing.assert_allclose(
+    data.demo[at], demonstrator.load(expert_path)(data.obs[at]), atol=1e-5
+  )  # float32 in another order
 
 
 def test_the_reference_driver_is_a_demonstrator(short_walker):
@@ -438,9 +657,16 @@ def test_the_reference_driver_is_a_demonstrator(short_walker):
 
 
 def test_cloning_ends_when_the_agent_is_good_enough(short_walker, tmp_path, expert_path):
-  trainer = make_trainer(short_walker, tmp_path, demonstrator=expert_path, clone_until=0.8, updates=20_000)
+  trainer = make_trainer(
+    short_walker, tmp_path, demonstrator=expert_path, clone_until=0.8, updates=20_000
+  )
   trainer.expert_return = 100.0
-  for own, phase in (([90.0] * 15, "clone"), ([70.0] * 16, "clone"), ([90.0] * 4 + [79.0] * 16, "clone"), ([10.0] * 4 + [81.0] * 16, "fade")):
+  for own, phase in (
+    ([90.0] * 15, "clone"),
+    ([70.0] * 16, "clone"),
+    ([90.0] * 4 + [79.0] * 16, "clone"),
+    ([10.0] * 4 + [81.0] * 16, "fade"),
+  ):
     trainer.own = own
     trainer._advance_phase()
     assert trainer.phase == phase, own
@@ -451,7 +677,8 @@ def test_phases_must_fit():
     TrainConfig(demonstrator="x", updates=100)
 
 
-# ---- files -----------------------------------------------------------------------------------------------------------------------
+# ---- files ---------------------------------------------------------------------------------------
+
 
 def test_metrics_are_written_and_readable(short_walker, tmp_path):
   trainer = make_trainer(short_walker, tmp_path, updates=16)
@@ -472,23 +699,48 @@ def test_returns_are_sums_over_episodes(short_walker, tmp_path):
   data = jax.tree.map(lambda x: np.asarray(x)[0], trainer.state.replay.data)
   episodes = [np.split(data.reward[e], np.flatnonzero(data.last[e]) + 1)[:-1] for e in range(ENVS)]
   assert row["episodes"] == sum(map(len, episodes)) == ENVS * (train.CHUNK // 12)
-  np.testing.assert_allclose(row["reward"], data.reward.sum() / (ENVS * train.CHUNK), rtol=0.05)  # the last step's reward arrives with the next chunk
-  np.testing.assert_allclose(row["return"], np.mean([np.sum(r) for e in episodes for r in e]), rtol=1e-5)  # float32 rewards
+  np.testing.assert_allclose(
+    row["reward"], data.reward.sum() / (ENVS * train.CHUNK), rtol=0.05
+  )  # the last step's reward arrives with the next chunk
+  np.testing.assert_allclose(
+    row["return"], np.mean([np.sum(r) for e in episodes for r in e]), rtol=1e-5
+  )  # float32 rewards
 
 
 def test_training_episodes_may_be_cut_and_some_robots_jittered(short_walker, tmp_path):
-  """Episodes end after `episode` steps, the robot's own length stands; the last half of the robots is jittered more and more and not reported."""
-  trainer = train.Trainer(short_walker, DREAMER, TrainConfig(envs=ENVS, updates=10_000, ratio=1.0, capacity=256, episode=8, jitter=0.4), tmp_path)
+  """Episodes end after `episode` steps, the robot's own length stands; the last half of the robots
+  is jittered more and more and not reported.
+  """
+  trainer = train.Trainer(
+    short_walker,
+    DREAMER,
+    TrainConfig(envs=ENVS, updates=10_000, ratio=1.0, capacity=256, episode=8, jitter=0.4),
+    tmp_path,
+  )
   counted(trainer)
-  np.testing.assert_allclose(trainer._jitter(), [[0.0] * (ENVS // 2) + [0.4 * k / (ENVS // 2) for k in range(1, ENVS // 2 + 1)]], rtol=1e-6)
+  np.testing.assert_allclose(
+    trainer._jitter(),
+    [[0.0] * (ENVS // 2) + [0.4 * k / (ENVS // 2) for k in range(1, ENVS // 2 + 1)]],
+    rtol=1e-6,
+  )
   row = trainer.step()
   data = jax.tree.map(lambda x: np.asarray(x)[0], trainer.state.replay.data)
   for e in range(ENVS):
-    assert np.all(np.diff(np.flatnonzero(data.last[e])) == 9)  # 8 decisions and the final observation
+    assert np.all(
+      np.diff(np.flatnonzero(data.last[e])) == 9
+    )  # 8 decisions and the final observation
   assert row["episodes"] == ENVS // 2 * (train.CHUNK // 8)
-  quiet = np.concatenate([r[:9] for e in range(ENVS // 2) for r in np.split(data.reward[e], np.flatnonzero(data.last[e]) + 1)[:-1]]).sum()
+  quiet = np.concatenate(
+    [
+      r[:9]
+      for e in range(ENVS // 2)
+      for r in np.split(data.reward[e], np.flatnonzero(data.last[e]) + 1)[:-1]
+    ]
+  ).sum()
   np.testing.assert_allclose(row["return"], quiet / row["episodes"], rtol=1e-5)  # float32 rewards
-  np.testing.assert_allclose(row["reward"], quiet / (ENVS // 2 * train.CHUNK), rtol=1e-5)  # 64 steps are eight whole episodes
+  np.testing.assert_allclose(
+    row["reward"], quiet / (ENVS // 2 * train.CHUNK), rtol=1e-5
+  )  # 64 steps are eight whole episodes
   assert trainer.env.spec.episode_steps == short_walker.spec.episode_steps == 12
   with pytest.raises(UserError, match="episode must be above 0"):
     TrainConfig(episode=0)
@@ -497,18 +749,29 @@ def test_training_episodes_may_be_cut_and_some_robots_jittered(short_walker, tmp
 
 
 def test_an_end_for_good_costs_until_the_last_updates(short_walker, tmp_path):
-  """Every second robot falls where its episodes end: its last records lose the cost, nobody else's do, no return does, and no record of the last updates."""
+  """Every second robot falls where its episodes end: its last records lose the cost, nobody else's
+  do, no return does, and no record of the last updates.
+  """
   falls = np.arange(ENVS) % 2 == 0
   replays, returns = [], []
-  for cost, pure in ((0.0, 1), (7.0, 1), (7.0, 10_000)):  # of 10,001 updates; the last trainer has one behind it
+  for cost, pure in (
+    (0.0, 1),
+    (7.0, 1),
+    (7.0, 10_000),
+  ):  # of 10,001 updates; the last trainer has one behind it
     trainer = make_trainer(short_walker, tmp_path, fall_cost=cost, pure=pure, updates=10_001)
-    trainer.state = trainer.state._replace(train=trainer.state.train._replace(updates=trainer.state.train.updates + 1))
+    trainer.state = trainer.state._replace(
+      train=trainer.state.train._replace(updates=trainer.state.train.updates + 1)
+    )
     counted(trainer)
     chunk = trainer.collect["pure"].chunk
 
     def fallen(*args, chunk=chunk):
       streams, rows = chunk(*args)
-      return streams, rows._replace(terminated=rows.truncated & falls, truncated=rows.truncated & ~falls)
+      return streams, rows._replace(
+        terminated=rows.truncated & falls, truncated=rows.truncated & ~falls
+      )
+
     trainer.collect = {"pure": types.SimpleNamespace(chunk=fallen)}
     returns.append(trainer.step()["return"])
     replays.append(jax.tree.map(lambda x: np.asarray(x)[0], trainer.state.replay.data))
@@ -527,11 +790,15 @@ def test_penalties_are_eased_and_nothing_else(short_walker, tmp_path):
   robot = copy.copy(short_walker)
   before = np.asarray(short_walker.model.task["reward_weights"]).copy()
   before[0] = -2.0
-  robot.model = robot.model._replace(task=robot.model.task | {"reward_weights": jnp.asarray(before)})
+  robot.model = robot.model._replace(
+    task=robot.model.task | {"reward_weights": jnp.asarray(before)}
+  )
   trainer = make_trainer(robot, tmp_path, penalties=0.25)
   at = trainer.collect["pure"].env
   assert at is not robot and trainer.env is robot  # what is evaluated in the end
-  np.testing.assert_array_equal(at.model.task["reward_weights"], np.where(before < 0, before * np.float32(0.25), before))
+  np.testing.assert_array_equal(
+    at.model.task["reward_weights"], np.where(before < 0, before * np.float32(0.25), before)
+  )
   np.testing.assert_array_equal(robot.model.task["reward_weights"], before)
   for name, leaf in robot.model.task.items():
     assert name == "reward_weights" or at.model.task[name] is leaf
@@ -541,7 +808,9 @@ def test_penalties_are_eased_and_nothing_else(short_walker, tmp_path):
 
 
 def test_the_policy_is_held_at_the_start_of_the_pure_phase(short_walker, tmp_path):
-  """Without its own gradient for the first `hold` updates; the anchor takes the robots' own actions for right, so no random ones may be among them."""
+  """Without its own gradient for the first `hold` updates; the anchor takes the robots' own actions
+  for right, so no random ones may be among them.
+  """
   trainer = make_trainer(short_walker, tmp_path, replace(DREAMER, anchor=0.5), hold=20)
   learn = counted(trainer)
   while trainer.updates < 40:
@@ -570,7 +839,9 @@ TREE = {"w": jnp.arange(6.0).reshape(2, 3), "n": jnp.int32(4), "key": jax.random
 
 
 def like(tree):
-  return jax.tree.map(lambda x: jnp.zeros_like(x) if not checkpoint._is_key(x) else jax.random.key(0), tree)
+  return jax.tree.map(
+    lambda x: jnp.zeros_like(x) if not checkpoint._is_key(x) else jax.random.key(0), tree
+  )
 
 
 @pytest.fixture
@@ -592,19 +863,24 @@ def test_round_trip_keeps_two(saved, same):
 
 
 DAMAGE = {
-    "truncated": lambda f: f.write_bytes(f.read_bytes()[:f.stat().st_size // 2]),
-    "emptied": lambda f: f.write_bytes(b""),
-    "garbage": lambda f: f.write_bytes(b"\x93\x00garbage" * 20),
-    "removed": lambda f: f.unlink()}
+  "truncated": lambda f: f.write_bytes(f.read_bytes()[: f.stat().st_size // 2]),
+  "emptied": lambda f: f.write_bytes(b""),
+  "garbage": lambda f: f.write_bytes(b"\x93\x00garbage" * 20),
+  "removed": lambda f: f.unlink(),
+}
 
 
 @pytest.mark.parametrize("kind", DAMAGE)
 def test_damaged_checkpoint_is_one_clear_line(saved, same, kind, capfd):
-  """The newest broken: said, and the one before it is taken; both broken: an error, and nothing is removed."""
+  """The newest broken: said, and the one before it is taken; both broken: an error, and nothing is
+  removed.
+  """
+
   def damage(number):
     for file in sorted((saved / number).rglob("*")):
       if file.is_file():
         DAMAGE[kind](file)
+
   both = saved.parent / "both"
   damage("2")
   shutil.copytree(saved, both)
@@ -612,7 +888,9 @@ def test_damaged_checkpoint_is_one_clear_line(saved, same, kind, capfd):
   tree, meta = store.load(like(TREE))
   assert same(tree, TREE | {"n": jnp.int32(1)}) and meta == {"number": 1} and store.latest() == 1
   (line,) = [x for x in capfd.readouterr().err.splitlines() if x.startswith("mjx-cl:")]
-  assert line.startswith(f"mjx-cl: cannot read checkpoint 2 in {saved}: ") and line.endswith("; it is broken, going on from checkpoint 1")
+  assert line.startswith(f"mjx-cl: cannot read checkpoint 2 in {saved}: ") and line.endswith(
+    "; it is broken, going on from checkpoint 1"
+  )
   store.save(2, TREE, {"number": 2})  # the number is free again
   assert same(store.load(like(TREE))[0], TREE)
   saved = both
@@ -620,7 +898,12 @@ def test_damaged_checkpoint_is_one_clear_line(saved, same, kind, capfd):
   before = sorted(p for p in both.rglob("*"))
   with pytest.raises(FileError) as e:
     checkpoint.Checkpoints(both).load(like(TREE))
-  assert "\n" not in str(e.value) and "checkpoint 2" in str(e.value) and str(both) in str(e.value) and sorted(p for p in both.rglob("*")) == before
+  assert (
+    "\n" not in str(e.value)
+    and "checkpoint 2" in str(e.value)
+    and str(both) in str(e.value)
+    and sorted(p for p in both.rglob("*")) == before
+  )
 
 
 def test_any_one_damaged_file_is_noticed_or_harmless(saved, same):
@@ -637,7 +920,10 @@ def test_any_one_damaged_file_is_noticed_or_harmless(saved, same):
   assert noticed >= 2 and len(files) > 2
 
 
-@pytest.mark.parametrize("other", [{"w": jnp.zeros((2, 4))}, {"w": jnp.zeros((3, 2))}, {"w": jnp.zeros(6)}, {"more": jnp.zeros(2)}])
+@pytest.mark.parametrize(
+  "other",
+  [{"w": jnp.zeros((2, 4))}, {"w": jnp.zeros((3, 2))}, {"w": jnp.zeros(6)}, {"more": jnp.zeros(2)}],
+)
 def test_checkpoint_of_another_size_is_one_clear_line(saved, other):
   with pytest.raises(FileError) as e:
     checkpoint.Checkpoints(saved).load(like(TREE) | other)
@@ -659,8 +945,13 @@ store.save(3, {"w": jnp.ones((2, 3))}, {"number": 3})
 
 def test_kill_during_a_save_keeps_the_last_good_checkpoint(saved, same):
   root = str(pathlib.Path(checkpoint.__file__).parents[1])
-  env = os.environ | {"PYTHONPATH": os.pathsep.join([root, os.environ.get("PYTHONPATH", "")]), "JAX_PLATFORMS": "cpu"}
-  done = subprocess.run([sys.executable, "-c", CHILD, str(saved)], env=env, capture_output=True, text=True, timeout=120)
+  env = os.environ | {
+    "PYTHONPATH": os.pathsep.join([root, os.environ.get("PYTHONPATH", "")]),
+    "JAX_PLATFORMS": "cpu",
+  }
+  done = subprocess.run(
+    [sys.executable, "-c", CHILD, str(saved)], env=env, capture_output=True, text=True, timeout=120
+  )
   assert done.returncode == 9, done.stderr
   left = [p.name for p in saved.iterdir() if p.name not in ("1", "2")]
   assert any(n.startswith("3.") for n in left)  # the half-written folder, under its temporary name
@@ -678,5 +969,3 @@ def test_empty_temporary_folder_is_no_checkpoint(saved):
     if file.is_file():
       file.unlink()
   assert checkpoint.Checkpoints(saved).latest() == 2
-
-

@@ -1,4 +1,7 @@
-"""Aggregates with intervals, after rliable's definitions (Agarwal et al. 2021): interquartile mean and percentile bootstrap."""
+"""Aggregates with intervals, after rliable's definitions (Agarwal et al. 2021): interquartile mean
+and percentile bootstrap.
+"""
+
 from __future__ import annotations
 
 import functools
@@ -10,7 +13,9 @@ REPS = 20_000
 
 
 def iqm(x: np.ndarray, axis: int = -1) -> np.ndarray:
-  """Mean of the middle half: floor(n / 4) values are cut at each end (scipy.stats.trim_mean with 0.25, rliable's IQM)."""
+  """Mean of the middle half: floor(n / 4) values are cut at each end (scipy.stats.trim_mean with
+  0.25, rliable's IQM).
+  """
   x = np.sort(np.asarray(x, float), axis)
   n = x.shape[axis]
   cut = n // 4
@@ -21,7 +26,8 @@ def interval(x, statistic=iqm, seed: int = 0, level: float = 0.95) -> list[float
   """Percentile bootstrap interval of `statistic` over runs.
 
   Args:
-    x: values of the runs (n,); with strata, (n, strata): each column is resampled by itself (rliable's stratified bootstrap).
+    x: values of the runs (n,); with strata, (n, strata): each column is resampled by itself
+      (rliable's stratified bootstrap).
     statistic: called as statistic(values, axis=-1) on (REPS, values).
   Returns:
     [low, high], or None for fewer than two values.
@@ -42,7 +48,9 @@ def interval(x, statistic=iqm, seed: int = 0, level: float = 0.95) -> list[float
 
 @functools.lru_cache(maxsize=64)
 def draws(n: int, reps: int, seed: int = 0) -> np.ndarray:
-  """Resampled runs of a bootstrap, int (reps, n), read-only. Whatever shares them keeps what its numbers have in common within a run."""
+  """Resampled runs of a bootstrap, int (reps, n), read-only. Whatever shares them keeps what its
+  numbers have in common within a run.
+  """
   index = np.random.default_rng(seed).integers(0, n, (reps, n))
   index.flags.writeable = False
   return index
@@ -50,7 +58,9 @@ def draws(n: int, reps: int, seed: int = 0) -> np.ndarray:
 
 @functools.lru_cache(maxsize=64)
 def weights(n: int, reps: int, seed: int = 0) -> np.ndarray:
-  """How often each run is in each of `draws`, over n: float (reps, n), read-only; weights @ values are the means of the resampled values."""
+  """How often each run is in each of `draws`, over n: float (reps, n), read-only; weights @ values
+  are the means of the resampled values.
+  """
   counts = np.zeros((reps, n))
   np.add.at(counts, (np.arange(reps)[:, None], draws(n, reps, seed)), 1.0 / n)
   counts.flags.writeable = False
@@ -61,20 +71,28 @@ def ends(statistics, level: float = 0.95) -> list[list[float | None] | None]:
   """Percentile intervals of several bootstrapped statistics at once.
 
   Args:
-    statistics: float (k, reps). nan: undefined in that draw, left out; inf: a censored time, an end that falls on one is None.
+    statistics: float (k, reps). nan: undefined in that draw, left out; inf: a censored time, an end
+      that falls on one is None.
   Returns:
-    k times [low, high], None where fewer than half of the draws define the statistic or both ends are undefined.
+    k times [low, high], None where fewer than half of the draws define the statistic or both ends
+    are undefined.
   """
   out = []
   for row in np.sort(np.asarray(statistics, float), -1):  # nan comes last
     known = len(row) - int(np.sum(np.isnan(row)))
-    pair = [finite(row[int(round((known - 1) * q))]) for q in ((1 - level) / 2, (1 + level) / 2)] if 2 * known >= len(row) and known else None
+    pair = (
+      [finite(row[int(round((known - 1) * q))]) for q in ((1 - level) / 2, (1 + level) / 2)]
+      if 2 * known >= len(row) and known
+      else None
+    )
     out.append(None if pair in (None, [None, None]) else pair)
   return out
 
 
 def censored_median(x, axis: int = -1) -> np.ndarray:
-  """Median of times in which a censored run counts as infinite (Kaplan-Meier's median where all are censored at the end)."""
+  """Median of times in which a censored run counts as infinite (Kaplan-Meier's median where all are
+  censored at the end).
+  """
   x = np.sort(np.asarray(x, float), axis)
   return np.take(x, (x.shape[axis] - 1) // 2, axis)
 
@@ -85,7 +103,9 @@ def share(x, axis: int = -1) -> np.ndarray:
 
 
 def wilson(hits: int, n: int) -> list[float] | None:
-  """Wilson 95 % interval of a proportion; unlike the bootstrap it is not of width zero at 0 or n hits."""
+  """Wilson 95 % interval of a proportion; unlike the bootstrap it is not of width zero at 0 or n
+  hits.
+  """
   if not n:
     return None
   z, p = 1.959964, hits / n
