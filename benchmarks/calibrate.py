@@ -80,14 +80,15 @@ def settled(folder) -> list[dict]:
   (steps,), skip: rows of refitting at their start}.
   """
   import pathlib
-  from mjx_cl import store
+
+  from mjx_cl.io import tables
 
   folder, out = pathlib.Path(folder), []
   config = json.loads((folder / "config.json").read_text())
   if config["first_seed"] < 100 or config["first_seed"] + config["seeds"] > 110:
     raise SystemExit(f"{folder}: seeds must be those that tune, 100 to 109")
-  columns = store.read_table(folder / "trace.parquet")
-  events = store.read_rows(folder / "events.parquet")
+  columns = tables.read_table(folder / "trace.parquet")
+  events = tables.read_rows(folder / "events.parquet")
   for g in np.unique(columns["stream"]):
     own = [e for e in events if e["stream"] == g]
     stop = next((e["step"] + 1 for e in own if e["kind"] == "stop"), None)
@@ -130,10 +131,14 @@ def main() -> None:
   parser.add_argument("--json", action="store_true")
   args = parser.parse_args()
   import os
-  from mjx_cl import runtime
+
+  from mjx_cl.io import runtime
 
   runtime.setup()
-  from mjx_cl import agents, envs, record, store
+  from mjx_cl import envs
+  from mjx_cl.io import tables
+  from mjx_cl.rollout import frozen
+  from mjx_cl.training import agents
 
   seeds = range(100, 110)
   begin = time.time()
@@ -146,11 +151,11 @@ def main() -> None:
     tell = lambda done, steps: (
       print(f"{done}/{steps}", file=sys.stderr) if done % 6400 == 0 else None
     )
-    nominal = record.record(
-      env, trained, record.stream_keys(seeds, args.streams), args.steps, progress=tell
+    nominal = frozen.record(
+      env, trained, frozen.stream_keys(seeds, args.streams), args.steps, progress=tell
     )
-    fault = record.record(
-      env, trained, record.stream_keys(seeds, 4), 7500, *TUNE[args.robot], 5000, progress=tell
+    fault = frozen.record(
+      env, trained, frozen.stream_keys(seeds, 4), 7500, *TUNE[args.robot], 5000, progress=tell
     )
     data = {f"n_{k}": nominal[k] for k in ("opr", "rpr", "reward")} | {
       f"f_{k}": fault[k] for k in ("opr", "rpr", "reward", "target")
@@ -273,9 +278,9 @@ def main() -> None:
     "plain": plain,
     "frontier": sorted(good, key=finds, reverse=True)[:20],
     "wall_s": round(time.time() - begin),
-    **store.provenance(),
+    **tables.provenance(),
   }
-  store.write_json(args.out, value)
+  tables.write_json(args.out, value)
   out = [
     {
       "name": name,

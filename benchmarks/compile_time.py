@@ -24,6 +24,7 @@ import dreamer_update
 def update():
   """(jitted function, its arguments)."""
   import jax
+
   from mjx_cl.config import PRESETS
   from mjx_cl.dreamer.agent import Agent
 
@@ -36,9 +37,10 @@ def digest():
   """Likewise, for the first stream of a run."""
   import jax
   import jax.numpy as jnp
-  from mjx_cl import run
-  from mjx_cl.adapt.crew import cut
+
+  from mjx_cl.adapt.blocks import cut
   from mjx_cl.config import CHUNK, RunConfig
+  from mjx_cl.runs import run
 
   runner = run.Runner(
     RunConfig(env="walker", seeds=2, arms=("detector",), steps=10_000), tempfile.gettempdir()
@@ -60,9 +62,10 @@ def main() -> None:
   programs = {"update": update, "digest": digest}
   if len(sys.argv) != 2 or sys.argv[1] not in programs:
     sys.exit(f"usage: python benchmarks/compile_time.py {'|'.join(programs)}")
-  import mjx_cl  # noqa: F401  its settings before JAX's own
   import jax
   import numpy as np
+
+  import mjx_cl  # noqa: F401  its settings before JAX's own
 
   jax.config.update("jax_enable_compilation_cache", False)
   program, given = programs[sys.argv[1]]()

@@ -69,6 +69,7 @@ def batch(agent, key):
   """Random windows as replay gives them."""
   import jax
   import jax.numpy as jnp
+
   from mjx_cl.dreamer.agent import Batch
 
   c, keys = agent.config, jax.random.split(key, 4)
@@ -93,6 +94,7 @@ def updater(size: str, last_starts: int = 0, seeds: int = 0, how: str = "map", *
   `vmap` on one device, `devices`: `map` on each of several.
   """
   import jax
+
   from mjx_cl.config import PRESETS
   from mjx_cl.dreamer.agent import Agent
 
@@ -113,7 +115,7 @@ def updater(size: str, last_starts: int = 0, seeds: int = 0, how: str = "map", *
     }[how]
     holder = [jax.jit(jax.vmap(agent.init))(jax.random.split(jax.random.key(0), seeds))]
     if how == "devices":  # as train.make_learn shares seeds
-      from mjx_cl.train import seeds_mesh
+      from mjx_cl.training.trainer import seeds_mesh
 
       mesh, mine = seeds_mesh(seeds), jax.sharding.PartitionSpec("seeds")
       many = jax.shard_map(many, mesh=mesh, in_specs=mine, out_specs=mine, check_vma=False)
@@ -130,6 +132,7 @@ def actor(groups: int, members: int):
   """64 decisions of groups x members robots without physics; observations are fixed."""
   import jax
   import jax.numpy as jnp
+
   from mjx_cl.config import PRESETS
   from mjx_cl.dreamer.agent import Agent
 
@@ -158,10 +161,11 @@ def watcher(groups: int, members: int):
   """The monitor over one chunk of 64 control steps."""
   import jax
   import jax.numpy as jnp
+
   from mjx_cl.config import PRESETS
   from mjx_cl.dreamer.agent import Agent
-  from mjx_cl.monitor import Monitor
-  from mjx_cl.rollout import Row
+  from mjx_cl.rollout.monitor import Monitor
+  from mjx_cl.rollout.scan import Row
 
   agent = Agent(PRESETS["cpu"].dreamer, 24, 6)
   monitor = Monitor(agent)
@@ -209,7 +213,7 @@ def on_gpu(clock: Clock) -> tuple[float | None, float | None]:
 
 COMPILE = """
 import sys, time
-from mjx_cl import runtime; runtime.setup()
+from mjx_cl.io import runtime; runtime.setup()
 import jax
 sys.path.insert(0, {here!r})
 import dreamer_update as bench
@@ -223,10 +227,11 @@ begin = time.perf_counter(); run(); print(first - (time.perf_counter() - begin))
 def roller():
   """One chunk of the rollout program of a run: acting, fault and native physics of 40 streams."""
   import jax
+
   from mjx_cl import envs, faults
   from mjx_cl.config import PRESETS
   from mjx_cl.dreamer.agent import Agent
-  from mjx_cl.rollout import Rollout, nest, start
+  from mjx_cl.rollout.scan import Rollout, nest, start
 
   env = envs.make("walker", "native")
   agent, fault = Agent(PRESETS["cpu"].dreamer, 24, 6), faults.make("gear", env)
@@ -265,7 +270,7 @@ def compile_times() -> dict[str, tuple[float, float]]:
 
 ALLOCATOR = """
 import sys
-from mjx_cl import runtime; runtime.setup()
+from mjx_cl.io import runtime; runtime.setup()
 sys.path.insert(0, {here!r})
 import dreamer_update as bench
 print(bench.Clock().measure({{"x": bench.updater("size1m")}}, 12)["x"])
@@ -302,7 +307,7 @@ def main() -> None:
     "--quick", action="store_true", help="size1m's update and acting alone, few rounds"
   )
   args = parser.parse_args()
-  from mjx_cl import runtime
+  from mjx_cl.io import runtime
 
   shared = runtime.sharing(SEEDS)
   runtime.setup(

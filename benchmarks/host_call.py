@@ -33,6 +33,7 @@ def calls():
   """A program of 2,000 calls."""
   import jax
   import jax.numpy as jnp
+
   from mjx_cl.physics import by_name
 
   x = jnp.zeros((40, 3), jnp.uint32)
@@ -47,8 +48,9 @@ def calls():
 def chunk():
   """64 control steps of ten walkers."""
   import jax
-  from mjx_cl import run
+
   from mjx_cl.config import CHUNK, RunConfig
+  from mjx_cl.runs import run
 
   runner = run.Runner(
     RunConfig(env="walker", seeds=10, arms=("none",), steps=10_000), tempfile.gettempdir()
@@ -60,8 +62,9 @@ def chunk():
 
 def measure(make, rounds: int) -> dict[str, float]:
   """Median seconds of each form, which take turns."""
-  from mjx_cl.physics import by_name
   from physics import race  # the script beside this one
+
+  from mjx_cl.physics import by_name
 
   asked, programs = by_name.registered, {}
   for form in FORMS:
@@ -74,7 +77,7 @@ def measure(make, rounds: int) -> dict[str, float]:
 
 def first(form: str) -> float:
   """Seconds until the first chunk is there, its robot and agent apart."""
-  from mjx_cl import runtime
+  from mjx_cl.io import runtime
 
   runtime.setup()
   use(form)
@@ -92,7 +95,7 @@ def main() -> None:
   if args.first:
     print(first(args.first))
     return
-  from mjx_cl import runtime, store
+  from mjx_cl.io import runtime, tables
 
   runtime.setup()
   from mjx_cl.physics import by_name
@@ -121,7 +124,7 @@ def main() -> None:
   if args.json:
     print(
       json.dumps(
-        {"command": "python benchmarks/host_call.py --json", **store.provenance(), "rows": rows},
+        {"command": "python benchmarks/host_call.py --json", **tables.provenance(), "rows": rows},
         indent=1,
       )
     )

@@ -60,10 +60,11 @@ def main() -> None:
   matplotlib.use("Agg")
   import matplotlib.pyplot as plt
   import numpy as np
-  from mjx_cl import store
-  from mjx_cl.scoring import bootstrap
 
-  table = store.read_table(pathlib.Path(args.train) / "metrics.parquet")
+  from mjx_cl.io import tables
+  from mjx_cl.scoring import intervals
+
+  table = tables.read_table(pathlib.Path(args.train) / "metrics.parquet")
   out = pathlib.Path(args.out)
   out.mkdir(parents=True, exist_ok=True)
   seeds = curves(table)
@@ -84,15 +85,15 @@ def main() -> None:
     "adv_mag",
     "ent/action",
   )
-  store.write_table(out / "curve.parquet", {c: table[c][ended] for c in columns if c in table})
+  tables.write_table(out / "curve.parquet", {c: table[c][ended] for c in columns if c in table})
   then = None
   if args.then:
-    then = store.read_table(pathlib.Path(args.then) / "metrics.parquet")
+    then = tables.read_table(pathlib.Path(args.then) / "metrics.parquet")
     for name, share in (("updates", 1), ("records", 1), ("seconds", len(seeds))):
       then[name] = then[name] + table[name][-1] / share
     ((rows, _),) = curves(then).values()
     then = {c: then[c][rows] for c in columns if c in then}
-    store.write_table(out / "then.parquet", then)
+    tables.write_table(out / "then.parquet", then)
   fig, axes = plt.subplots(1, 3, figsize=(13, 3.8), sharey=True, constrained_layout=True)
   scales = (
     ("updates", 1.0, "updates of each seed"),
@@ -119,7 +120,7 @@ def main() -> None:
           for rows, values in seeds.values()
         ]
         if np.isfinite(means).all():
-          lo, hi = bootstrap.interval(means, lambda v, axis: np.mean(v, axis))
+          lo, hi = intervals.interval(means, lambda v, axis: np.mean(v, axis))
           middle, low, high, at = (
             middle + [np.mean(means)],
             low + [lo],

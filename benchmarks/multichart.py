@@ -16,13 +16,17 @@ import sys
 
 import numpy as np
 
-from mjx_cl import runtime
+from mjx_cl.io import runtime
 
 runtime.setup()
 
-from mjx_cl import cli, detectors, leaderboard, passes, store, streams  # noqa: E402
-from mjx_cl.detectors.references import REFERENCES  # noqa: E402
-from mjx_cl.scoring import bootstrap, metrics  # noqa: E402
+from mjx_cl import detectors
+from mjx_cl.cli import app
+from mjx_cl.detectors.baselines import REFERENCES  # noqa: E402
+from mjx_cl.io import tables as store  # noqa: E402
+from mjx_cl.leaderboard import score as leaderboard
+from mjx_cl.leaderboard import streams, sweep
+from mjx_cl.scoring import intervals, metrics  # noqa: E402
 
 
 def tuning(held: streams.StreamSet, robot: str) -> leaderboard.Data:
@@ -46,7 +50,7 @@ def standing(entry: leaderboard.Entry, data: leaderboard.Data, samples) -> dict:
   hour of one detector.
   """
   found = leaderboard.examine(
-    entry, data, passes.Runner(entry.own(data.robot) if entry.own else entry.build), samples
+    entry, data, sweep.Runner(entry.own(data.robot) if entry.own else entry.build), samples
   )
   seeds = sorted(set(data.fault.seed.tolist()))
   alarms = dict(zip(seeds, found.nominal_fired[data.count_from :].sum(0)))
@@ -58,7 +62,7 @@ def standing(entry: leaderboard.Entry, data: leaderboard.Data, samples) -> dict:
     data.fault.control_s,
   )
   seed = np.stack([values["cost_standard"][data.fault.seed == s].mean() for s in seeds])
-  ends = bootstrap.ends((bootstrap.weights(len(seeds), metrics.REPS) @ seed)[None])[0]
+  ends = intervals.ends((intervals.weights(len(seeds), metrics.REPS) @ seed)[None])[0]
   return {
     "threshold": found.threshold,
     "score": float(values["cost_standard"].mean()),
@@ -83,7 +87,7 @@ def main(args: argparse.Namespace) -> None:
     one = data[robot][0]
     data[robot] = (
       one,
-      passes.samples(
+      sweep.samples(
         leaderboard.joined(one.tune.residual, one.score.residual),
         one.fault.residual,
         one.fault.onset,
@@ -135,4 +139,4 @@ def main(args: argparse.Namespace) -> None:
 if __name__ == "__main__":
   parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
   parser.add_argument("--out", default="results/multichart.json")
-  sys.exit(cli.attempt(lambda: main(parser.parse_args())))
+  sys.exit(app.attempt(lambda: main(parser.parse_args())))

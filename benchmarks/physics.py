@@ -14,7 +14,7 @@ import statistics
 import sys
 import time
 
-from mjx_cl import runtime
+from mjx_cl.io import runtime
 
 runtime.setup()
 

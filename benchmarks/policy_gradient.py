@@ -24,7 +24,7 @@ import dataclasses
 import json
 import sys
 
-from mjx_cl import runtime
+from mjx_cl.io import runtime
 
 runtime.setup()
 
@@ -32,11 +32,17 @@ import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 
-from mjx_cl import agents, cli, envs, faults, replay, store  # noqa: E402
-from mjx_cl.dreamer import nets  # noqa: E402
+from mjx_cl import envs, faults
+from mjx_cl.cli import app
+from mjx_cl.dreamer import (
+  nets,  # noqa: E402
+  replay,
+)
 from mjx_cl.dreamer.agent import Agent, Weights  # noqa: E402
-from mjx_cl.rollout import Rollout, nest, records, start  # noqa: E402
-from mjx_cl.scoring import bootstrap  # noqa: E402
+from mjx_cl.io import tables  # noqa: E402
+from mjx_cl.rollout.scan import Rollout, nest, records, start  # noqa: E402
+from mjx_cl.scoring import intervals  # noqa: E402
+from mjx_cl.training import agents
 
 CHUNK, FACTORS, DREAMS = 64, (0, 1, -1, 3, -3), 20
 
@@ -158,7 +164,7 @@ def measure(args) -> dict:
         "promise": (promised[i] - promised[0]) / agent.config.imagine,
         "reward": float(earned[i].mean()),
         "gain": float(gain.mean()),
-        "gain_ci": bootstrap.interval(gain, np.mean),
+        "gain_ci": intervals.interval(gain, np.mean),
         "terminations": int(ends[i]),
       }
     )
@@ -173,7 +179,7 @@ def measure(args) -> dict:
     "signal_to_noise": signal,
     "slope": (at[args.size]["gain"] - at[-args.size]["gain"]) / 2,
     "rows": rows,
-    **store.provenance(),
+    **tables.provenance(),
   }
 
 
@@ -219,4 +225,4 @@ def parser() -> argparse.ArgumentParser:
 
 
 if __name__ == "__main__":
-  sys.exit(cli.attempt(lambda: main(parser().parse_args())))
+  sys.exit(app.attempt(lambda: main(parser().parse_args())))

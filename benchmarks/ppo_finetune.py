@@ -1,7 +1,7 @@
 """What a model-free learner makes of the same faults: brax's PPO, pretrained on the healthy robot,
 goes on learning on the broken one.
 
-  python -m mjx_cl.demonstrator walker --out runs/ppo_walker --steps 8000000
+  python -m mjx_cl.training.demonstrator walker --out runs/ppo_walker --steps 8000000
   python benchmarks/ppo_finetune.py walker --policy runs/ppo_walker --fault walker/gear-half --json
 
 The robots are those of `mjx-cl run` with the same seeds: same joint, same starts, same clock, one
@@ -32,7 +32,7 @@ import sys
 import time
 import types
 
-from mjx_cl import runtime
+from mjx_cl.io import runtime
 
 runtime.setup()
 
@@ -41,13 +41,16 @@ import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 import optax  # noqa: E402
 
-from mjx_cl import cli, demonstrator, envs, faults, store  # noqa: E402
-from mjx_cl.adapters import brax  # noqa: E402
+from mjx_cl import envs, faults
+from mjx_cl.cli import app
 from mjx_cl.config import RunConfig, becomes, changes  # noqa: E402
 from mjx_cl.dreamer.agent import Carry  # noqa: E402
+from mjx_cl.envs.adapters import brax  # noqa: E402
 from mjx_cl.errors import FileError, UserError  # noqa: E402
-from mjx_cl.rollout import Rollout, nest, start  # noqa: E402
-from mjx_cl.scoring import bootstrap, normalised, recovery  # noqa: E402
+from mjx_cl.io import tables  # noqa: E402
+from mjx_cl.rollout.scan import Rollout, nest, start  # noqa: E402
+from mjx_cl.scoring import intervals, normalised_recovery, recovery  # noqa: E402
+from mjx_cl.training import demonstrator
 
 CHUNK, WARMUP = (
   64,
@@ -183,7 +186,7 @@ def measure(args) -> dict:
   except FileError:
     raise FileError(
       f"{args.policy} holds no PPO policy of {args.env!r}; train one with: python -m "
-      f"mjx_cl.demonstrator {args.env} --out DIR"
+      f"mjx_cl.training.demonstrator {args.env} --out DIR"
     ) from None
   net = demonstrator.networks_of(env)
   actor = Actor(net, len(env.spec.act))
@@ -233,7 +236,7 @@ def measure(args) -> dict:
         learning + time.monotonic() - clock,
       )
   if args.keep:
-    store.write_table(
+    tables.write_table(
       pathlib.Path(args.keep),
       {
         "step": np.tile(np.arange(args.steps, dtype=np.int32), len(labels)),
@@ -271,7 +274,7 @@ def measure(args) -> dict:
     "wall_s": time.monotonic() - began,
     "wall_s_updates": learning,
     **value,
-    **store.provenance(),
+    **tables.provenance(),
   }
 
 
@@ -304,7 +307,7 @@ def score(
         "return_lost": recovery.return_lost(own, onset, pre),
         "terminations": int(ended[:, g].sum()),
         "updates": updates if arm == "ppo" else 0,
-        "normalised": normalised.normalise(final(own), final(base), pre, pre),
+        "normalised": normalised_recovery.normalise(final(own), final(base), pre, pre),
       }
     )
   arms = {}
@@ -313,7 +316,7 @@ def score(
     hit = [r for r in own if r["affected"]]
     times = [np.inf if r["recovery_steps"] is None else r["recovery_steps"] for r in hit]
     mean = lambda rows, name: (
-      (float(bootstrap.iqm(x)), bootstrap.interval(x))
+      (float(intervals.iqm(x)), intervals.interval(x))
       if (x := [r[name] for r in rows if r[name] is not None])
       else (None, None)
     )
@@ -321,10 +324,10 @@ def score(
       "seeds": len(own),
       "affected": len(hit),
       "recovered": int(np.sum(np.isfinite(times))),
-      "recovery_median_steps": bootstrap.finite(bootstrap.censored_median(times))
+      "recovery_median_steps": intervals.finite(intervals.censored_median(times))
       if times
       else None,
-      "recovery_median_steps_ci": bootstrap.interval(times, bootstrap.censored_median)
+      "recovery_median_steps_ci": intervals.interval(times, intervals.censored_median)
       if times
       else None,
       "terminations": sum(r["terminations"] for r in own),
@@ -372,7 +375,7 @@ def parser() -> argparse.ArgumentParser:
   out.add_argument(
     "--policy",
     required=True,
-    help="folder that `python -m mjx_cl.demonstrator ENV` or benchmarks/ppo_walker.py --out wrote",
+    help="folder that `python -m mjx_cl.training.demonstrator ENV` or benchmarks/ppo_walker.py --out wrote",
   )
   out.add_argument("--fault", default="walker/gear-half", help="fault or preset")
   out.add_argument("--onset", type=int, default=5000)
@@ -389,4 +392,4 @@ def parser() -> argparse.ArgumentParser:
 
 
 if __name__ == "__main__":
-  sys.exit(cli.attempt(lambda: main(parser().parse_args())))
+  sys.exit(app.attempt(lambda: main(parser().parse_args())))

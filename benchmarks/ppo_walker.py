@@ -76,10 +76,11 @@ def main() -> None:
   args = parser.parse_args()
   if args.steps < 1 or args.evals < 2:
     parser.error("--steps must be above 0 and --evals above 1")
-  from mjx_cl import runtime
+  from mjx_cl.io import runtime
 
   runtime.setup()
-  from mjx_cl import demonstrator, envs
+  from mjx_cl import envs
+  from mjx_cl.training import demonstrator
 
   say = lambda row: print(
     f"step {row['step']:,}: return {row['return']:.0f}, {row['seconds']:.0f} s",

@@ -16,7 +16,7 @@ import pathlib
 import sys
 import time
 
-from mjx_cl import runtime
+from mjx_cl.io import runtime
 
 runtime.setup()
 
@@ -24,11 +24,14 @@ import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 
-from mjx_cl import bench, cli, envs, faults, store  # noqa: E402
-from mjx_cl.interrupt import Interruptible  # noqa: E402
-from mjx_cl.rollout import Rollout, nest, start  # noqa: E402
-from mjx_cl.run import Runner, check_same  # noqa: E402
-from mjx_cl.scoring import bootstrap  # noqa: E402
+from mjx_cl import envs, faults
+from mjx_cl.cli import app
+from mjx_cl.io import tables  # noqa: E402
+from mjx_cl.io.interrupt import Interruptible  # noqa: E402
+from mjx_cl.rollout.scan import Rollout, nest, start  # noqa: E402
+from mjx_cl.runs import suite
+from mjx_cl.runs.run import Runner, check_same  # noqa: E402
+from mjx_cl.scoring import intervals  # noqa: E402
 
 GRIPS = (0.65, 0.61, 0.60, 0.59, 0.58, 0.575, 0.57, 0.56, 0.55, 0.50, 0.45, 0.40, 0.35, 0.30)
 DRIVES, STEPS, CHUNK = 24, 2_000, 50  # drives of each car at each coefficient, control steps of one
@@ -39,7 +42,7 @@ def adapted(work: pathlib.Path, seeds: list[int], steps: int):
   """A Runner that has lived the car part of suite `paper` without its socks, for `steps` control
   steps.
   """
-  (part,) = bench.pick(bench.suite("paper").parts, ("car",))
+  (part,) = suite.pick(suite.suite("paper").parts, ("car",))
   runner = Runner(
     dataclasses.replace(
       part.config,
@@ -55,7 +58,7 @@ def adapted(work: pathlib.Path, seeds: list[int], steps: int):
   if (work / "config.json").exists():
     check_same(work, runner.config_dict())
   else:
-    store.write_json(work / "config.json", runner.config_dict())
+    tables.write_json(work / "config.json", runner.config_dict())
   runner.open()
   runner.resume()
   saved = time.monotonic()
@@ -118,7 +121,7 @@ def main(args) -> None:
       "grip": grip,
       "reward": reward[:, i].tolist(),
       "lost": float(lost[:, i].mean()),
-      "lost_ci": bootstrap.interval(lost[:, i], np.mean),
+      "lost_ci": intervals.interval(lost[:, i], np.mean),
       "crashes": float(crashes[:, i].mean()),
     }
     for i, grip in enumerate(args.grips)
@@ -129,7 +132,7 @@ def main(args) -> None:
       f"{r['crashes']:.1f}",
       file=sys.stderr,
     )
-  store.write_json(
+  tables.write_json(
     args.out,
     {
       "command": " ".join(["python", *sys.argv]),
@@ -138,7 +141,7 @@ def main(args) -> None:
       "drives": args.drives,
       "drive_steps": STEPS,
       "rows": rows,
-      **store.provenance(),
+      **tables.provenance(),
     },
   )
 
@@ -154,4 +157,4 @@ if __name__ == "__main__":
   parser.add_argument(
     "--grips", type=float, nargs="+", default=GRIPS, help="the first is the healthy one"
   )
-  sys.exit(cli.attempt(lambda: main(parser.parse_args())))
+  sys.exit(app.attempt(lambda: main(parser.parse_args())))

@@ -16,10 +16,13 @@ import sys
 
 import pyarrow.parquet as parquet
 
-from mjx_cl import cli, detectors, leaderboard, store
-from mjx_cl.detectors import references
+from benchmarks.report.report import load
+from mjx_cl import detectors
+from mjx_cl.cli import app
+from mjx_cl.detectors import baselines
 from mjx_cl.errors import FileError
-from mjx_cl.report import load
+from mjx_cl.io import tables
+from mjx_cl.leaderboard import score
 
 FILE = pathlib.Path(detectors.__file__).parent / "thresholds.json"
 LEAST = 10  # alarms
@@ -37,14 +40,14 @@ def collect(folder: pathlib.Path) -> dict:
     raise FileError(
       f"{folder / 'leaderboard.parquet'}: not a leaderboard's table ({str(e).splitlines()[0]})"
     ) from None
-  known = leaderboard.variants()
+  known = score.variants()
   robots: dict[str, dict] = {}
   for row in rows:
     name = row["detector"]
     if (
       name not in known
       or name in detectors.PAPER
-      or name in references.REFERENCES
+      or name in baselines.REFERENCES
       or row["threshold"] is None
       or row["arl0_alarms"] < LEAST
     ):
@@ -73,7 +76,7 @@ def collect(folder: pathlib.Path) -> dict:
 
 def main(args: argparse.Namespace) -> None:
   values = collect(pathlib.Path(args.board))
-  store.write_json(pathlib.Path(args.out), values)
+  tables.write_json(pathlib.Path(args.out), values)
   print(
     f"{sum(map(len, values['robots'].values()))} thresholds of {', '.join(values['robots'])} "
     f"at ARL0 {values['arl0']:,} in {args.out}"
@@ -88,4 +91,4 @@ if __name__ == "__main__":
     help="folder that `mjx-cl leaderboard --out` wrote",
   )
   parser.add_argument("--out", default=str(FILE))
-  sys.exit(cli.attempt(lambda: main(parser.parse_args())))
+  sys.exit(app.attempt(lambda: main(parser.parse_args())))

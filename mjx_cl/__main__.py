@@ -2,6 +2,6 @@
 
 import sys
 
-from mjx_cl.cli import main
+from mjx_cl.cli.app import main
 
 sys.exit(main())

@@ -9,10 +9,10 @@ import math
 import numbers
 from dataclasses import dataclass, field
 
-from mjx_cl import fault_presets
 from mjx_cl.adapt.arms import ARMS, never_stops
-from mjx_cl.dreamer.sizes import SIZES
 from mjx_cl.errors import UserError, choose
+from mjx_cl.faults import presets
+from mjx_cl.sizes import SIZES
 
 # decisions between two rounds of updates, of a training as of a run, where the stop rule looks as
 # often
@@ -60,7 +60,7 @@ def kinds(where: str, annotations: dict[str, str], values: dict, before: str = "
       )
 
 
-def whole(config, *names: str, most: int = fault_presets.FOREVER - 1) -> None:
+def whole(config, *names: str, most: int = presets.FOREVER - 1) -> None:
   """Raises unless every named field is a whole number of at least 0 and at most `most`."""
   for name in names:
     value = getattr(config, name)
@@ -266,7 +266,7 @@ class TrainConfig:
       "repeat",
       *(("episode",) if self.episode is not None else ()),
     )
-    if self.fault is not None and fault_presets.named(self.fault) and self.severity != 1.0:
+    if self.fault is not None and presets.named(self.fault) and self.severity != 1.0:
       raise UserError(f"preset {self.fault!r} brings its own severity; leave severity out")
     fraction(self, "demo_share", "clone_until", "shake", "shake_share", "severity")
     positive(self, "clone_std")
@@ -479,15 +479,13 @@ class RunConfig:
     changes(self)  # refuses what does not fit together
     if becomes(self):
       last = (
-        fault_presets.FOREVER - 1 - max(c.after for c in changes(self))
+        presets.FOREVER - 1 - max(c.after for c in changes(self))
       )  # later than the last step: it never happens
-    elif self.severity is None and not fault_presets.named(self.fault):
+    elif self.severity is None and not presets.named(self.fault):
       object.__setattr__(self, "severity", 0.5)
     positive(self, "steps", "seeds")
-    if self.steps >= fault_presets.FOREVER:
-      raise UserError(
-        f"steps must be below {fault_presets.FOREVER:,} control steps; got {self.steps}"
-      )
+    if self.steps >= presets.FOREVER:
+      raise UserError(f"steps must be below {presets.FOREVER:,} control steps; got {self.steps}")
     check_seeds(self.first_seed, self.seeds, "first_seed")
     finite(self.settings, "settings of the detector")
     if self.agent == "":
@@ -530,18 +528,14 @@ class RunConfig:
 
 def becomes(config: RunConfig) -> str | None:
   """The environment that the robot of a run becomes, None: stays what it is."""
-  return (
-    fault_presets.find(config.fault, config.env).becomes
-    if fault_presets.named(config.fault)
-    else None
-  )
+  return presets.find(config.fault, config.env).becomes if presets.named(config.fault) else None
 
 
-def changes(config: RunConfig) -> tuple[fault_presets.Change, ...]:
+def changes(config: RunConfig) -> tuple[presets.Change, ...]:
   """The faults of a run, with its duration where the preset leaves it open; of a robot that becomes
   another one, those of that other one.
   """
-  return fault_presets.resolve(
+  return presets.resolve(
     config.env,
     config.fault,
     config.target,

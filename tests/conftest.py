@@ -12,7 +12,7 @@ os.environ.setdefault(
   "MJX_CL_CACHE", str(pathlib.Path(tempfile.gettempdir()) / "mjx_cl_tests_cache")
 )  # shared by all runs and processes
 
-from mjx_cl import runtime  # noqa: E402
+from mjx_cl.io import runtime  # noqa: E402
 
 runtime.setup()
 

@@ -33,6 +33,7 @@ def settled(
       rows are left out.
     count: int32 (), rows ever written; fewer than `patience` means not settled.
     nominal_mean, nominal_std: float32 (6,).
+
   Returns:
     bool (6,).
   """

@@ -13,15 +13,15 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from mjx_cl import replay as replay_lib
-from mjx_cl.adapt import arms as arms_lib, phase as phase_lib
+from mjx_cl.adapt import arms as arms_lib
+from mjx_cl.adapt import phase as phase_lib
 from mjx_cl.adapt.convergence import SIGNALS
 from mjx_cl.config import AdaptConfig
+from mjx_cl.dreamer import replay as replay_lib
 from mjx_cl.dreamer.agent import Agent, Batch, TrainState, culprit
 from mjx_cl.errors import choose
-from mjx_cl.monitor import History, Monitor, unknown
-from mjx_cl.rollout import records
-
+from mjx_cl.rollout.monitor import History, Monitor, unknown
+from mjx_cl.rollout.scan import records
 
 BEHAVIOUR = {
   "pol",
@@ -93,7 +93,8 @@ class Digest(NamedTuple):
   """What the host logs of a chunk: rows (T, groups) and values (groups,). `failed`: index into
   agent.CAUSES of what was at fault in an update, which changed nothing and was the stream's last;
   -1: nothing. `back`: bool, an abort put the weights of before the adaptation back; None where no
-  arm does. `earned`, `earns`: mean reward a step that was judged by, see Before; None likewise."""
+  arm does. `earned`, `earns`: mean reward a step that was judged by, see Before; None likewise.
+  """
 
   residual: Residual
   score: jax.Array
@@ -149,6 +150,7 @@ def choices(
     onsets: true onsets of each robot, unless its arm spares it, as control steps, FOREVER: not
       known yet; None: no faults.
     stops: seed -> control steps after which an arm that is told its oracle stop ends.
+
   Raises:
     UserError where an arm's schedule does not fit into the run.
   """
@@ -272,6 +274,7 @@ class Loop:
         neighbours.
       acceptance: float32 (groups,), of the robot that each stream has by now, where robots change;
         None: that of `spec`.
+
     Returns:
       (state', Digest).
     """

@@ -131,6 +131,7 @@ def update(
       alone, as `ended`.
     limit: int32 (), most control steps of adaptation, None: config.budget.
     counts: bool (6,), signals that must have settled, None: all.
+
   Returns:
     (state', decision int32 (), settled bool (6,)).
   """

@@ -13,8 +13,7 @@ from typing import NamedTuple
 import jax
 
 from mjx_cl.config import kinds
-from mjx_cl.detectors import combine
-from mjx_cl.detectors import references
+from mjx_cl.detectors import baselines, combine
 from mjx_cl.detectors.adwin import adwin
 from mjx_cl.detectors.base import Alarm, Detector, scalar
 from mjx_cl.detectors.bfar import bfar
@@ -25,20 +24,20 @@ from mjx_cl.detectors.cusum import cusum
 from mjx_cl.detectors.e_detector import e_detector
 from mjx_cl.detectors.ewma import ewma
 from mjx_cl.detectors.glr import glr
-from mjx_cl.detectors.page_hinkley import page_hinkley
 from mjx_cl.detectors.hotelling import hotelling
 from mjx_cl.detectors.knn import knn
 from mjx_cl.detectors.kswin import kswin
 from mjx_cl.detectors.max_variables import max_variables
 from mjx_cl.detectors.mewma import mewma
 from mjx_cl.detectors.multichart import multichart
+from mjx_cl.detectors.page_hinkley import page_hinkley
 from mjx_cl.detectors.rolling_sigma import rolling_sigma
 from mjx_cl.detectors.scan import scan
-from mjx_cl.detectors.surprise import surprise
 from mjx_cl.detectors.shiryaev_roberts import shiryaev_roberts
+from mjx_cl.detectors.surprise import surprise
 from mjx_cl.detectors.z_score import z_score
 from mjx_cl.errors import UserError, choose
-from mjx_cl.plugins import Registry
+from mjx_cl.io.plugins import Registry
 
 
 def paper_rule(
@@ -233,10 +232,10 @@ DETECTORS |= {
 # what every score is printed beside; the oracle, which must be told the onset, is in
 # references.REFERENCES alone
 DETECTORS |= {
-  "never": references.never,
-  "always": references.always,
-  "periodic": references.periodic,
-  "random": references.random,
+  "never": baselines.never,
+  "always": baselines.always,
+  "periodic": baselines.periodic,
+  "random": baselines.random,
 }
 
 
@@ -294,7 +293,8 @@ def factory(name: str):
 
 def check_kinds(name: str, settings: dict, *builds) -> None:
   """Refuses a setting of another kind than its annotation in one of `builds` says, before a program
-  is traced with it. Words are the factories' own to read, and numbers of JAX pass."""
+  is traced with it. Words are the factories' own to read, and numbers of JAX pass.
+  """
   known = {
     p.name: getattr(p.annotation, "__name__", str(p.annotation))
     for build in builds

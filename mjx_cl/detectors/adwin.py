@@ -47,7 +47,8 @@ def empty(max_buckets: int, rows: int) -> Buckets:
 def insert(window: Buckets, x: jax.Array) -> Buckets:
   """Adds a sample as a bucket of row 0. A full row first merges its two oldest buckets into one of
   the next row, so a carry runs up the full rows; beyond the last row it is lost, and the window
-  slides."""
+  slides.
+  """
   mean, squares, number = window
   places, rows = mean.shape
   row = jnp.arange(rows)
@@ -152,6 +153,7 @@ def adwin(
       at several checks. False starts from an empty window.
     warmup: samples whose mean and deviation scale the stream and which enter no window [control
       steps]; 0 takes the stream as it is.
+
   Returns:
     Detector whose update takes x, float32 (), and gives Alarm(fired: bool (), score: float32 ()).
   Blind to: a change of variance alone; a change that is undone within `clock` samples; a shift that

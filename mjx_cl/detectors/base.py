@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any, Callable, NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -55,7 +56,7 @@ def demand(name: str, **rules: tuple[Any, bool, str]) -> None:
 
 
 def above(value, low) -> bool:
-  """value > low; a traced value, which has no number yet, passes."""
+  """Value > low; a traced value, which has no number yet, passes."""
   return isinstance(value, jax.core.Tracer) or bool(value > low)
 
 
@@ -77,7 +78,7 @@ def cold() -> Warm:
 
 
 def standardise(state: Warm, x: jax.Array, warmup: int) -> tuple[Warm, jax.Array, jax.Array]:
-  """z = (x - mean) / max(std, 1e-6) with mean and std (n, not n - 1) of the first `warmup` samples,
+  """Z = (x - mean) / max(std, 1e-6) with mean and std (n, not n - 1) of the first `warmup` samples,
   by Welford's recursion.
 
   Returns:

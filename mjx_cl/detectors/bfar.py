@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_cl.detectors import many
+from mjx_cl.detectors import multivariate
 from mjx_cl.detectors.base import Alarm, Detector, above, demand
 
 
@@ -105,6 +105,7 @@ def bfar(
     repetitions: of the bootstrap.
     shrinkage: in (0, 1], of S = (1 - shrinkage) covariance of v over reference blocks + shrinkage
       times its mean variance on the diagonal.
+
   Returns:
     Detector whose update takes a monitor.Residual and gives Alarm(fired: bool (), score: float32
     ()).
@@ -189,7 +190,9 @@ def bfar(
     references = state.references.at[at].set(
       jnp.where(ended & learning, values, state.references[at])
     )
-    healthy = many.once(ended & (state.count + 1 == m * block), settle, references, state.healthy)
+    healthy = multivariate.once(
+      ended & (state.count + 1 == m * block), settle, references, state.healthy
+    )
     tested = ended & ~learning
     recent = jnp.where(
       tested, jnp.concatenate([(healthy.weights @ values)[None], state.recent[:-1]]), state.recent

@@ -84,6 +84,7 @@ def bocpd(
     alpha, beta: shape and scale of the prior of the variance.
     warmup: samples that fit mean and std and that the run length does not count [control steps]; 0:
       the stream is standardised already.
+
   Returns:
     Detector whose update takes x, float32 (), and gives Alarm(fired: bool (), score: float32 ());
     score nan during warm-up.

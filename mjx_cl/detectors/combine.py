@@ -5,7 +5,8 @@ stream passes through first.
 from __future__ import annotations
 
 import inspect
-from typing import Any, Callable, NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -167,7 +168,8 @@ class CoolState(NamedTuple):
 def cool_down(detector: Detector, steps: int) -> Detector:
   """Drops the alarms of the `steps` samples after one that counted. The detector runs on meanwhile,
   and a dropped alarm restarts its evidence too. A sample without a score does not count; 0 changes
-  nothing."""
+  nothing.
+  """
   demand("cool_down", steps=(steps, steps >= 0, "at least 0"))
 
   def update(state, x):
@@ -255,6 +257,7 @@ def whitened(detector: Detector, order: int = 8, warmup: int = 1000) -> Detector
   Args:
     order: samples that predict the next.
     warmup: samples that fit the autoregression [control steps].
+
   Returns:
     Detector of x, float32 (); Alarm.score is nan until the inner detector knows one.
   Blind to: whatever repeats with the dependence of the healthy stream. Innovations are

@@ -79,6 +79,7 @@ def conformal(
     seed: of U; streams started alike share it.
     warmup: samples that fit mean and std; nothing fires before they end [control steps]. 0: the
       stream is standardised already.
+
   Returns:
     Detector whose update takes x, float32 (), and gives Alarm(fired: bool (), score: float32 ());
     score nan during warm-up.

@@ -38,6 +38,7 @@ def cusum(
     two_sided: also a fall fires; False: a rise alone.
     warmup: samples that fit mean and std; nothing fires before they end; 0: x is standardised
       already [control steps].
+
   Returns:
     Detector whose update takes x, float32 (), and gives Alarm(fired: bool (), score: float32 (),
     nan during warm-up).

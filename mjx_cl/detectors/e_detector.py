@@ -35,6 +35,7 @@ def accumulate(evidence: jax.Array, growth: jax.Array, form: str) -> tuple[jax.A
   Args:
     evidence: float32 (bets,), see EDetectorState. growth: float32 (bets,), logarithms of factors
       whose healthy mean is at most 1.
+
   Returns:
     (evidence', ln of the mean of M' over the bets, float32 ()).
   """
@@ -86,6 +87,7 @@ def e_detector(
     two_sided: also bets against a mean below -bound, with half of the wealth.
     warmup: samples that fit mean and std; nothing fires before they end [control steps]. 0: the
       stream is standardised already.
+
   Returns:
     Detector whose update takes x, float32 (), and gives Alarm(fired: bool (), score: float32 ());
     score nan during warm-up.

@@ -38,6 +38,7 @@ def ewma(rate: float = 0.1, threshold: float = 3.0, warmup: int = 1000) -> Detec
       is narrower at first and so fires more often just after a restart.
     warmup: samples that fit mean and std; nothing fires before they end; 0: x is standardised
       already [control steps].
+
   Returns:
     Detector whose update takes x, float32 (), and gives Alarm(fired: bool (), score: float32 (),
     nan during warm-up).

@@ -51,6 +51,7 @@ def glr(threshold: float = 12.0, capacity: int = 32, warmup: int = 1000) -> Dete
     capacity: candidates kept on each side.
     warmup: samples that fit mean and std; nothing fires before they end; 0: x is standardised
       already [control steps].
+
   Returns:
     Detector whose update takes x, float32 (), and gives Alarm(fired: bool (), score: float32 (),
     nan during warm-up).

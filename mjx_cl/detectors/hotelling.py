@@ -7,15 +7,15 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from mjx_cl.detectors import many
+from mjx_cl.detectors import multivariate
 from mjx_cl.detectors.base import Alarm, Detector, above, demand
 
 
 class HotellingState(NamedTuple):
   """Attributes: whitener: many.Whitener. trail: many.Trail of whitened samples (smooth, p)."""
 
-  whitener: many.Whitener
-  trail: many.Trail
+  whitener: multivariate.Whitener
+  trail: multivariate.Trail
 
 
 def hotelling(
@@ -51,6 +51,7 @@ def hotelling(
       directions of almost no variance, in which everything is an alarm.
     channels: `a+b+..` or a sequence of channels (combine.CHANNELS); `groups` is all eight.
     log: take logarithms of all but the reward.
+
   Returns:
     Detector whose update takes a monitor.Residual and gives Alarm(fired: bool (), score: float32
     ()).
@@ -61,7 +62,7 @@ def hotelling(
   Introduction to Statistical Quality Control, ch. 11. Example: _, out = jax.lax.scan(det.update,
   det.init(), residuals)
   """
-  names = many.split("hotelling", channels)
+  names = multivariate.split("hotelling", channels)
   p = len(names)
   demand(
     "hotelling",
@@ -76,15 +77,15 @@ def hotelling(
   )
 
   def init():
-    return HotellingState(many.whitener(p), many.trail(smooth, p))
+    return HotellingState(multivariate.whitener(p), multivariate.trail(smooth, p))
 
   def update(state, residual):
-    x, known = many.pick(residual, names, log)
-    reference, y, ready = many.whiten(state.whitener, x, known, warmup, shrinkage)
-    held = many.push(state.trail, y, ready)
+    x, known = multivariate.pick(residual, names, log)
+    reference, y, ready = multivariate.whiten(state.whitener, x, known, warmup, shrinkage)
+    held = multivariate.push(state.trail, y, ready)
     score = jnp.sum(jnp.square(held.total)) / jnp.maximum(1, jnp.minimum(held.count, smooth))
     fired = ready & (score > threshold)
-    return HotellingState(reference, many.restart(held, fired)), Alarm(
+    return HotellingState(reference, multivariate.restart(held, fired)), Alarm(
       fired, jnp.where(ready, score, jnp.nan)
     )
 

@@ -7,9 +7,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from mjx_cl.detectors import many
+from mjx_cl.detectors import multivariate
 from mjx_cl.detectors.base import Alarm, Detector, Warm, above, demand, standardise
-from mjx_cl.monitor import LATENT
+from mjx_cl.rollout.monitor import LATENT
 
 
 class Healthy(NamedTuple):
@@ -32,7 +32,7 @@ class KnnState(NamedTuple):
   warm: Warm
   references: jax.Array
   healthy: Healthy
-  trail: many.Trail
+  trail: multivariate.Trail
 
 
 def kth(squares: jax.Array, k: int) -> jax.Array:
@@ -72,6 +72,7 @@ def knn(
     smooth: samples of the trailing mean [control steps].
     threshold: decision level [deviations of a single healthy distance].
     warmup: samples that give the references; nothing fires before they end.
+
   Returns:
     Detector whose update takes a monitor.Residual and gives Alarm(fired: bool (), score: float32
     ()).
@@ -95,7 +96,7 @@ def knn(
       Warm(jnp.int32(0), jnp.zeros(LATENT), jnp.zeros(LATENT)),
       jnp.zeros((references, LATENT)),
       healthy,
-      many.trail(smooth, 1),
+      multivariate.trail(smooth, 1),
     )
 
   def settle(learnt):
@@ -109,17 +110,19 @@ def knn(
     known = jnp.all(jnp.isfinite(residual.latent))
     x = jnp.where(known, residual.latent, 0.0)
     warm, _, ready = standardise(state.warm, x, warmup)
-    warm, ready = many.keep(known, warm, state.warm), ready & known
+    warm, ready = multivariate.keep(known, warm, state.warm), ready & known
     at, learning = state.warm.count // stride, known & (state.warm.count < warmup)
     store = learning & (state.warm.count % stride == 0) & (at < references)
     at = jnp.minimum(at, references - 1)
     stored = state.references.at[at].set(jnp.where(store, x, state.references[at]))
-    healthy = many.once(learning & (warm.count == warmup), settle, (warm, stored), state.healthy)
+    healthy = multivariate.once(
+      learning & (warm.count == warmup), settle, (warm, stored), state.healthy
+    )
     distance = jnp.sqrt(kth(jnp.square(x - stored) @ healthy.weight, k))
-    held = many.push(state.trail, ((distance - healthy.mean) / healthy.std)[None], ready)
+    held = multivariate.push(state.trail, ((distance - healthy.mean) / healthy.std)[None], ready)
     score = held.total[0] / jnp.maximum(1, jnp.minimum(held.count, smooth))
     fired = ready & (score > threshold)
-    return KnnState(warm, stored, healthy, many.restart(held, fired)), Alarm(
+    return KnnState(warm, stored, healthy, multivariate.restart(held, fired)), Alarm(
       fired, jnp.where(ready, score, jnp.nan)
     )
 

@@ -64,7 +64,7 @@ def draw(key: jax.Array, tests: jax.Array, older: int, number: int) -> jax.Array
 
 
 def distance(a: jax.Array, b: jax.Array) -> jax.Array:
-  """size times the Kolmogorov-Smirnov distance of two samples of equal size, int32 ()."""
+  """Size times the Kolmogorov-Smirnov distance of two samples of equal size, int32 ()."""
   both = jnp.concatenate([a, b])
 
   def turn(
@@ -115,6 +115,7 @@ def kswin(
     keep: after an alarm the newest `stat_size` samples stay in the window, as in the paper; False:
       none, as in river.
     seed: of the draws.
+
   Returns:
     Detector whose update takes x, float32 (), and gives Alarm(fired: bool (), score: float32 ());
     the score is nan until the window is full.

@@ -46,6 +46,7 @@ def likelihood_ratio(
     threshold: decision level [nats]; may be traced.
     channels: of combine.CHANNELS.
     log: ln max(x, 1e-9) in place of x, for all channels but the reward.
+
   Returns:
     Detector over monitor.Residual. The first `order` samples only fill the past: nothing fires,
     score nan. A sample with an unknown channel leaves the state unchanged; the past of the next one

@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from mjx_cl.detectors import many
+from mjx_cl.detectors import multivariate
 from mjx_cl.detectors.base import Alarm, Detector, above, demand
 
 
@@ -56,6 +56,7 @@ def max_variables(
     warmup: samples that fit mean and deviation, at least 2 smooth; 0: channels are standardised and
       independent samples already.
     channels, log: as in hotelling.
+
   Returns:
     Detector whose update takes a monitor.Residual and gives Alarm(fired: bool (), score: float32
     ()).
@@ -64,7 +65,7 @@ def max_variables(
   Woodall, Ncube 1985, Technometrics 27, 285-292. Example: _, out = jax.lax.scan(det.update,
   det.init(), residuals)
   """
-  names = many.split("max_variables", channels)
+  names = multivariate.split("max_variables", channels)
   demand(
     "max_variables",
     smooth=(smooth, smooth >= 1, "at least 1"),
@@ -78,15 +79,15 @@ def max_variables(
   sign = jnp.array([-1.0 if c == "reward" else 1.0 for c in names])
 
   def init():
-    return many.standing(smooth, len(names))
+    return multivariate.standing(smooth, len(names))
 
   def update(state, residual):
-    x, known = many.pick(residual, names, log)
-    state, z, ready = many.trailing_z(state, x, known, smooth, warmup)
+    x, known = multivariate.pick(residual, names, log)
+    state, z, ready = multivariate.trailing_z(state, x, known, smooth, warmup)
     largest = jnp.max(jnp.abs(z) if two_sided else sign * z)
     score = corrected(largest, len(names), two_sided)
     fired = ready & (score > threshold)
-    return state._replace(trail=many.restart(state.trail, fired)), Alarm(
+    return state._replace(trail=multivariate.restart(state.trail, fired)), Alarm(
       fired, jnp.where(ready, score, jnp.nan)
     )
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from mjx_cl.detectors import many
+from mjx_cl.detectors import multivariate
 from mjx_cl.detectors.base import Alarm, Detector, above, demand
 
 
@@ -17,7 +17,7 @@ class MewmaState(NamedTuple):
   (), (1 - rate)^(2 t).
   """
 
-  whitener: many.Whitener
+  whitener: multivariate.Whitener
   mean: jax.Array
   left: jax.Array
 
@@ -52,6 +52,7 @@ def mewma(
     threshold: decision level [squared deviations].
     warmup, shrinkage, channels, log: as in hotelling.
     exact: the exact variance.
+
   Returns:
     Detector whose update takes a monitor.Residual and gives Alarm(fired: bool (), score: float32
     ()).
@@ -60,7 +61,7 @@ def mewma(
   Prabhu 1996, J. Amer. Statist. Assoc. 91, 1701-1706. Example: _, out = jax.lax.scan(det.update,
   det.init(), residuals)
   """
-  names = many.split("mewma", channels)
+  names = multivariate.split("mewma", channels)
   p = len(names)
   demand(
     "mewma",
@@ -75,11 +76,11 @@ def mewma(
   )
 
   def init():
-    return MewmaState(many.whitener(p), jnp.zeros(p), jnp.float32(1))
+    return MewmaState(multivariate.whitener(p), jnp.zeros(p), jnp.float32(1))
 
   def update(state, residual):
-    x, known = many.pick(residual, names, log)
-    reference, y, ready = many.whiten(state.whitener, x, known, warmup, shrinkage)
+    x, known = multivariate.pick(residual, names, log)
+    reference, y, ready = multivariate.whiten(state.whitener, x, known, warmup, shrinkage)
     mean = jnp.where(ready, rate * y + (1 - rate) * state.mean, state.mean)
     left = jnp.where(ready, state.left * (1 - rate) ** 2, state.left)
     score = jnp.sum(jnp.square(mean)) * (2 - rate) / rate

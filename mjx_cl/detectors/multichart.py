@@ -29,6 +29,7 @@ def multichart(threshold: float = 1.0, charts: str = CHARTS, robot: str | None =
     threshold: decision level [thresholds h_i].
     charts: names on the leaderboard, joined by commas; those whose h_i is known.
     robot: whose h_i are taken; default, and for a robot without any: the walker's.
+
   Returns:
     Detector whose update takes a monitor.Residual and gives Alarm(fired: bool (), score: float32
     (), nan while no chart knows one).

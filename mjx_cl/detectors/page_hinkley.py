@@ -63,6 +63,7 @@ def page_hinkley(
     min_instances: samples after the warm-up, or after an alarm, before anything fires and a score
       is known [control steps].
     warmup: samples that fit centre and std; 0: x as it is [control steps].
+
   Returns:
     Detector whose update takes x, float32 (), and gives Alarm(fired: bool (), score: float32 (),
     nan before min_instances).

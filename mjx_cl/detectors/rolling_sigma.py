@@ -100,6 +100,7 @@ def rolling_sigma(
     log: take the logarithm first; a residual is positive and skewed, and single large ones
       otherwise widen the deviation for a whole window.
     unit: standard deviations that count as one, so that several of these can share a threshold.
+
   Returns:
     Detector whose update takes x, float32 (), and gives Alarm(fired: bool (), score: float32 ()).
   Cost: window / size + O(1) a sample, size the power of two at or below window / 12.

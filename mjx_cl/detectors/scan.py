@@ -8,9 +8,9 @@ import functools
 import jax
 import jax.numpy as jnp
 
-from mjx_cl import runtime
 from mjx_cl.detectors.base import Alarm, Detector
 from mjx_cl.errors import UserError
+from mjx_cl.io import runtime
 
 
 def scan(detector: Detector, cores: int | None = None):
@@ -24,9 +24,11 @@ def scan(detector: Detector, cores: int | None = None):
   Args:
     detector: its update takes a number, a vector or any pytree per step.
     cores: shares; default: of a CPU, the cores that this process may use. No more than streams.
+
   Returns:
     xs, leaves (T, S, ...) -> Alarm(fired bool (T, S), score float32 (T, S)). Compiled at the first
     call and for every new shape.
+
   Raises:
     UserError for fewer than one core, or leaves without the two axes.
   Example: alarms = detectors.scan(detectors.cusum())(xs)      # alarms.fired: bool (T, S)

@@ -52,6 +52,7 @@ def shiryaev_roberts(
     two_sided: rise or fall, half and half; False: a rise alone.
     warmup: samples that fit mean and std; nothing fires before they end; 0: x is standardised
       already [control steps].
+
   Returns:
     Detector whose update takes x, float32 (), and gives Alarm(fired: bool (), score: float32 (),
     nan during warm-up).

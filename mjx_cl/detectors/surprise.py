@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 
-from mjx_cl.detectors import many
+from mjx_cl.detectors import multivariate
 from mjx_cl.detectors.base import Alarm, Detector, above, demand
 
 
@@ -31,6 +31,7 @@ def surprise(
     warmup: samples that fit mean and deviation, at least 2 smooth; 0: samples are standardised and
       independent already, and no logarithm is taken.
     two_sided: also a fall counts, as of a frozen sensor that is foreseen too well.
+
   Returns:
     Detector whose update takes a monitor.Residual and gives Alarm(fired: bool (), score: float32
     ()).
@@ -50,14 +51,14 @@ def surprise(
   )
 
   def init():
-    return many.standing(smooth, 1)
+    return multivariate.standing(smooth, 1)
 
   def update(state, residual):
-    x, known = many.pick(residual, ("surprise",), warmup > 0)
-    state, z, ready = many.trailing_z(state, x, known, smooth, warmup)
+    x, known = multivariate.pick(residual, ("surprise",), warmup > 0)
+    state, z, ready = multivariate.trailing_z(state, x, known, smooth, warmup)
     score = jnp.abs(z[0]) if two_sided else z[0]
     fired = ready & (score > threshold)
-    return state._replace(trail=many.restart(state.trail, fired)), Alarm(
+    return state._replace(trail=multivariate.restart(state.trail, fired)), Alarm(
       fired, jnp.where(ready, score, jnp.nan)
     )
 

@@ -43,6 +43,7 @@ def z_score(
     smooth: samples of the trailing mean that is tested; 1: the samples themselves [control steps].
     warmup: samples that fit mean and std; nothing fires before they end; 0: x is standardised
       already [control steps].
+
   Returns:
     Detector whose update takes x, float32 (), and gives Alarm(fired: bool (), score: float32 (),
     nan during warm-up).

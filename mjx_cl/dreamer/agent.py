@@ -16,8 +16,8 @@ import optax
 
 from mjx_cl.config import DreamerConfig
 from mjx_cl.dreamer import behaviour, heads, losses, nets, optim, rssm
-from mjx_cl.dreamer.sizes import SIZES
 from mjx_cl.errors import UserError
+from mjx_cl.sizes import SIZES
 
 sg = jax.lax.stop_gradient
 
@@ -234,6 +234,7 @@ class Agent:
 
     Args:
       obs: float32 (O,).
+
     Returns:
       (carry', action (A,), unclipped; the environment clips). carry'.deter and .stoch are the
       posterior latent at obs.
@@ -477,6 +478,7 @@ class Agent:
     Args:
       deter, stoch: posterior at t, (N, D), (N, S).
       actions: a_t .. a_{t+n-1}, (n, N, A).
+
     Returns:
       xhat_{t+1..t+n} (n, N, O) in raw units (symexp applied) and rhat (n, N).
     """

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import flax.linen as nn
 
-from mjx_cl.dreamer.nets import Linear, MLP, symlog
+from mjx_cl.dreamer.nets import MLP, Linear, symlog
 
 
 class Encoder(nn.Module):

@@ -49,6 +49,7 @@ def update_range(low_high, returns, rate: float):
 
   Args:
     low_high: float32 (2,).
+
   Returns:
     New (2,) and the scale max(1, high - low), float32 ().
   """

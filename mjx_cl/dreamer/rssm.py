@@ -10,8 +10,8 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from mjx_cl.dreamer.nets import Hidden, Linear, MLP, kernel_init, mean_square, parameter
-from mjx_cl.dreamer.sizes import Size
+from mjx_cl.dreamer.nets import MLP, Hidden, Linear, kernel_init, mean_square, parameter
+from mjx_cl.sizes import Size
 
 UNIMIX = 0.01
 
@@ -75,7 +75,7 @@ class BlockNorm(nn.Module):
 
 
 def clip_action(action):
-  """a / sg(max(1, |a|)): outside [-1, 1] the bound, inside the identity."""
+  """A / sg(max(1, |a|)): outside [-1, 1] the bound, inside the identity."""
   return action / jax.lax.stop_gradient(jnp.maximum(1.0, jnp.abs(action)))
 
 
@@ -119,7 +119,7 @@ class RSSM(nn.Module):
     return deter.reshape(deter.shape[0], blocks, -1).transpose(1, 0, 2)
 
   def core(self, deter, stoch, action):
-    """deter' (N, D)."""
+    """Deter' (N, D)."""
     return join(self.core_cut(self.cut(deter), deter, stoch, action))
 
   def core_cut(self, chunks, deter, stoch, action, pre=(None, None)):

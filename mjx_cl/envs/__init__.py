@@ -12,7 +12,7 @@ from mjx_cl.envs.car_real import CarReal
 from mjx_cl.envs.quadruped import Quadruped
 from mjx_cl.envs.walker import Walker
 from mjx_cl.errors import PluginError, UserError, choose
-from mjx_cl.plugins import Registry, line
+from mjx_cl.io.plugins import Registry, line
 from mjx_cl.types import Spec
 
 ENVS = Registry(

@@ -215,7 +215,7 @@ def build(name: str, points: np.ndarray, right, left) -> Track:
 
 
 def _cross(a, b):
-  """z of the cross product of (..., 2) vectors."""
+  """Z of the cross product of (..., 2) vectors."""
   return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
@@ -509,7 +509,7 @@ class Course:
     return cos * points[..., 0] + sin * points[..., 1], cos * points[..., 1] - sin * points[..., 0]
 
   def at(self, track, s) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """x [m], y [m], heading [rad] and curvature [1/m] of the centre line at arc length s [m], any
+    """X [m], y [m], heading [rad] and curvature [1/m] of the centre line at arc length s [m], any
     real number.
     """
     place = s / self._cell[track]

@@ -349,6 +349,7 @@ def reward_terms(
   Args:
     before: state that was left; its `command` is what the agent saw.
     acceleration, torque: (12,) [rad/s2], [N m]. soft_range: (2, 12) [rad].
+
   Returns:
     (terms (11,) in the order of REWARDS, air' (4,) [s], |v_xy - command| () [m/s]).
   """

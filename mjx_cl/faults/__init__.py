@@ -35,7 +35,7 @@ from mjx_cl.faults.schedule import FOREVER, SCHEDULES, Plan, plan
 from mjx_cl.faults.sensor import SENSOR
 from mjx_cl.faults.task import TASK
 from mjx_cl.faults.transfer import TRANSFER
-from mjx_cl.plugins import Registry, line
+from mjx_cl.io.plugins import Registry, line
 
 FAMILIES = {
   "actuator": ACTUATOR,

@@ -7,7 +7,8 @@ be touched, whatever the fault's author wrote.
 
 from __future__ import annotations
 
-from typing import Any, Callable, NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -143,6 +144,7 @@ def fault(
     not_monotone: why a greater severity need not make a greater difference at first.
     rows: array of what each target stands for, leading (targets,); `act` gets the row of its
       target. None: it gets the target's index.
+
   Raises:
     UserError where `env` lacks one of the leaves.
   """

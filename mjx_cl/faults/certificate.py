@@ -13,8 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_cl import fault_presets, faults as faults_lib
-from mjx_cl.faults import schedule
+from mjx_cl import faults as faults_lib
+from mjx_cl.faults import presets, schedule
 
 SEVERITIES = (0.0, 0.25, 0.5, 0.75, 1.0)
 AFTER = (1, 10, 100)  # control steps at which the size of the difference is reported
@@ -94,7 +94,7 @@ def lanes(
 def preset_lanes(env, faults: dict[str, faults_lib.Fault]) -> list[Lane]:
   """One lane for every preset that this robot can have."""
   out = []
-  for name, preset in fault_presets.PRESETS.items():
+  for name, preset in presets.PRESETS.items():
     if (
       preset.robot in (env.spec.name, "*")
       and preset.changes
@@ -194,9 +194,9 @@ def plans(faults: dict[str, faults_lib.Fault], chosen: list[Lane], onset: int):
   target = np.zeros(shape, np.int32)
   for i, lane in enumerate(chosen):
     changes = (
-      (fault_presets.Change(lane.fault, lane.target, lane.severity),)
-      if not fault_presets.named(lane.fault)
-      else fault_presets.PRESETS[lane.fault].changes
+      (presets.Change(lane.fault, lane.target, lane.severity),)
+      if not presets.named(lane.fault)
+      else presets.PRESETS[lane.fault].changes
     )
     if len({(c.fault, c.after) for c in changes}) < len(changes):
       raise ValueError(
@@ -330,8 +330,8 @@ def compare(env, faults, chosen, rows, plain, onset) -> list[Certificate]:
   for i, lane in enumerate(chosen):
     mine = (
       (lane.fault,)
-      if not fault_presets.named(lane.fault)
-      else tuple(c.fault for c in fault_presets.PRESETS[lane.fault].changes)
+      if not presets.named(lane.fault)
+      else tuple(c.fault for c in presets.PRESETS[lane.fault].changes)
     )
     begin = onset - 1 if any(faults[name].senses for name in mine) else onset
     at = np.flatnonzero(differs[i])
@@ -342,7 +342,7 @@ def compare(env, faults, chosen, rows, plain, onset) -> list[Certificate]:
     ]
     kind, reason = (
       ("preset", "")
-      if fault_presets.named(lane.fault)
+      if presets.named(lane.fault)
       else (faults_lib.family(lane.fault), faults[lane.fault].not_monotone)
     )
     out.append(

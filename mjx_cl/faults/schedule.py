@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from mjx_cl.errors import UserError
-from mjx_cl.fault_presets import FOREVER, SCHEDULES
+from mjx_cl.faults.presets import FOREVER, SCHEDULES
 
 
 class Plan(NamedTuple):

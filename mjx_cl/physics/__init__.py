@@ -16,8 +16,8 @@ the actuators get, at every physics step. `xp` is numpy (native, the whole batch
 written with `xp` alone and with `...` indices. `task` holds the leaves of types.Model.task.
 """
 
-from mjx_cl import runtime
 from mjx_cl.errors import UserError
+from mjx_cl.io import runtime
 
 # model fields after whose change MuJoCo asks for mj_setConst
 DERIVING = ("body_mass", "body_inertia", "body_ipos", "body_iquat", "dof_armature", "qpos0")

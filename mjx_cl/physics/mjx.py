@@ -133,7 +133,8 @@ class Mjx:
 def _anywhere(tree):
   """The same arrays, bound to no device. MJX binds its own, which binds all that a step returns: a
   program called with what it returned itself would be compiled a second time, for bound arguments,
-  and robots could not be sharded."""
+  and robots could not be sharded.
+  """
   return jax.tree.map(lambda x: jnp.asarray(np.asarray(x)), tree)
 
 

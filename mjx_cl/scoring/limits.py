@@ -24,7 +24,8 @@ from typing import NamedTuple
 import numpy as np
 
 from mjx_cl.errors import UserError
-from mjx_cl.scoring import bootstrap, special
+from mjx_cl.scoring import intervals as bootstrap
+from mjx_cl.scoring import special
 
 # 2 x 0.583: mean overshoot at both ends of a Gaussian random walk, Siegmund 1985, Sequential
 # Analysis
@@ -85,6 +86,7 @@ def bound(false_alarm: float, miss: float, information: float) -> float | None:
   Args:
     false_alarm, miss: probabilities inside (0, 1). information: KL rate of the faulty from the
       healthy channel [nats per step].
+
   Returns:
     Steps (not rounded); 0 where false_alarm >= 1 - miss, which tossing a coin achieves; None
     without information.
@@ -135,7 +137,8 @@ def _streams(x, name: str) -> np.ndarray:
 class Lagged(NamedTuple):
   """Streams beside their own past, for many models of one order. Attributes: past (T - order, S,
   order C), newest first, now (T - order, S, C), known (T - order, S), where all of both is
-  finite."""
+  finite.
+  """
 
   past: np.ndarray
   now: np.ndarray
@@ -226,6 +229,7 @@ def fit(nominal, faulty, order: int = 8) -> Parameters:
       S of the two may differ. A step counts where it and the `order` steps before it are finite.
       nominal may be a Healthy, whose order then holds.
     order: of the autoregression; 0 takes steps as independent.
+
   Returns:
     Parameters, arrays float64.
   """
@@ -240,7 +244,8 @@ def fit(nominal, faulty, order: int = 8) -> Parameters:
 
 def innovations(x, model: Conditional) -> np.ndarray:
   """Whitened one-step errors (T - order, S, C) of streams x, or of `lagged` ones: independent
-  standard normal where the model holds; nan where a lag is unknown."""
+  standard normal where the model holds; nan where a lag is unknown.
+  """
   past, now, known = lagged(x, len(model.lags))
   flat = np.swapaxes(model.lags, 1, 2).reshape(-1, now.shape[2])
   return np.where(
@@ -249,12 +254,12 @@ def innovations(x, model: Conditional) -> np.ndarray:
 
 
 def log_density(x, model: Conditional) -> np.ndarray:
-  """ln p(x_t | past) of each step, but for a constant, (T - order, S); nan where a lag is unknown."""
+  """Ln p(x_t | past) of each step, but for a constant, (T - order, S); nan where a lag is unknown."""
   return -0.5 * (np.sum(innovations(x, model) ** 2, -1) + model.log_det)
 
 
 def log_ratio(x, parameters: Parameters) -> np.ndarray:
-  """ln p_after(x_t | past) - ln p_before(x_t | past) of each step, (T - order, S); nan where a lag
+  """Ln p_after(x_t | past) - ln p_before(x_t | past) of each step, (T - order, S); nan where a lag
   is unknown.
   """
   x = lagged(x, len(parameters.after.lags))
@@ -279,6 +284,7 @@ def information(nominal, faulty, order: int = 8, reps: int = REPS) -> dict:
   Args:
     nominal, faulty: (T, S) or (T, S, C), stream s of both is seed s; faulty: steps after the onset
       alone. S >= 2. nominal may be a Healthy.
+
   Returns:
     {information_nats_per_step, its _ci: bootstrap over seeds, None for fewer than two}.
   """
@@ -326,6 +332,7 @@ def ljung_box(e, lags: int = 20, fitted: int = 0) -> tuple[float, float]:
   Args:
     e: float (T,) or (T, S), nan left out. lags: autocorrelations tested. fitted: autoregressive
       coefficients that were fitted to all of them.
+
   Returns:
     (Q, p): p small: not white. Long streams fail for correlations too small to matter.
   Reference: Ljung and Box 1978, Biometrika 65, 297-303.
@@ -358,6 +365,7 @@ def closed_form(nominal, faulty, arl0: float, order: int = 8, lags: int = 20) ->
 
   Args:
     nominal, faulty: (T, S), as for `information`.
+
   Returns:
     {optimal_delay_steps: samples or None, optimal_delay_steps_ci: bootstrap over the faulty
     streams, note: the reason for None, else None, ljung_box_p}.
@@ -402,7 +410,8 @@ def closed_form(nominal, faulty, arl0: float, order: int = 8, lags: int = 20) ->
 def _delays(arl0: float, e: np.ndarray) -> list[float | None]:
   """Interval of the closed form's delay: the delays at the ends of the shift's own, a bootstrap
   over streams of innovations e (T, S) or (T, S, 1). An end is None where no shift is among the
-  likely ones, which no detector finds."""
+  likely ones, which no detector finds.
+  """
   e = e.reshape(len(e), -1)
   count, total = np.isfinite(e).sum(0), np.nansum(e, 0)
   w = bootstrap.weights(len(total), REPS)
@@ -421,6 +430,7 @@ def efficiency(oracle_latencies, detector_latencies, horizon: int, reps: int = R
   Args:
     oracle_latencies, detector_latencies: (S,) of the same seeds [control steps], None or inf or nan
       = missed. horizon: [control steps].
+
   Returns:
     {efficiency; oracle_delay_steps, delay_steps: restricted means; each with its _ci, a bootstrap
     over seeds, drawn in pairs, None for fewer than two;

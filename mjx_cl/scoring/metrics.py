@@ -30,7 +30,8 @@ from typing import NamedTuple
 import numpy as np
 
 from mjx_cl.errors import UserError
-from mjx_cl.scoring import alarms, bootstrap, special
+from mjx_cl.scoring import alarms, special
+from mjx_cl.scoring import intervals as bootstrap
 
 HORIZON_S = 20.0  # a later alarm is no detection, unless a suite says otherwise [s after onset]
 HALF_S = 5.0  # delay after which half of what an immediate alarm saves is lost [s]
@@ -73,6 +74,7 @@ def latencies(
   Args:
     alarm: bool (T, S). onset: int (S,). horizon: [control steps]. count_from: steps before it count
       nowhere.
+
   Returns:
     float (S,).
   """
@@ -172,6 +174,7 @@ def row(
     count_from: steps before it count nowhere, the detector's warm-up.
     reps: bootstrap draws; the same seeds are drawn for every metric. horizon_s: a later alarm is no
       detection [s after onset].
+
   Returns:
     Flat dict, undefined = None. x_ci = [low, high] at 95 %, an end that falls on a censored time is
     None, the whole None for fewer than two seeds: Wilson for shares, exact Poisson where no false
@@ -281,6 +284,7 @@ def arl0(alarm, count_from: int = 0) -> dict:
 
   Args:
     alarm: bool (T, S). count_from: steps before it count nowhere.
+
   Returns:
     {arl0 [control steps], None without an alarm; arl0_ci: from the exact Poisson interval of the
     number of alarms, which takes alarms as independent, its upper end None without an alarm;
@@ -306,6 +310,7 @@ def episode_alarm_probability(alarm, episode, count_from: int = 0) -> dict:
   Args:
     alarm: bool (T, S). episode: int (T, S), number of the episode, constant within it. count_from:
       steps before it count nowhere.
+
   Returns:
     {episode_alarm_probability, episode_alarm_probability_ci: Wilson over episodes, taken as
     independent; episodes}.
@@ -358,6 +363,7 @@ def overall(rows: list[dict], reps: int = REPS) -> Overall:
 
   Args:
     rows: of `row`, with detector, robot, fault, severity, and perhaps reference.
+
   Returns:
     Overall; each row has detector, blocks, and for every mean over streams its value and its _ci,
     None where any of its rows has none; mean_rank.
@@ -412,8 +418,10 @@ def difference(
 
   Args:
     rows: as `overall` takes them. measure: one of its means over streams.
+
   Returns:
     (mean difference, [low, high]).
+
   Raises:
     UserError where the two were not scored on the same faults, or rows lack their streams.
   """

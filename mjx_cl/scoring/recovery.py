@@ -99,6 +99,7 @@ def return_lost_healthy(
   Args:
     onset: the number of steps for a robot that never breaks. start: control step of the alarm, or
       of whatever else started adaptation; None: nothing.
+
   Returns:
     0 where nothing started before onset; None where there is no reward_pre to compare with.
   """

@@ -44,7 +44,7 @@ def gamma_cdf(a: float, x: float) -> float:
 
 
 def normal_quantile(p: float) -> float:
-  """x with P(Z <= x) = p for a standard normal Z, by bisection of the error function."""
+  """X with P(Z <= x) = p for a standard normal Z, by bisection of the error function."""
   low, high = -9.0, 9.0
   for _ in range(60):
     x = (low + high) / 2
@@ -54,7 +54,7 @@ def normal_quantile(p: float) -> float:
 
 @functools.lru_cache(maxsize=4096)
 def gamma_quantile(a: float, p: float) -> float:
-  """x with gamma_cdf(a, x) = p, 0 < p < 1: Newton's steps from Wilson and Hilferty's cube, inside a
+  """X with gamma_cdf(a, x) = p, 0 < p < 1: Newton's steps from Wilson and Hilferty's cube, inside a
   bracket.
   """
   x = max(a * (1 - 1 / (9 * a) + normal_quantile(p) / (3 * math.sqrt(a))) ** 3, 1e-8)

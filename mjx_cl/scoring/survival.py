@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mjx_cl.scoring import bootstrap, recovery
+from mjx_cl.scoring import intervals, recovery
 
 Z = 1.959963984540054  # 97.5 % quantile of the normal distribution
 
@@ -50,6 +50,7 @@ def kaplan_meier(time, seen, interval: str = "log-log") -> Curve:
     time: (n,) times of recovery or of censoring [any unit]. seen: bool (n,), the recovery was seen;
       False: censored.
     interval: log-log (stays within [0, 1], fair with ten streams) or greenwood.
+
   Returns:
     Curve over the times of events; empty arrays where none was seen.
   Undefined: the log-log interval where S is 0; Greenwood's too, since V is infinite there.
@@ -134,7 +135,7 @@ def restricted_mean(time, seen, horizon: float) -> tuple[float | None, list[floa
 
 
 def paired_difference(
-  a, b, horizon: float, reps: int = bootstrap.REPS, seed: int = 0
+  a, b, horizon: float, reps: int = intervals.REPS, seed: int = 0
 ) -> tuple[float | None, list[float | None] | None]:
   """Difference of the restricted means of two arms on the same seeds, a - b, with its 95 %
   percentile bootstrap interval.
@@ -144,6 +145,7 @@ def paired_difference(
 
   Args:
     a, b: (time (n,), seen bool (n,)), entry i of both from the same seed.
+
   Returns:
     (difference, [low, high]). Draws in which a mean is undefined are left out; the interval is None
     for fewer than two seeds or where more than half of the draws are.
@@ -155,10 +157,10 @@ def paired_difference(
   difference = None if None in means else means[0] - means[1]
   if len(a[0]) < 2:
     return difference, None
-  drawn = bootstrap.draws(len(a[0]), reps, seed)
+  drawn = intervals.draws(len(a[0]), reps, seed)
   counts = np.zeros((reps, len(a[0])))
   np.add.at(counts, (np.arange(reps)[:, None], drawn), 1.0)
-  return difference, bootstrap.ends([_means(*a, horizon, counts) - _means(*b, horizon, counts)])[0]
+  return difference, intervals.ends([_means(*a, horizon, counts) - _means(*b, horizon, counts)])[0]
 
 
 def _means(time, seen, horizon, counts):
@@ -196,7 +198,8 @@ def of_runs(rows, steps: int) -> tuple[np.ndarray, np.ndarray]:
 def watched(rows, steps: int) -> list[int | None]:
   """Control steps after its onset for which a recovery could be seen, of each row of runs.parquet:
   up to 2,000 before the stream's next change, or before the end of the run. Below 0 where even that
-  is earlier; None without an onset."""
+  is earlier; None without an onset.
+  """
   onsets: dict[int, list[int]] = {}
   for r in rows:
     if r["onset"] is not None:
