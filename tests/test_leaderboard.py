@@ -571,14 +571,14 @@ def test_what_is_no_detector_gets_one_line(refused, late, tmp_path, monkeypatch)
 
 
 @pytest.mark.parametrize("part, name, others", [("mine.py:Mine", "Mine", set()), ("river.drift:PageHinkley", "PageHinkley", {"cusum@opr"})])
-def test_the_readmes_commands(late, tmp_path, monkeypatch, mjx, part, name, others):  # noqa: F811
+def test_the_commands_for_ones_own_detector(late, tmp_path, monkeypatch, mjx, part, name, others):  # noqa: F811
   """A class out of a file and a river detector, calibrated to the asked rate; both see the fault of four deviations."""
   if part.startswith("river"):
     pytest.importorskip("river")
   monkeypatch.chdir(tmp_path)
-  (block,) = [b for b in re.findall(r"^```python\n(.*?)^```", (pathlib.Path(__file__).parent.parent / "README.md").read_text(), re.S | re.M) if "# mine.py" in b]
+  (block,) = [b for b in re.findall(r"^```python\n(.*?)^```", (pathlib.Path(__file__).parent.parent / "docs/extending.md").read_text(), re.S | re.M) if "# mine.py" in b]
   pathlib.Path("mine.py").write_text(block)
-  command, *more = shown("README.md", part)
+  command, *more = shown("docs/extending.md", part)
   code, out, err = mjx(command, late, *more, "--json")
   assert code == 0, err
   rows = json.loads(out)

@@ -1,4 +1,4 @@
-"""Robots, faults and detectors of other packages: the README's class as a robot, one module with all three, and broken ones."""
+"""Robots, faults and detectors of other packages: the class of docs/extending.md as a robot, one module with all three, and broken ones."""
 import dataclasses
 import importlib.metadata
 import json
@@ -19,8 +19,7 @@ from mjx_cl.monitor import unknown
 from mjx_cl.plugins import Registry
 
 ROOT = pathlib.Path(__file__).parents[1]
-README = (ROOT / "README.md").read_text()
-REACH = re.search(r"class Reach:.*?\n\n", README, re.S)[0]  # as a reader copies it
+REACH = re.search(r"class Reach:.*?\n\n", (ROOT / "docs/extending.md").read_text(), re.S)[0]  # as a reader copies it
 PLUG = f'''import jax, jax.numpy as jnp
 from mjx_cl.detectors import Alarm, Detector, scalar
 from mjx_cl.faults.base import fault
