@@ -1,7 +1,9 @@
-"""The pictures of docs/detection.md, from simulation with fixed seeds: run lengths, latency, censoring, two AUROC traps, the limit.
+"""The pictures of docs/detection.md, from simulation with fixed seeds: run lengths, latency,
+censoring, two AUROC traps, the limit.
 
-  python benchmarks/figures_detection.py --out docs
+python benchmarks/figures_detection.py --out docs
 """
+
 from __future__ import annotations
 
 import argparse
@@ -32,10 +34,18 @@ def run_lengths(ax, rng):
   lengths = lengths[np.isfinite(lengths)]
   ax.hist(lengths, np.arange(0, 2000, 50), color=BLUE, alpha=0.7)
   ax.axvline(lengths.mean(), color=ORANGE)
-  ax.text(lengths.mean() + 20, ax.get_ylim()[1] * 0.85, f"mean = ARL0 = {lengths.mean():.0f} steps", color=ORANGE)
+  ax.text(
+    lengths.mean() + 20,
+    ax.get_ylim()[1] * 0.85,
+    f"mean = ARL0 = {lengths.mean():.0f} steps",
+    color=ORANGE,
+  )
   early = np.mean(lengths <= lengths.mean() / 10)
-  ax.set(xlabel="control steps until the first false alarm", ylabel="healthy streams",
-         title=f"One CUSUM, 2,000 healthy streams: {early:.0%} alarm within a tenth of the ARL0")
+  ax.set(
+    xlabel="control steps until the first false alarm",
+    ylabel="healthy streams",
+    title=f"One CUSUM, 2,000 healthy streams: {early:.0%} alarm within a tenth of the ARL0",
+  )
 
 
 def latency(ax, rng):
@@ -45,12 +55,16 @@ def latency(ax, rng):
   s = cusum(z)[:, 0]
   alarm = 250 + int((s[250:] > 8).argmax())
   ax.plot(z[:, 0], color=GREY, lw=0.6, label="residual [deviations]")
-  ax.plot(s[:alarm + 1], color=BLUE, label="evidence of the CUSUM")
+  ax.plot(s[: alarm + 1], color=BLUE, label="evidence of the CUSUM")
   ax.axhline(8, color=ORANGE, ls="--", label="threshold")
   ax.axvline(250, color="k", lw=0.8)
   ax.annotate("", (alarm, 11), (250, 11), arrowprops={"arrowstyle": "<->", "color": GREEN})
   ax.text(252, 11.5, f"latency {alarm - 250} steps", color=GREEN)
-  ax.set(xlabel="control step", ylim=(-4, 14), title="A fault at step 250 shifts the residual by one deviation")
+  ax.set(
+    xlabel="control step",
+    ylim=(-4, 14),
+    title="A fault at step 250 shifts the residual by one deviation",
+  )
   ax.legend(loc="upper left", fontsize=8)
 
 
@@ -60,13 +74,19 @@ def censoring(ax, rng):
   end = 500
   for k, t in enumerate(times):
     ax.plot([0, min(t, end)], [k, k], color=GREY, lw=1)
-    ax.plot(min(t, end), k, "o" if np.isfinite(t) else ">", color=BLUE if np.isfinite(t) else ORANGE)
+    ax.plot(
+      min(t, end), k, "o" if np.isfinite(t) else ">", color=BLUE if np.isfinite(t) else ORANGE
+    )
   mean, median = times[np.isfinite(times)].mean(), times[4]
   ax.axvline(mean, color=ORANGE, ls="--")
   ax.text(mean + 4, 8.3, f"mean over the found ones: {mean:.0f}", color=ORANGE, backgroundcolor="w")
   ax.axvline(median, color=GREEN)
   ax.text(median + 4, 6.8, f"censored median: {median:.0f}", color=GREEN, backgroundcolor="w")
-  ax.set(xlabel="steps since the onset", ylabel="seed, in order of latency", title="Four of ten are missed (triangles): a mean over successes hides them")
+  ax.set(
+    xlabel="steps since the onset",
+    ylabel="seed, in order of latency",
+    title="Four of ten are missed (triangles): a mean over successes hides them",
+  )
 
 
 def traps(ax, rng):
@@ -80,40 +100,82 @@ def traps(ax, rng):
     ranks = np.argsort(np.argsort(x)) + 1
     m = steps - onset
     return (ranks[onset:].sum() - m * (m + 1) / 2) / (m * onset)
+
   ax.plot(b - 9, color=ORANGE, lw=0.7, label=f"late: AUROC {area(b):.2f}")
   ax.plot(a, color=BLUE, lw=0.7, label=f"at once: AUROC {area(a):.2f}")
   ax.axvline(onset, color="k", lw=0.8)
-  ax.set(xlabel="control step", yticks=[], ylabel="score", title="The same AUROC: one detector speaks up at once, one 200 steps later")
+  ax.set(
+    xlabel="control step",
+    yticks=[],
+    ylabel="score",
+    title="The same AUROC: one detector speaks up at once, one 200 steps later",
+  )
   ax.legend(loc="upper left", fontsize=8)
 
 
 def limit(ax, rng):
-  """Delay against ARL0 for a shift of one deviation: the closed form, a CUSUM tuned to it, and a threshold on single samples."""
+  """Delay against ARL0 for a shift of one deviation: the closed form, a CUSUM tuned to it, and a
+  threshold on single samples.
+  """
   from mjx_cl.scoring import limits
+
   rates = np.geomspace(50, 20_000, 12)
-  ax.plot(rates, [limits.brownian(r, 1.0).delay for r in rates], color="k", label="limit: no detector is faster (closed form)")
-  healthy, faulty = cusum(rng.standard_normal((20_000, 300))), cusum(rng.standard_normal((400, 20_000)) + 1.0)
+  ax.plot(
+    rates,
+    [limits.brownian(r, 1.0).delay for r in rates],
+    color="k",
+    label="limit: no detector is faster (closed form)",
+  )
+  healthy, faulty = (
+    cusum(rng.standard_normal((20_000, 300))),
+    cusum(rng.standard_normal((400, 20_000)) + 1.0),
+  )
   points = []
   for h in (2.5, 3.0, 3.5, 4.0, 5.0, 6.0):
-    points.append((np.minimum(first(healthy > h), 20_000).mean() + 1, (first(faulty > h) + 1).mean()))
+    points.append(
+      (np.minimum(first(healthy > h), 20_000).mean() + 1, (first(faulty > h) + 1).mean())
+    )
   ax.plot(*zip(*points), "o", color=BLUE, label="CUSUM, simulated")
   from scipy.stats import norm
+
   k = np.linspace(2.0, 4.0, 9)
-  ax.plot(1 / norm.sf(k), 1 / norm.sf(k - 1.0), "s", color=ORANGE, label="threshold on single samples (exact)")
-  ax.set(xscale="log", yscale="log", xlabel="ARL0 [control steps]", ylabel="mean delay [control steps]", title="Shift of one deviation in independent samples")
+  ax.plot(
+    1 / norm.sf(k),
+    1 / norm.sf(k - 1.0),
+    "s",
+    color=ORANGE,
+    label="threshold on single samples (exact)",
+  )
+  ax.set(
+    xscale="log",
+    yscale="log",
+    xlabel="ARL0 [control steps]",
+    ylabel="mean delay [control steps]",
+    title="Shift of one deviation in independent samples",
+  )
   ax.legend(fontsize=8)
 
 
-PICTURES = {"arl": run_lengths, "latency": latency, "censoring": censoring, "auroc": traps, "limit": limit}
+PICTURES = {
+  "arl": run_lengths,
+  "latency": latency,
+  "censoring": censoring,
+  "auroc": traps,
+  "limit": limit,
+}
 
 
 def main() -> None:
-  parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+  parser = argparse.ArgumentParser(
+    description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+  )
   parser.add_argument("--out", default="docs")
   args = parser.parse_args()
   import matplotlib
+
   matplotlib.use("Agg")
   from matplotlib import pyplot
+
   for name, draw in PICTURES.items():
     figure, ax = pyplot.subplots(figsize=(7, 3.2), layout="constrained")
     draw(ax, np.random.default_rng(1))

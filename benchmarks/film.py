@@ -3,8 +3,8 @@
   python benchmarks/film.py                                            # writes docs/film.gif
   python benchmarks/film.py --agent runs/film/agents/detector-4
 
-Without `--agent` it first lets two walkers break and adapt (`mjx-cl run walker --keep`, minutes) and
-takes what the first has learnt. On another machine these are other lives, and it draws another film.
+Without `--agent` it first lets two walkers break and adapt (`mjx-cl run walker --keep`, minutes)
+and takes what the first has learnt. On another machine they live otherwise, and so does the film.
 All three robots have the same seed; they differ in their right hip and in what they have learnt.
 """
 
@@ -50,15 +50,17 @@ def tint(model, weak: str) -> None:
 
 def live(agent: str | None, broken: bool, seed: int, steps: int) -> tuple[list, list[float]]:
   """Pictures from step FIRST on, and at each the mean reward of the last LATELY steps."""
-  from mjx_cl import agents, envs, render
+  from mjx_cl import envs
+  from mjx_cl.render import pictures as draw
+  from mjx_cl.training import agents
 
   env = envs.make("walker")
   found = agents.of(env, agent)
-  scene, _ = render.painter(env, *DRAWN, view="robot")
+  scene, _ = draw.painter(env, *DRAWN, view="robot")
   tint(scene.model, JOINT.partition("_")[0] if broken else "")
   fault = {"fault": "gear", "target": JOINT, "severity": SEVERITY} if broken else {}
   pictures, rewards, means = [], [], []
-  acting = render.act(env, FIRST + steps, seed, found.agent, found.train.params, **fault)
+  acting = draw.act(env, FIRST + steps, seed, found.agent, found.train.params, **fault)
   for frame in acting:
     rewards.append(frame.reward)
     if frame.step >= FIRST and (frame.step - FIRST) % EVERY == 0:
@@ -105,7 +107,7 @@ def main() -> None:
   parser.add_argument("--steps", type=int, default=300, help="control steps shown, 0.025 s each")
   args = parser.parse_args()
   agent = args.agent or str(learn(pathlib.Path(args.work)))
-  from mjx_cl import runtime
+  from mjx_cl.io import runtime
 
   runtime.setup()
   from PIL import Image

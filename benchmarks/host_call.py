@@ -1,8 +1,12 @@
-"""What a call from a compiled program to the host costs, by name and by jax.pure_callback: python benchmarks/host_call.py [--json]
+"""What a call from a compiled program to the host costs, by name and by jax.pure_callback: python
+benchmarks/host_call.py [--json]
 
-Microseconds of a call that does nothing (2,000 in a loop, 40 rows of 3 numbers), and milliseconds of 64 control steps of ten walkers with their agent, each form in
-turn, medians; and seconds until such a chunk has been run the first time, in a new process with a new compile cache and in a second one that finds it there.
+Microseconds of a call that does nothing (2,000 in a loop, 40 rows of 3 numbers), and milliseconds
+of 64 control steps of ten walkers with their agent, each form in turn, medians; and seconds until
+such a chunk has been run the first time, in a new process with a new compile cache and in a second
+one that finds it there.
 """
+
 from __future__ import annotations
 
 import argparse
@@ -18,6 +22,7 @@ FORMS = ("by name", "pure_callback")
 
 def use(form: str) -> None:
   from mjx_cl.physics import by_name
+
   if form == "pure_callback":
     by_name.registered = lambda: False
   elif not by_name.registered():
@@ -28,25 +33,39 @@ def calls():
   """A program of 2,000 calls."""
   import jax
   import jax.numpy as jnp
+
   from mjx_cl.physics import by_name
+
   x = jnp.zeros((40, 3), jnp.uint32)
-  program = jax.jit(lambda x: jax.lax.fori_loop(0, 2000, lambda i, x: jax.vmap(lambda x: by_name.call("nothing", "", 3, x))(x), x))
+  program = jax.jit(
+    lambda x: jax.lax.fori_loop(
+      0, 2000, lambda i, x: jax.vmap(lambda x: by_name.call("nothing", "", 3, x))(x), x
+    )
+  )
   return lambda: program(x).block_until_ready()
 
 
 def chunk():
   """64 control steps of ten walkers."""
   import jax
-  from mjx_cl import run
+
   from mjx_cl.config import CHUNK, RunConfig
-  runner = run.Runner(RunConfig(env="walker", seeds=10, arms=("none",), steps=10_000), tempfile.gettempdir())
-  return lambda: jax.block_until_ready(runner.rollout.chunk(runner.acting, runner.state.streams, CHUNK)[1])
+  from mjx_cl.runs import run
+
+  runner = run.Runner(
+    RunConfig(env="walker", seeds=10, arms=("none",), steps=10_000), tempfile.gettempdir()
+  )
+  return lambda: jax.block_until_ready(
+    runner.rollout.chunk(runner.acting, runner.state.streams, CHUNK)[1]
+  )
 
 
 def measure(make, rounds: int) -> dict[str, float]:
   """Median seconds of each form, which take turns."""
-  from mjx_cl.physics import by_name
   from physics import race  # the script beside this one
+
+  from mjx_cl.physics import by_name
+
   asked, programs = by_name.registered, {}
   for form in FORMS:
     use(form)
@@ -58,7 +77,8 @@ def measure(make, rounds: int) -> dict[str, float]:
 
 def first(form: str) -> float:
   """Seconds until the first chunk is there, its robot and agent apart."""
-  from mjx_cl import runtime
+  from mjx_cl.io import runtime
+
   runtime.setup()
   use(form)
   run = chunk()
@@ -75,20 +95,39 @@ def main() -> None:
   if args.first:
     print(first(args.first))
     return
-  from mjx_cl import runtime, store
+  from mjx_cl.io import runtime, tables
+
   runtime.setup()
   from mjx_cl.physics import by_name
+
   nothing = by_name.shared("nothing", lambda: lambda word, x: x)
-  rows = [{"name": f"a call, {form}", "value": 1e6 * s / 2000, "unit": "us"} for form, s in measure(calls, 15).items()]
-  rows += [{"name": f"64 steps of ten walkers, {form}", "value": 1e3 * s, "unit": "ms"} for form, s in measure(chunk, 30).items()]
+  rows = [
+    {"name": f"a call, {form}", "value": 1e6 * s / 2000, "unit": "us"}
+    for form, s in measure(calls, 15).items()
+  ]
+  rows += [
+    {"name": f"64 steps of ten walkers, {form}", "value": 1e3 * s, "unit": "ms"}
+    for form, s in measure(chunk, 30).items()
+  ]
   del nothing
   for form in FORMS:
     with tempfile.TemporaryDirectory() as folder:
       for which in ("new cache", "second process"):
-        out = subprocess.run([sys.executable, __file__, "--first", form], env=os.environ | {"MJX_CL_CACHE": folder}, capture_output=True, text=True, check=True).stdout
+        out = subprocess.run(
+          [sys.executable, __file__, "--first", form],
+          env=os.environ | {"MJX_CL_CACHE": folder},
+          capture_output=True,
+          text=True,
+          check=True,
+        ).stdout
         rows.append({"name": f"first chunk, {form}, {which}", "value": float(out), "unit": "s"})
   if args.json:
-    print(json.dumps({"command": "python benchmarks/host_call.py --json", **store.provenance(), "rows": rows}, indent=1))
+    print(
+      json.dumps(
+        {"command": "python benchmarks/host_call.py --json", **tables.provenance(), "rows": rows},
+        indent=1,
+      )
+    )
   else:
     for row in rows:
       print(f"{row['name']:45} {row['value']:8.2f} {row['unit']}")

@@ -1,9 +1,12 @@
-"""Speed of recording residual streams: python benchmarks/recording.py [--json] [--streams 40] [--steps 2560]
+"""Speed of recording residual streams: python benchmarks/recording.py [--json] [--streams 40]
+[--steps 2560]
 
-40 healthy walkers (acting, physics, world model's predictions) in one batch as `mjx-cl record` does it, the predictions of a chunk beside the next chunk's
-physics, against a loop that calls the same jitted functions for one robot at a time, one after the other; stream-steps per second without compile time. Both take
-turns, medians.
+40 healthy walkers (acting, physics, world model's predictions) in one batch as `mjx-cl record` does
+it, the predictions of a chunk beside the next chunk's physics, against a loop that calls the same
+jitted functions for one robot at a time, one after the other; stream-steps per second without
+compile time. Both take turns, medians.
 """
+
 from __future__ import annotations
 
 import argparse
@@ -12,23 +15,26 @@ import statistics
 import sys
 import time
 
-from mjx_cl import runtime
+from mjx_cl.io import runtime
 
 runtime.setup()
 
 import jax  # noqa: E402
 
-from mjx_cl import agents, envs, faults  # noqa: E402
-from mjx_cl.monitor import Monitor  # noqa: E402
-from mjx_cl.record import stream_keys  # noqa: E402
-from mjx_cl.recording import Behind  # noqa: E402
-from mjx_cl.rollout import Rollout, nest, start  # noqa: E402
+from mjx_cl import envs, faults  # noqa: E402
+from mjx_cl.leaderboard.record import Behind  # noqa: E402
+from mjx_cl.rollout.frozen import stream_keys  # noqa: E402
+from mjx_cl.rollout.monitor import Monitor  # noqa: E402
+from mjx_cl.rollout.scan import Rollout, nest, start  # noqa: E402
+from mjx_cl.training import agents
 
 TOGETHER = 8  # chunks in a row, the last of which nothing runs beside: a recording has hundreds
 
 
 def live(env, trained, streams: int, chunk: int):
-  """Two calls for `streams` robots side by side: one that lives one more chunk and gives its rows, one that looks at rows."""
+  """Two calls for `streams` robots side by side: one that lives one more chunk and gives its rows,
+  one that looks at rows.
+  """
   none = faults.none(env)
   rollout, monitor = Rollout(env, trained.agent, none), Monitor(trained.agent, spec=env.spec)
   watch = jax.jit(monitor.update)
@@ -45,6 +51,7 @@ def live(env, trained, streams: int, chunk: int):
     held["history"], seen = watch(params, held["history"], rows, key)
     held["n"] += 1
     return jax.block_until_ready(seen)
+
   return act, look
 
 
@@ -71,11 +78,34 @@ def main() -> None:
     if k:
       times["batch"].append((middle - begin) / TOGETHER)
       times["single"].append((time.perf_counter() - middle) / TOGETHER)
-  rate = {"batch": args.streams * chunk / statistics.median(times["batch"]), "single": chunk / statistics.median(times["single"])}
+  rate = {
+    "batch": args.streams * chunk / statistics.median(times["batch"]),
+    "single": chunk / statistics.median(times["single"]),
+  }
   ratio = rate["batch"] / rate["single"]
-  rows = [{"name": f"recording, {args.streams} streams in one program", "value": round(rate["batch"]), "unit": "stream-steps/s", "goal": None, "holds": None},
-          {"name": "recording, one robot at a time", "value": round(rate["single"]), "unit": "stream-steps/s", "goal": None, "holds": None},
-          {"name": "recording, one program against one robot at a time", "value": round(ratio, 2), "unit": "ratio", "goal": ">= 10", "holds": ratio >= 10}]
+  rows = [
+    {
+      "name": f"recording, {args.streams} streams in one program",
+      "value": round(rate["batch"]),
+      "unit": "stream-steps/s",
+      "goal": None,
+      "holds": None,
+    },
+    {
+      "name": "recording, one robot at a time",
+      "value": round(rate["single"]),
+      "unit": "stream-steps/s",
+      "goal": None,
+      "holds": None,
+    },
+    {
+      "name": "recording, one program against one robot at a time",
+      "value": round(ratio, 2),
+      "unit": "ratio",
+      "goal": ">= 10",
+      "holds": ratio >= 10,
+    },
+  ]
   for r in rows:
     print(f"{r['name']:42s} {r['value']:>10,} {r['unit']}", file=sys.stderr)
   if args.json:

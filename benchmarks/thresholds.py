@@ -1,9 +1,13 @@
-"""Thresholds that `mjx-cl run --detector NAME` takes where none is given: python benchmarks/thresholds.py [--board results/leaderboard_100k] [--out FILE]
+"""Thresholds that `mjx-cl run --detector NAME` takes where none is given: python
+benchmarks/thresholds.py [--board results/leaderboard_100k] [--out FILE]
 
-Writes mjx_cl/detectors/thresholds.json from a leaderboard's own files: robot -> name on the board -> settings, threshold, ARL0 and the alarms that it was
-counted from. Left out are references, which look at nothing, the paper's rule, which has figures of its own (`detectors.PAPER`), and what the board counted fewer
-than ten alarms of: a detector that no threshold brings to that rate stays silent, and one with too few rows has not been measured.
+Writes mjx_cl/detectors/thresholds.json from a leaderboard's own files: robot -> name on the board
+-> settings, threshold, ARL0 and the alarms that it was counted from. Left out are references, which
+look at nothing, the paper's rule, which has figures of its own (`detectors.PAPER`), and what the
+board counted fewer than ten alarms of: a detector that no threshold brings to that rate stays
+silent, and one with too few rows has not been measured.
 """
+
 from __future__ import annotations
 
 import argparse
@@ -12,10 +16,13 @@ import sys
 
 import pyarrow.parquet as parquet
 
-from mjx_cl import cli, detectors, leaderboard, store
-from mjx_cl.detectors import references
+from benchmarks.report.report import load
+from mjx_cl import detectors
+from mjx_cl.cli import app
+from mjx_cl.detectors import baselines
 from mjx_cl.errors import FileError
-from mjx_cl.report import load
+from mjx_cl.io import tables
+from mjx_cl.leaderboard import score
 
 FILE = pathlib.Path(detectors.__file__).parent / "thresholds.json"
 LEAST = 10  # alarms
@@ -25,34 +32,63 @@ def collect(folder: pathlib.Path) -> dict:
   """What the file holds. Raises FileError where the board's files are missing or foreign."""
   about = load(folder / "leaderboard.json")
   try:
-    rows = parquet.read_table(folder / "leaderboard.parquet", columns=["detector", "robot", "threshold", "arl0", "arl0_alarms"]).to_pylist()
+    rows = parquet.read_table(
+      folder / "leaderboard.parquet",
+      columns=["detector", "robot", "threshold", "arl0", "arl0_alarms"],
+    ).to_pylist()
   except Exception as e:  # pyarrow raises of its own
-    raise FileError(f"{folder / 'leaderboard.parquet'}: not a leaderboard's table ({str(e).splitlines()[0]})") from None
-  known = leaderboard.variants()
+    raise FileError(
+      f"{folder / 'leaderboard.parquet'}: not a leaderboard's table ({str(e).splitlines()[0]})"
+    ) from None
+  known = score.variants()
   robots: dict[str, dict] = {}
   for row in rows:
     name = row["detector"]
-    if name not in known or name in detectors.PAPER or name in references.REFERENCES or row["threshold"] is None or row["arl0_alarms"] < LEAST:
+    if (
+      name not in known
+      or name in detectors.PAPER
+      or name in baselines.REFERENCES
+      or row["threshold"] is None
+      or row["arl0_alarms"] < LEAST
+    ):
       continue
     settings = dict(known[name])
     use, channel = detectors.split(settings.pop("use"))
     settings = {"use": use} | ({"channel": channel} if channel else {}) | settings
-    robots.setdefault(row["robot"], {})[name] = {"settings": settings, "threshold": row["threshold"], "arl0": row["arl0"], "alarms": row["arl0_alarms"]}
+    robots.setdefault(row["robot"], {})[name] = {
+      "settings": settings,
+      "threshold": row["threshold"],
+      "arl0": row["arl0"],
+      "alarms": row["arl0_alarms"],
+    }
   try:
-    head = {"command": about["command"], "arl0": about["arl0_target"], "seeds": about["seeds"]["tune"]}
+    head = {
+      "command": about["command"],
+      "arl0": about["arl0_target"],
+      "seeds": about["seeds"]["tune"],
+    }
   except (KeyError, TypeError):
     raise FileError(f"{folder / 'leaderboard.json'}: not a leaderboard's") from None
-  return head | {"robots": {robot: dict(sorted(own.items())) for robot, own in sorted(robots.items())}}
+  return head | {
+    "robots": {robot: dict(sorted(own.items())) for robot, own in sorted(robots.items())}
+  }
 
 
 def main(args: argparse.Namespace) -> None:
   values = collect(pathlib.Path(args.board))
-  store.write_json(pathlib.Path(args.out), values)
-  print(f"{sum(map(len, values['robots'].values()))} thresholds of {', '.join(values['robots'])} at ARL0 {values['arl0']:,} in {args.out}")
+  tables.write_json(pathlib.Path(args.out), values)
+  print(
+    f"{sum(map(len, values['robots'].values()))} thresholds of {', '.join(values['robots'])} "
+    f"at ARL0 {values['arl0']:,} in {args.out}"
+  )
 
 
 if __name__ == "__main__":
   parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-  parser.add_argument("--board", default="results/leaderboard_100k", help="folder that `mjx-cl leaderboard --out` wrote")
+  parser.add_argument(
+    "--board",
+    default="results/leaderboard_100k",
+    help="folder that `mjx-cl leaderboard --out` wrote",
+  )
   parser.add_argument("--out", default=str(FILE))
-  sys.exit(cli.attempt(lambda: main(parser.parse_args())))
+  sys.exit(app.attempt(lambda: main(parser.parse_args())))

@@ -1,6 +1,7 @@
 """python -m mjx_cl"""
+
 import sys
 
-from mjx_cl.cli import main
+from mjx_cl.cli.app import main
 
 sys.exit(main())

@@ -3,6 +3,7 @@
 
 class UserError(Exception):
   """Wrong arguments, names or ranges: exit code 2."""
+
   exit_code = 2
 
 
@@ -12,6 +13,7 @@ class PluginError(UserError):
 
 class FileError(UserError):
   """A broken, foreign or missing file, a full disk, a numeric failure: exit code 1."""
+
   exit_code = 1
 
 

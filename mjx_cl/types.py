@@ -1,4 +1,7 @@
-"""Values that more than one package passes around. All are pytrees of one robot, one stream; callers vmap."""
+"""Values that more than one package passes around. All are pytrees of one robot, one stream;
+callers vmap.
+"""
+
 from __future__ import annotations
 
 from typing import Any, NamedTuple
@@ -13,8 +16,10 @@ class Model(NamedTuple):
     mj: MuJoCo field name -> array in MjModel's own layout and units, e.g. `actuator_gear` (nu, 6).
     task: whatever is no MuJoCo field (motor law, tyre, reward weights), name -> array.
     force: float32 (nv,), generalised force applied from outside [N, N m], or None: none is applied.
-  An environment lists all leaves that faults may own; `rollout` passes on those `mj` leaves and the force that its fault owns, no others.
+  An environment lists all leaves that faults may own; `rollout` passes on those `mj` leaves and the
+  force that its fault owns, no others.
   """
+
   mj: dict[str, jax.Array]
   task: dict[str, jax.Array]
   force: jax.Array | None = None
@@ -26,10 +31,13 @@ class Step(NamedTuple):
   Attributes:
     obs: float32 (obs_size,), the first one of the next episode where a caller has reset the robot.
     reward: float32 (), of arriving.
-    terminated: bool (), an end that is worth nothing from here on (a fall where the task ends on one).
+    terminated: bool (), an end that is worth nothing from here on (a fall where the task ends on
+      one).
     truncated: bool (), the time limit; the value of what would have followed still counts.
-    final_obs: float32 (obs_size,), the observation arrived at, also when `obs` belongs to a new episode.
+    final_obs: float32 (obs_size,), the observation arrived at, also when `obs` belongs to a new
+      episode.
   """
+
   obs: jax.Array
   reward: jax.Array
   terminated: jax.Array
@@ -38,7 +46,10 @@ class Step(NamedTuple):
 
 
 class Var(NamedTuple):
-  """One scalar of an observation or action: name, unit, bounds, and `scale`, its typical deviation while the healthy robot is at work."""
+  """One scalar of an observation or action: name, unit, bounds, and `scale`, its typical deviation
+  while the healthy robot is at work.
+  """
+
   name: str
   unit: str
   low: float = float("-inf")
@@ -50,20 +61,27 @@ class Spec(NamedTuple):
   """What a task is, in numbers a reader can check.
 
   Attributes:
-    name: what tables and agents' cards call it; of a registered robot the name that it is registered by.
+    name: what tables and agents' cards call it; of a registered robot the name that it is
+      registered by.
     obs, act: one Var per scalar, in the order of the arrays.
     control_s: control period [s].
     episode_steps: control steps until truncation.
-    acceptance: mean reward per control step from which the task counts as done well enough [reward].
-    posture: index into obs and the least mean value that counts as upright, or None where no posture is asked for.
+    acceptance: mean reward per control step from which the task counts as done well enough
+      [reward].
+    posture: index into obs and the least mean value that counts as upright, or None where no
+      posture is asked for.
     targets: what a joint-wise fault can name, in actuator order.
     act_groups: (name, indices into act), such as the joints of one leg.
     obs_groups: (name, indices into obs), such as all joint speeds.
-    feet: (name, indices), what touches the ground: geoms of the MuJoCo model, or axles of a model that is none.
-    bodies: (name, indices), bodies whose mass may change, the trunk first; empty where there are none by name.
-    watched: (name, indices into obs), the eight parts of the observation whose residuals a detector sees one by one, each of one kind; what the
-      world model cannot foresee (commands, the robot's own last action) is left out. Empty: the observation in eight stretches.
+    feet: (name, indices), what touches the ground: geoms of the MuJoCo model, or axles of a model
+      that is none.
+    bodies: (name, indices), bodies whose mass may change, the trunk first; empty where there are
+      none by name.
+    watched: (name, indices into obs), the eight parts of the observation whose residuals a detector
+      sees one by one, each of one kind; what the world model cannot foresee (commands, the robot's
+      own last action) is left out. Empty: the observation in eight stretches.
   """
+
   name: str
   obs: tuple[Var, ...]
   act: tuple[Var, ...]
@@ -86,5 +104,6 @@ class EnvState(NamedTuple):
     physics: backend state; opaque.
     step: int32 (), control steps since the reset.
   """
+
   physics: Any
   step: jax.Array

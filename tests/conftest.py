@@ -1,13 +1,18 @@
-"""Shared by all tests: XLA flags and compile cache before the first use of JAX, and the few programs that are costly to compile."""
+"""Shared by all tests: XLA flags and compile cache before the first use of JAX, and the few
+programs that are costly to compile.
+"""
+
 import gc
 import os
 import pathlib
 import tempfile
 import threading
 
-os.environ.setdefault("MJX_CL_CACHE", str(pathlib.Path(tempfile.gettempdir()) / "mjx_cl_tests_cache"))  # shared by all runs and processes
+os.environ.setdefault(
+  "MJX_CL_CACHE", str(pathlib.Path(tempfile.gettempdir()) / "mjx_cl_tests_cache")
+)  # shared by all runs and processes
 
-from mjx_cl import runtime  # noqa: E402
+from mjx_cl.io import runtime  # noqa: E402
 
 runtime.setup()
 
@@ -17,24 +22,31 @@ import numpy as np  # noqa: E402
 import pytest  # noqa: E402
 
 ROBOTS = 256  # batch of the one MJX program that the suite compiles
-LIMIT = 2.0   # GiB
+LIMIT = 2.0  # GiB
 
 
 def resident_gib() -> float:
   """Memory that this process holds; 0 where /proc is missing."""
   try:
-    return int(pathlib.Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**30
+    return (
+      int(pathlib.Path("/proc/self/statm").read_text().split()[1])
+      * os.sysconf("SC_PAGE_SIZE")
+      / 2**30
+    )
   except OSError:
     return 0.0
 
 
 @pytest.fixture(scope="module", autouse=True)
 def forget():
-  """A module's compiled programs go with it once the process holds more than LIMIT GiB; session fixtures take theirs from the compile cache again."""
+  """A module's compiled programs go with it once the process holds more than LIMIT GiB; session
+  fixtures take theirs from the compile cache again.
+  """
   yield
   if resident_gib() > LIMIT:
     jax.clear_caches()
     from mjx_cl.adapt import loop
+
     loop._programs.clear()
     gc.collect()
     runtime.give_back()
@@ -44,15 +56,21 @@ def forget():
 def walker():
   """mujoco.MjModel of the walker."""
   from mjx_cl.envs.walker import load_model
+
   return load_model()
 
 
 @pytest.fixture(scope="session")
 def pair(walker):
-  """Native and MJX backend of the walker (10 substeps), as {name: (init, step)} for ROBOTS robots; one program each."""
+  """Native and MJX backend of the walker (10 substeps), as {name: (init, step)} for ROBOTS robots;
+  one program each.
+  """
   from mjx_cl import physics
+
   backends = {name: physics.make(name, walker, substeps=10) for name in ("native", "mjx")}
-  return {name: (jax.jit(jax.vmap(b.init)), jax.jit(jax.vmap(b.step))) for name, b in backends.items()}
+  return {
+    name: (jax.jit(jax.vmap(b.init)), jax.jit(jax.vmap(b.step))) for name, b in backends.items()
+  }
 
 
 @pytest.fixture(scope="session")
@@ -63,11 +81,20 @@ def fields(walker):
 
 @pytest.fixture(scope="session")
 def crowd(walker, pair, fields):
-  """1,024 states of walkers that thrash about on the floor: qpos (4, ROBOTS, 9), qvel (4, ROBOTS, 9), at 0.75, 1.5, 2.25 and 3 s."""
+  """1,024 states of walkers that thrash about on the floor: qpos (4, ROBOTS, 9), qvel (4, ROBOTS,
+  9), at 0.75, 1.5, 2.25 and 3 s.
+  """
   init, step = pair["native"]
   rng = np.random.default_rng(0)
   low, high = walker.jnt_range[3:].T
-  qpos = np.concatenate([np.zeros((ROBOTS, 2)), rng.uniform(-np.pi, np.pi, (ROBOTS, 1)), rng.uniform(low, high, (ROBOTS, 6))], 1)
+  qpos = np.concatenate(
+    [
+      np.zeros((ROBOTS, 2)),
+      rng.uniform(-np.pi, np.pi, (ROBOTS, 1)),
+      rng.uniform(low, high, (ROBOTS, 6)),
+    ],
+    1,
+  )
   state, kept = init(qpos.astype(np.float32), np.zeros((ROBOTS, 9), np.float32)), []
   for k in range(120):
     state, out = step(fields, state, rng.uniform(-1, 1, (ROBOTS, 6)).astype(np.float32))
@@ -81,19 +108,23 @@ def tiny():
   """Agent of the preset `tiny` for the walker."""
   from mjx_cl.config import PRESETS
   from mjx_cl.dreamer.agent import Agent
+
   return Agent(PRESETS["tiny"].dreamer, 24, 6)
 
 
 @pytest.fixture(scope="session")
 def tiny_params(tiny):
   """Parameters of two tiny agents, leading axis (2,)."""
-  return jax.jit(jax.vmap(lambda key: tiny.init(key).params))(jax.random.split(jax.random.key(7), 2))
+  return jax.jit(jax.vmap(lambda key: tiny.init(key).params))(
+    jax.random.split(jax.random.key(7), 2)
+  )
 
 
 @pytest.fixture(scope="session")
 def short_walker():
   """Native walker whose episodes last 12 control steps."""
   from mjx_cl import envs
+
   env = envs.make("walker", "native")
   env.spec = env.spec._replace(episode_steps=12)
   return env
@@ -101,7 +132,10 @@ def short_walker():
 
 @pytest.fixture
 def within():
-  """within(seconds, function): what `function` returns, or a failure (not a hang) where it takes longer."""
+  """within(seconds, function): what `function` returns, or a failure (not a hang) where it takes
+  longer.
+  """
+
   def call(seconds, function):
     out = []
     thread = threading.Thread(target=lambda: out.append(function()), daemon=True)
@@ -109,12 +143,16 @@ def within():
     thread.join(seconds)
     assert out, f"raised, or did not finish within {seconds} s"
     return out[0]
+
   return call
 
 
 @pytest.fixture
 def same():
-  """same(a, b): every leaf of two pytrees is bit for bit equal (nan equals itself, -0.0 differs from 0.0)."""
+  """same(a, b): every leaf of two pytrees is bit for bit equal (nan equals itself, -0.0 differs
+  from 0.0).
+  """
+
   def bits(x):
     if jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
       x = jax.random.key_data(x)
@@ -125,4 +163,5 @@ def same():
     a, b = jax.tree.leaves_with_path(a), jax.tree.leaves_with_path(b)
     assert [p for p, _ in a] == [p for p, _ in b]
     return all(bits(jnp.asarray(x)) == bits(jnp.asarray(y)) for (_, x), (_, y) in zip(a, b))
+
   return compare

@@ -1,9 +1,11 @@
 """What is compared: arms of a run. `ARMS` is the one table; a new arm is a line in it.
 
-An arm is a set of choices and holds no code of its own: what starts adaptation, what ends it, what learns, which weights it starts from, and whether
-the robot breaks at all. `loop.choices` turns the arms of a run into arrays over its streams, so that one compiled program serves any mix of
-them. Free of JAX, as config.py.
+An arm is a set of choices and holds no code of its own: what starts adaptation, what ends it, what
+learns, which weights it starts from, and whether the robot breaks at all. `loop.choices` turns the
+arms of a run into arrays over its streams, so that one compiled program serves any mix of them.
+Free of JAX, as config.py.
 """
+
 from __future__ import annotations
 
 from collections.abc import Callable
@@ -20,10 +22,11 @@ class Trigger:
 
   Attributes:
     why: the words that events.parquet says, with the step.
-    steps: (AdaptConfig, onsets of the robot, steps of the run, seed) -> control steps at which adaptation is due. One that falls into an
-      adaptation or into the warm-up starts nothing.
+    steps: (AdaptConfig, onsets of the robot, steps of the run, seed) -> control steps at which
+      adaptation is due. One that falls into an adaptation or into the warm-up starts nothing.
     listens: alarms of the detector are acted on, after the warm-up.
   """
+
   why: str
   steps: Callable[..., tuple[int, ...]] = lambda adapt, onsets, steps, seed: ()
   listens: bool = False
@@ -34,9 +37,12 @@ class End:
   """What ends adaptation.
 
   Attributes:
-    rule: stop and abort rules of the phase machine are in force. limit: AdaptConfig -> most control steps of one adaptation.
-    told: it ends at the oracle stop of the stream's seed, which another run has found (RunConfig.stops), or at the limit if that comes first.
+    rule: stop and abort rules of the phase machine are in force. limit: AdaptConfig -> most control
+      steps of one adaptation.
+    told: it ends at the oracle stop of the stream's seed, which another run has found
+      (RunConfig.stops), or at the limit if that comes first.
   """
+
   rule: bool
   limit: Callable[..., int]
   told: bool = False
@@ -45,14 +51,16 @@ class End:
 @dataclass(frozen=True)
 class Arm:
   """Attributes:
-    about: one line for `mjx-cl list arms`.
-    trigger, end: when it adapts.
-    world_only: the world model learns; actor, critic and all that belongs to them stay as they are.
-    fresh: parameters, moments and counters are drawn anew from the stream's seed at every start. The latent that the robot carries runs on.
-    rollback: an adaptation that is aborted leaves the better of two sets of weights, those of before it or those that it learnt, see loop.Before.
-    breaks: the robot gets the run's faults; False: their severity is 0.
-    agent: what is joined to the name of the run's agent, after a hyphen, to give that of the arm's own; "": it is the run's.
+  about: one line for `mjx-cl list arms`.
+  trigger, end: when it adapts.
+  world_only: the world model learns; actor, critic and all that belongs to them stay as they are.
+  fresh: parameters, moments and counters are drawn anew from the stream's seed at every start. The
+  latent that the robot carries runs on. rollback: an adaptation that is aborted leaves the better
+  of two sets of weights, those of before it or those that it learnt, see loop.Before. breaks: the
+  robot gets the run's faults; False: their severity is 0. agent: what is joined to the name of the
+  run's agent, after a hyphen, to give that of the arm's own; "": it is the run's.
   """
+
   about: str
   trigger: Trigger
   end: End
@@ -66,16 +74,25 @@ class Arm:
 def _random(adapt, onsets, steps, seed):
   """One step, uniform over those from which a whole adaptation fits into the run."""
   import numpy as np
+
   last = steps - adapt.random_steps
   if last < adapt.warmup:
-    raise UserError(f"arm 'random' needs warmup + random_steps = {adapt.warmup + adapt.random_steps} steps; the run has {steps}")
+    raise UserError(
+      f"arm 'random' needs warmup + random_steps = {adapt.warmup + adapt.random_steps} steps; "
+      f"the run has {steps}"
+    )
   return (int(np.random.default_rng([seed, 8]).integers(adapt.warmup, last + 1)),)
 
 
 NEVER = Trigger("")
 ALARM = Trigger("alarm", listens=True)
-ONSET = Trigger("true onset", lambda adapt, onsets, steps, seed: tuple(max(onset, adapt.warmup) for onset in onsets))
-PERIOD = Trigger("schedule", lambda adapt, onsets, steps, seed: tuple(range(adapt.period, steps, adapt.period)))
+ONSET = Trigger(
+  "true onset",
+  lambda adapt, onsets, steps, seed: tuple(max(onset, adapt.warmup) for onset in onsets),
+)
+PERIOD = Trigger(
+  "schedule", lambda adapt, onsets, steps, seed: tuple(range(adapt.period, steps, adapt.period))
+)
 RANDOM = Trigger("random time", _random)
 AT_ONCE = Trigger("end of the warm-up", lambda adapt, onsets, steps, seed: (adapt.warmup,))
 
@@ -88,33 +105,79 @@ NO_END = End(False, lambda adapt: FOREVER)
 
 
 def never_stops(arm: Arm) -> bool:
-  """Nothing but the budget ends the arm's adaptation: it shows what every possible stop would have been worth."""
+  """Nothing but the budget ends the arm's adaptation: it shows what every possible stop would have
+  been worth.
+  """
   return arm.end is BUDGET
 
 
 def stops(arm: Arm) -> bool:
-  """The arm goes on from the shipped agent, all of it learns and is kept, and the stop rule ends that: its stop compares with those of one that never stops."""
-  return arm.end is RULE and arm.breaks and not arm.fresh and not arm.world_only and not arm.rollback
+  """The arm goes on from the shipped agent, all of it learns and is kept, and the stop rule ends
+  that: its stop compares with those of one that never stops.
+  """
+  return (
+    arm.end is RULE and arm.breaks and not arm.fresh and not arm.world_only and not arm.rollback
+  )
 
 
 ARMS: dict[str, Arm] = {
-    "detector": Arm("finetuning starts on the detector's alarm", ALARM, RULE),
-    "rollback": Arm("as detector, but an aborted finetuning goes back to the weights of before it, where these earned more after the alarm", ALARM, RULE,
-                    rollback=True),
-    "none": Arm("no adaptation; alarms are logged", NEVER, NO_END),
-    "always": Arm("finetuning from the end of the warm-up on, without an end", AT_ONCE, NO_END),
-    "periodic": Arm("finetuning every --adapt.period steps, for --adapt.period-steps; over 25,000 steps about the updates of one detected fault",
-                    PERIOD, PERIOD_STEPS),
-    "random": Arm("finetuning once, at a time drawn from the seed, for --adapt.random-steps; about the updates of one detected fault",
-                  RANDOM, RANDOM_STEPS),
-    "oracle": Arm("finetuning starts at the true onset, ends by the stop rule", ONSET, RULE),
-    "oracle-budget": Arm("finetuning starts at the true onset, ends after --adapt.budget steps whatever the signals say: the run from which the best "
-                         "stop is chosen afterwards", ONSET, BUDGET),
-    "oracle-stop": Arm("finetuning starts at the true onset and ends where it should: at the oracle stop of the same seed, found by an earlier run of "
-                       "oracle-budget with --snapshots, whose folder --stops names", ONSET, ORACLE_STOP),
-    "scratch": Arm("at the true onset all parameters are drawn anew; ends by the stop rule", ONSET, RULE, fresh=True),
-    "world-model": Arm("as detector, but the world model alone learns; actor and critic stay", ALARM, RULE, world_only=True),
-    "randomised": Arm("no adaptation, an agent that was trained on randomised faults: ROBOT-randomised, or FOLDER-randomised beside an --agent FOLDER",
-                      NEVER, NO_END, agent="randomised"),
-    "no-fault": Arm("as detector, on a robot that never breaks: what false alarms cost", ALARM, RULE, breaks=False),
+  "detector": Arm("finetuning starts on the detector's alarm", ALARM, RULE),
+  "rollback": Arm(
+    "as detector, but an aborted finetuning goes back to the weights of before it, where these "
+    "earned more after the alarm",
+    ALARM,
+    RULE,
+    rollback=True,
+  ),
+  "none": Arm("no adaptation; alarms are logged", NEVER, NO_END),
+  "always": Arm("finetuning from the end of the warm-up on, without an end", AT_ONCE, NO_END),
+  "periodic": Arm(
+    "finetuning every --adapt.period steps, for --adapt.period-steps; over 25,000 steps about "
+    "the updates of one detected fault",
+    PERIOD,
+    PERIOD_STEPS,
+  ),
+  "random": Arm(
+    "finetuning once, at a time drawn from the seed, for --adapt.random-steps; about the "
+    "updates of one detected fault",
+    RANDOM,
+    RANDOM_STEPS,
+  ),
+  "oracle": Arm("finetuning starts at the true onset, ends by the stop rule", ONSET, RULE),
+  "oracle-budget": Arm(
+    "finetuning starts at the true onset, ends after --adapt.budget steps whatever the signals "
+    "say: the run from which the best "
+    "stop is chosen afterwards",
+    ONSET,
+    BUDGET,
+  ),
+  "oracle-stop": Arm(
+    "finetuning starts at the true onset and ends where it should: at the oracle stop of the "
+    "same seed, found by an earlier run of "
+    "oracle-budget with --snapshots, whose folder --stops names",
+    ONSET,
+    ORACLE_STOP,
+  ),
+  "scratch": Arm(
+    "at the true onset all parameters are drawn anew; ends by the stop rule",
+    ONSET,
+    RULE,
+    fresh=True,
+  ),
+  "world-model": Arm(
+    "as detector, but the world model alone learns; actor and critic stay",
+    ALARM,
+    RULE,
+    world_only=True,
+  ),
+  "randomised": Arm(
+    "no adaptation, an agent that was trained on randomised faults: ROBOT-randomised, or "
+    "FOLDER-randomised beside an --agent FOLDER",
+    NEVER,
+    NO_END,
+    agent="randomised",
+  ),
+  "no-fault": Arm(
+    "as detector, on a robot that never breaks: what false alarms cost", ALARM, RULE, breaks=False
+  ),
 }

@@ -1,4 +1,5 @@
 """Have six signals settled? A pure test over a ring of chunk values."""
+
 from __future__ import annotations
 
 import jax
@@ -9,7 +10,13 @@ from mjx_cl.config import AdaptConfig
 SIGNALS = ("opr", "rpr", "reward", "dyn_loss", "adv_mag", "value_loss")
 
 
-def settled(ring: jax.Array, count: jax.Array, nominal_mean: jax.Array, nominal_std: jax.Array, config: AdaptConfig) -> jax.Array:
+def settled(
+  ring: jax.Array,
+  count: jax.Array,
+  nominal_mean: jax.Array,
+  nominal_std: jax.Array,
+  config: AdaptConfig,
+) -> jax.Array:
   """Which signals show neither trend nor excess fluctuation over the ring.
 
     level      = median of the ring
@@ -17,13 +24,16 @@ def settled(ring: jax.Array, count: jax.Array, nominal_mean: jax.Array, nominal_
     fluctuation: (upper - lower quartile) / 1.349 <= max(fluctuation level, excess nominal_std)
     OPR, RPR   : also settled while level <= near nominal_mean
 
-  Medians and quartiles, because a chunk that holds a stumble or an episode's start is many times the others: with means and deviations one
-  walker whose reward was nominal for 10,000 steps never counted as settled (advantage magnitude, deviation twice the mean).
+  Medians and quartiles, because a chunk that holds a stumble or an episode's start is many times
+  the others: with means and deviations one walker whose reward was nominal for 10,000 steps never
+  counted as settled (advantage magnitude, deviation twice the mean).
 
   Args:
-    ring: float32 (patience, 6), one row per chunk in any rotation, SIGNALS along the last axis; nan rows are left out.
+    ring: float32 (patience, 6), one row per chunk in any rotation, SIGNALS along the last axis; nan
+      rows are left out.
     count: int32 (), rows ever written; fewer than `patience` means not settled.
     nominal_mean, nominal_std: float32 (6,).
+
   Returns:
     bool (6,).
   """

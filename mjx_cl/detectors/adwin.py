@@ -1,4 +1,5 @@
 """ADWIN on one residual: a window that is cut wherever its two parts differ in mean."""
+
 from __future__ import annotations
 
 from typing import NamedTuple
@@ -10,12 +11,15 @@ from mjx_cl.detectors.base import Alarm, Detector, Warm, above, cold, demand, sc
 
 
 class Buckets(NamedTuple):
-  """The window as an exponential histogram: a bucket of row i stands for 2^i samples; the oldest is place 0 of the highest row in use.
+  """The window as an exponential histogram: a bucket of row i stands for 2^i samples; the oldest is
+  place 0 of the highest row in use.
 
   Attributes:
-    mean: float32 (max_buckets, rows). squares: float32 (max_buckets, rows), sums of squared deviations; both 0 where unused.
+    mean: float32 (max_buckets, rows). squares: float32 (max_buckets, rows), sums of squared
+      deviations; both 0 where unused.
     number: int32 (rows,), buckets in use.
   """
+
   mean: jax.Array
   squares: jax.Array
   number: jax.Array
@@ -23,8 +27,10 @@ class Buckets(NamedTuple):
 
 class AdwinState(NamedTuple):
   """Attributes:
-    warm: scale of the stream. window: see Buckets. tick: int32 (), samples since the window began. score: float32 (), of the last check.
+  warm: scale of the stream. window: see Buckets. tick: int32 (), samples since the window began.
+  score: float32 (), of the last check.
   """
+
   warm: Warm
   window: Buckets
   tick: jax.Array
@@ -33,12 +39,16 @@ class AdwinState(NamedTuple):
 
 def empty(max_buckets: int, rows: int) -> Buckets:
   """A window of no samples."""
-  return Buckets(jnp.zeros((max_buckets, rows)), jnp.zeros((max_buckets, rows)), jnp.zeros(rows, jnp.int32))
+  return Buckets(
+    jnp.zeros((max_buckets, rows)), jnp.zeros((max_buckets, rows)), jnp.zeros(rows, jnp.int32)
+  )
 
 
 def insert(window: Buckets, x: jax.Array) -> Buckets:
-  """Adds a sample as a bucket of row 0. A full row first merges its two oldest buckets into one of the next row, so a carry runs up the full rows;
-  beyond the last row it is lost, and the window slides."""
+  """Adds a sample as a bucket of row 0. A full row first merges its two oldest buckets into one of
+  the next row, so a carry runs up the full rows; beyond the last row it is lost, and the window
+  slides.
+  """
   mean, squares, number = window
   places, rows = mean.shape
   row = jnp.arange(rows)
@@ -53,87 +63,133 @@ def insert(window: Buckets, x: jax.Array) -> Buckets:
   def settle(old, first, up):
     left = jnp.where(gives, jnp.concatenate([old[2:], jnp.zeros((2, rows))]), old)
     return jnp.where(place, jnp.concatenate([first[None], up[:-1]]), left)
-  return Buckets(settle(mean, x, up_mean), settle(squares, jnp.float32(0), up_squares), number + gets)
+
+  return Buckets(
+    settle(mean, x, up_mean), settle(squares, jnp.float32(0), up_squares), number + gets
+  )
 
 
 def drop_oldest(window: Buckets) -> Buckets:
   """Without the oldest bucket."""
   row = jnp.arange(window.number.shape[0])
   oldest = row == jnp.max(jnp.where(window.number > 0, row, -1))
-  left = lambda old: jnp.where(oldest, jnp.concatenate([old[1:], jnp.zeros((1, row.shape[0]))]), old)
+  left = lambda old: jnp.where(
+    oldest, jnp.concatenate([old[1:], jnp.zeros((1, row.shape[0]))]), old
+  )
   return Buckets(left(window.mean), left(window.squares), window.number - oldest)
 
 
 def strongest_cut(window: Buckets, shortest: int) -> jax.Array:
-  """The largest -ln(delta) at which some cut of the window is just significant, float32 (); -inf where none is allowed yet."""
+  """The largest -ln(delta) at which some cut of the window is just significant, float32 (); -inf
+  where none is allowed yet.
+  """
   places, rows = window.mean.shape
   in_order = lambda a: a.T[::-1].reshape(-1)  # oldest first
   held = in_order(jnp.arange(places)[:, None] < window.number)
-  n = jnp.where(held, in_order(jnp.broadcast_to(jnp.float32(2.0) ** jnp.arange(rows), (places, rows))), 0.0)
+  n = jnp.where(
+    held, in_order(jnp.broadcast_to(jnp.float32(2.0) ** jnp.arange(rows), (places, rows))), 0.0
+  )
   mean = in_order(window.mean)
   width = jnp.sum(n)
   centre = jnp.sum(n * mean) / width
-  variance = jnp.sum(jnp.where(held, in_order(window.squares) + n * jnp.square(mean - centre), 0.0)) / width
+  variance = (
+    jnp.sum(jnp.where(held, in_order(window.squares) + n * jnp.square(mean - centre), 0.0)) / width
+  )
   n0, u0 = jnp.cumsum(n), jnp.cumsum(n * (mean - centre))
   n1 = width - n0
   allowed = (n0 >= shortest) & (n1 >= shortest)
-  difference = jnp.abs(u0 / jnp.maximum(n0, 1) + u0 / jnp.maximum(n1, 1))  # the parts' sums about the centre are u0 and -u0
+  difference = jnp.abs(
+    u0 / jnp.maximum(n0, 1) + u0 / jnp.maximum(n1, 1)
+  )  # the parts' sums about the centre are u0 and -u0
   m = 1 / jnp.maximum(n0 - shortest + 1, 1) + 1 / jnp.maximum(n1 - shortest + 1, 1)
   linear, root = 2 / 3 * m, jnp.sqrt(2 * m * variance)
-  y = 2 * difference / (root + jnp.sqrt(root * root + 4 * linear * difference))  # linear y^2 + root y = difference, without cancellation
+  y = (
+    2 * difference / (root + jnp.sqrt(root * root + 4 * linear * difference))
+  )  # linear y^2 + root y = difference, without cancellation
   return jnp.max(jnp.where(allowed, y * y, -jnp.inf)) - jnp.log(2 * jnp.log(width))
 
 
 @scalar
-def adwin(threshold: float = 6.2146, clock: int = 32, grace_period: int = 10, max_buckets: int = 5, min_window_length: int = 5, rows: int = 16,
-          keep: bool = False, warmup: int = 1000) -> Detector:
-  """Two-sided ADWIN: a window as long as its samples agree, kept as O(log n) buckets, tested at every border between two of them.
+def adwin(
+  threshold: float = 6.2146,
+  clock: int = 32,
+  grace_period: int = 10,
+  max_buckets: int = 5,
+  min_window_length: int = 5,
+  rows: int = 16,
+  keep: bool = False,
+  warmup: int = 1000,
+) -> Detector:
+  """Two-sided ADWIN: a window as long as its samples agree, kept as O(log n) buckets, tested at
+  every border between two of them.
 
-    parts of n0 older and n1 newer samples, W = n0 + n1, means u0, u1, variance s2 of the whole window
-    significant at delta where |u0 - u1| > sqrt(2 m s2 L) + 2/3 m L,
-      L = ln(2 ln(W) / delta),  m = 1 / (n0 - min_window_length + 1) + 1 / (n1 - min_window_length + 1)
-    score = largest -ln(delta) at which a border would just be significant;  fired = score > threshold, at a check
-    at an alarm the oldest buckets go, one by one, until no border is significant; then, unless `keep`, the rest goes too
+    parts of n0 older and n1 newer samples, W = n0 + n1, means u0, u1, variance s2 of the whole
+    window significant at delta where |u0 - u1| > sqrt(2 m s2 L) + 2/3 m L,
+      L = ln(2 ln(W) / delta),  m = 1 / (n0 - min_window_length + 1) + 1 / (n1 - min_window_length +
+      1)
+    score = largest -ln(delta) at which a border would just be significant;  fired = score >
+    threshold, at a check at an alarm the oldest buckets go, one by one, until no border is
+    significant; then, unless `keep`, the rest goes too
 
-  Only every `clock`-th sample is a check, and only beyond `grace_period` samples: an alarm comes up to clock - 1 samples later than the evidence
-  for it (15.5 on average), and between checks the score is that of the last one. The score is that of the window before anything is dropped.
-  The bound is meant for samples in [0, 1]. In the form above the variance carries the scale, and only the term 2/3 m L, the price of a bounded
-  but skewed sample, has the unit of x: on samples much smaller than 1 it rules and the rule is deaf, on samples much larger it vanishes and
-  what is left is a test of a normal mean. Warm-up deviations as unit set that scale; they are not bounded, so delta is then a level, not a guarantee.
+  Only every `clock`-th sample is a check, and only beyond `grace_period` samples: an alarm comes up
+  to clock - 1 samples later than the evidence for it (15.5 on average), and between checks the
+  score is that of the last one. The score is that of the window before anything is dropped. The
+  bound is meant for samples in [0, 1]. In the form above the variance carries the scale, and only
+  the term 2/3 m L, the price of a bounded but skewed sample, has the unit of x: on samples much
+  smaller than 1 it rules and the rule is deaf, on samples much larger it vanishes and what is left
+  is a test of a normal mean. Warm-up deviations as unit set that scale; they are not bounded, so
+  delta is then a level, not a guarantee.
 
   Args:
-    threshold: -ln(delta), compared with the score; 6.2146 is delta = 0.002, with no alarm in 2,000,000 independent Gaussian samples. May be traced.
+    threshold: -ln(delta), compared with the score; 6.2146 is delta = 0.002, with no alarm in
+      2,000,000 independent Gaussian samples. May be traced.
     clock: samples from check to check [control steps].
     grace_period: samples that a window must exceed to be checked [control steps].
     max_buckets: buckets of one size; more make finer borders.
     min_window_length: samples that either part must have [control steps].
-    rows: bucket sizes 1, 2, 4 .. 2^(rows-1); beyond max_buckets (2^rows - 1) samples, 327,675 by default, the oldest are forgotten.
-    keep: after an alarm keep what lies after the cut, as in the paper; one change then often alarms at several checks. False starts from an
-      empty window.
-    warmup: samples whose mean and deviation scale the stream and which enter no window [control steps]; 0 takes the stream as it is.
+    rows: bucket sizes 1, 2, 4 .. 2^(rows-1); beyond max_buckets (2^rows - 1) samples, 327,675 by
+      default, the oldest are forgotten.
+    keep: after an alarm keep what lies after the cut, as in the paper; one change then often alarms
+      at several checks. False starts from an empty window.
+    warmup: samples whose mean and deviation scale the stream and which enter no window [control
+      steps]; 0 takes the stream as it is.
+
   Returns:
     Detector whose update takes x, float32 (), and gives Alarm(fired: bool (), score: float32 ()).
-  Blind to: a change of variance alone; a change that is undone within `clock` samples; a shift that 2/3 m L hides (warmup = 0, small unit).
-  Source: Bifet and Gavalda 2007, SIAM International Conference on Data Mining, 443-448, in the form with variance; warmup = 0 alarms where
+  Blind to: a change of variance alone; a change that is undone within `clock` samples; a shift that
+  2/3 m L hides (warmup = 0, small unit). Source: Bifet and Gavalda 2007, SIAM International
+  Conference on Data Mining, 443-448, in the form with variance; warmup = 0 alarms where
     river.drift.ADWIN does.   Example: _, out = jax.lax.scan(det.update, det.init(), xs)
   """
-  demand("adwin", threshold=(threshold, above(threshold, 0), "above 0"), clock=(clock, clock >= 1, "at least 1"),
-         grace_period=(grace_period, grace_period >= 1, "at least 1"), max_buckets=(max_buckets, max_buckets >= 2, "at least 2"),
-         min_window_length=(min_window_length, min_window_length >= 1, "at least 1"), rows=(rows, 1 <= rows <= 24, "from 1 to 24"),
-         warmup=(warmup, warmup == 0 or warmup >= 2, "0, or at least 2"))
+  demand(
+    "adwin",
+    threshold=(threshold, above(threshold, 0), "above 0"),
+    clock=(clock, clock >= 1, "at least 1"),
+    grace_period=(grace_period, grace_period >= 1, "at least 1"),
+    max_buckets=(max_buckets, max_buckets >= 2, "at least 2"),
+    min_window_length=(min_window_length, min_window_length >= 1, "at least 1"),
+    rows=(rows, 1 <= rows <= 24, "from 1 to 24"),
+    warmup=(warmup, warmup == 0 or warmup >= 2, "0, or at least 2"),
+  )
 
   def init():
     return AdwinState(cold(), empty(max_buckets, rows), jnp.int32(0), jnp.float32(jnp.nan))
 
   def check(window, due, last):
-    """(window after the cuts, score): a loop of no turn where nothing is due, so that under vmap the test costs only where some stream is due."""
+    """(window after the cuts, score): a loop of no turn where nothing is due, so that under vmap
+    the test costs only where some stream is due.
+    """
+
     def turn(carry):
       window, _, score, first = carry
       now = strongest_cut(window, min_window_length)
       cut = now > threshold
       window = jax.tree.map(lambda a, b: jnp.where(cut, a, b), drop_oldest(window), window)
       return window, cut, jnp.where(first, now, score), jnp.bool_(False)
-    window, _, score, _ = jax.lax.while_loop(lambda carry: carry[1], turn, (window, due, last, jnp.bool_(True)))
+
+    window, _, score, _ = jax.lax.while_loop(
+      lambda carry: carry[1], turn, (window, due, last, jnp.bool_(True))
+    )
     return window, jnp.where(jnp.isneginf(score), jnp.nan, score)
 
   def update(state, x):

@@ -1,7 +1,9 @@
 """The contract of a detector, and what the detectors share."""
+
 from __future__ import annotations
 
-from typing import Any, Callable, NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,8 +13,10 @@ from mjx_cl.errors import UserError
 
 class Alarm(NamedTuple):
   """Attributes:
-    fired: bool (). score: float32 (), larger is more suspect; nan where the sample was masked or nothing is known yet.
+  fired: bool (). score: float32 (), larger is more suspect; nan where the sample was masked or
+  nothing is known yet.
   """
+
   fired: jax.Array
   score: jax.Array
 
@@ -20,31 +24,39 @@ class Alarm(NamedTuple):
 class Detector(NamedTuple):
   """Attributes:
     init: () -> state, a pytree of arrays.
-    update: (state, x) -> (state, Alarm), same structure, shapes and dtypes in and out: scannable and vmappable. Where `update.skips` is set, a scalar x
-      that is nan leaves the state as it is and has no score; `combine.on` then need not compare a long state element by element at every sample.
+    update: (state, x) -> (state, Alarm), same structure, shapes and dtypes in and out: scannable
+      and vmappable. Where `update.skips` is set, a scalar x that is nan leaves the state as it is
+      and has no score; `combine.on` then need not compare a long state element by element at every
+      sample.
 
-  A factory's `threshold` is compared as score > threshold and may be traced, so that one compiled program serves a whole calibration. After an
-  alarm the evidence starts from nothing, what was learnt of the healthy robot stays, unless the factory says otherwise.
+  A factory's `threshold` is compared as score > threshold and may be traced, so that one compiled
+  program serves a whole calibration. After an alarm the evidence starts from nothing, what was
+  learnt of the healthy robot stays, unless the factory says otherwise.
   """
+
   init: Callable[[], Any]
   update: Callable[[Any, Any], tuple[Any, Alarm]]
 
 
 def scalar(factory: Callable[..., Detector]) -> Callable[..., Detector]:
-  """Marks a factory whose detectors take one number per step; `make` puts them on channels of monitor.Residual. Works for plug-ins too."""
+  """Marks a factory whose detectors take one number per step; `make` puts them on channels of
+  monitor.Residual. Works for plug-ins too.
+  """
   factory.takes = "scalar"
   return factory
 
 
 def demand(name: str, **rules: tuple[Any, bool, str]) -> None:
-  """Refuses settings out of range: demand("cusum", threshold=(threshold, above(threshold, 0), "above 0"))."""
+  """Refuses settings out of range: demand("cusum", threshold=(threshold, above(threshold, 0),
+  "above 0")).
+  """
   for setting, (value, holds, rule) in rules.items():
     if not holds:
       raise UserError(f"detector {name!r}: {setting} must be {rule}; got {value}")
 
 
 def above(value, low) -> bool:
-  """value > low; a traced value, which has no number yet, passes."""
+  """Value > low; a traced value, which has no number yet, passes."""
   return isinstance(value, jax.core.Tracer) or bool(value > low)
 
 
@@ -54,6 +66,7 @@ class Warm(NamedTuple):
   Attributes:
     count: int32 (). mean: float32 (). squares: float32 (), sum of squared deviations.
   """
+
   count: jax.Array
   mean: jax.Array
   squares: jax.Array
@@ -65,10 +78,12 @@ def cold() -> Warm:
 
 
 def standardise(state: Warm, x: jax.Array, warmup: int) -> tuple[Warm, jax.Array, jax.Array]:
-  """z = (x - mean) / max(std, 1e-6) with mean and std (n, not n - 1) of the first `warmup` samples, by Welford's recursion.
+  """Z = (x - mean) / max(std, 1e-6) with mean and std (n, not n - 1) of the first `warmup` samples,
+  by Welford's recursion.
 
   Returns:
-    (state', z, ready): ready is false, and z means nothing, during warm-up. warmup = 0 takes x as standardised already: z = x.
+    (state', z, ready): ready is false, and z means nothing, during warm-up. warmup = 0 takes x as
+    standardised already: z = x.
   """
   if warmup == 0:
     return state, x, jnp.bool_(True)

@@ -1,8 +1,12 @@
-"""Combinators: a detector of a channel, several together, several samples together, and what a stream passes through first."""
+"""Combinators: a detector of a channel, several together, several samples together, and what a
+stream passes through first.
+"""
+
 from __future__ import annotations
 
 import inspect
-from typing import Any, Callable, NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,21 +24,26 @@ def is_channel(name: str) -> bool:
 
 
 def read(channel: str, residual) -> jax.Array:
-  """One number of a monitor.Residual: `opr`, `rpr`, `reward`, `surprise`, `group_0` .. `group_7`, or `variable_0` and so on, the residual of a single
-  observation variable. Unknown values are nan. UserError for a variable that the residual does not hold."""
+  """One number of a monitor.Residual: `opr`, `rpr`, `reward`, `surprise`, `group_0` .. `group_7`,
+  or `variable_0` and so on, the residual of a single observation variable. Unknown values are nan.
+  UserError for a variable that the residual does not hold.
+  """
   if channel.startswith("group_"):
     return residual.groups[int(channel[6:])]
   if channel.startswith("variable_"):
     index, size = int(channel[9:]), residual.variables.shape[-1]
     if index >= size:
-      raise UserError(f"no channel {channel}: the residual holds {size} variables" + ("" if size else ", since recorded streams keep groups of them alone"))
+      raise UserError(
+        f"no channel {channel}: the residual holds {size} variables"
+        + ("" if size else ", since recorded streams keep groups of them alone")
+      )
     return residual.variables[index]
   return getattr(residual, channel)
 
 
 def on(channel: str, detector: Detector, log: bool = False) -> Detector:
-  """A single-residual detector on one channel of monitor.Residual. A sample that is invalid or no finite number leaves its
-  state unchanged.
+  """A single-residual detector on one channel of monitor.Residual. A sample that is invalid or no
+  finite number leaves its state unchanged.
 
   Args:
     log: ln max(x, 1e-9) in place of x; residuals are positive and skewed.
@@ -51,34 +60,45 @@ def on(channel: str, detector: Detector, log: bool = False) -> Detector:
     if not skips:
       new = jax.tree.map(lambda a, b: jnp.where(valid, a, b), new, state)
     return new, Alarm(alarm.fired & valid, jnp.where(valid, alarm.score, jnp.nan))
+
   return Detector(detector.init, update)
 
 
 def any_of(*detectors: Detector) -> Detector:
   """Fires when any member fires; score = the largest of the members' scores that are known."""
+
   def update(states, x):
     out = [d.update(s, x) for d, s in zip(detectors, states)]
     fired = jnp.any(jnp.stack([alarm.fired for _, alarm in out]))
     scores = jnp.stack([alarm.score for _, alarm in out])
     known = jnp.where(jnp.isnan(scores), -jnp.inf, scores).max()
-    return tuple(state for state, _ in out), Alarm(fired, jnp.where(jnp.all(jnp.isnan(scores)), jnp.nan, known))
-  update.members = detectors  # for passes.updates: the largest score hides what the other members do
+    return tuple(state for state, _ in out), Alarm(
+      fired, jnp.where(jnp.all(jnp.isnan(scores)), jnp.nan, known)
+    )
+
+  update.members = (
+    detectors  # for passes.updates: the largest score hides what the other members do
+  )
   return Detector(lambda: tuple(d.init() for d in detectors), update)
 
 
 class AllOfState(NamedTuple):
   """Attributes:
-    members: their states. age: int32 (members,), samples since each one's last alarm that still counts; `within` where there is none.
+  members: their states. age: int32 (members,), samples since each one's last alarm that still
+  counts; `within` where there is none.
   """
+
   members: tuple
   age: jax.Array
 
 
 def all_of(*detectors: Detector, within: int = 1) -> Detector:
-  """Fires when every member has fired among the last `within` samples; the alarms are spent then, and each member must fire anew.
+  """Fires when every member has fired among the last `within` samples; the alarms are spent then,
+  and each member must fire anew.
 
-  A member starts its evidence afresh at its own alarm, so alarms for the same change seldom fall on one sample: give detectors that gather evidence
-  a `within` of about the spread of their delays. Score = the smallest of the members' scores, nan unless all are known; fired does not follow from
+  A member starts its evidence afresh at its own alarm, so alarms for the same change seldom fall on
+  one sample: give detectors that gather evidence a `within` of about the spread of their delays.
+  Score = the smallest of the members' scores, nan unless all are known; fired does not follow from
   it where within > 1. A row in which no member has a score does not count as a sample.
   """
   demand("all_of", within=(within, within >= 1, "at least 1"))
@@ -89,24 +109,36 @@ def all_of(*detectors: Detector, within: int = 1) -> Detector:
     older = jnp.where(jnp.all(jnp.isnan(scores)), state.age, jnp.minimum(state.age + 1, within))
     age = jnp.where(jnp.stack([alarm.fired for _, alarm in out]), 0, older)
     fired = jnp.all(age < within) & jnp.any(age == 0)  # never at a row that no member counts
-    return AllOfState(tuple(s for s, _ in out), jnp.where(fired, within, age)), Alarm(fired, jnp.min(scores))
-  return Detector(lambda: AllOfState(tuple(d.init() for d in detectors), jnp.full(len(detectors), within, jnp.int32)), update)
+    return AllOfState(tuple(s for s, _ in out), jnp.where(fired, within, age)), Alarm(
+      fired, jnp.min(scores)
+    )
+
+  return Detector(
+    lambda: AllOfState(
+      tuple(d.init() for d in detectors), jnp.full(len(detectors), within, jnp.int32)
+    ),
+    update,
+  )
 
 
 class RunState(NamedTuple):
   """Attributes:
-    inner: state of the detector. run: int32 (), scores in a row above the threshold, at most k.
+  inner: state of the detector. run: int32 (), scores in a row above the threshold, at most k.
   """
+
   inner: Any
   run: jax.Array
 
 
 def patience(factory: Callable[..., Detector], k: int, **settings) -> Detector:
-  """`factory(**settings)`, but firing only at the k-th score above its threshold in a row; k = 1 changes nothing.
+  """`factory(**settings)`, but firing only at the k-th score above its threshold in a row; k = 1
+  changes nothing.
 
-  Until then the detector does not know its threshold, so that its evidence goes on where it would have been spent by an alarm. It fires at the
-  k-th and starts afresh as always; what a run is to it (cusum: spent by the alarm; z_score: one alarm per excursion) stays as it is. A sample
-  without a score neither lengthens nor ends a run. Takes a factory, since a finished detector's threshold cannot be held back.
+  Until then the detector does not know its threshold, so that its evidence goes on where it would
+  have been spent by an alarm. It fires at the k-th and starts afresh as always; what a run is to it
+  (cusum: spent by the alarm; z_score: one alarm per excursion) stays as it is. A sample without a
+  score neither lengthens nor ends a run. Takes a factory, since a finished detector's threshold
+  cannot be held back.
   """
   demand("patience", k=(k, k >= 1, "at least 1"))
   known = inspect.signature(factory).parameters
@@ -120,20 +152,24 @@ def patience(factory: Callable[..., Detector], k: int, **settings) -> Detector:
     inner, alarm = detector.update(state.inner, x)
     run = jnp.where(alarm.score > threshold, jnp.minimum(state.run + 1, k), 0)
     return RunState(inner, jnp.where(jnp.isnan(alarm.score), state.run, run)), alarm
+
   return Detector(lambda: RunState(first.init(), jnp.int32(0)), update)
 
 
 class CoolState(NamedTuple):
   """Attributes:
-    inner: state of the detector. left: int32 (), samples for which alarms are still dropped.
+  inner: state of the detector. left: int32 (), samples for which alarms are still dropped.
   """
+
   inner: Any
   left: jax.Array
 
 
 def cool_down(detector: Detector, steps: int) -> Detector:
-  """Drops the alarms of the `steps` samples after one that counted. The detector runs on meanwhile, and a dropped alarm restarts its evidence too.
-  A sample without a score does not count; 0 changes nothing."""
+  """Drops the alarms of the `steps` samples after one that counted. The detector runs on meanwhile,
+  and a dropped alarm restarts its evidence too. A sample without a score does not count; 0 changes
+  nothing.
+  """
   demand("cool_down", steps=(steps, steps >= 0, "at least 0"))
 
   def update(state, x):
@@ -141,45 +177,56 @@ def cool_down(detector: Detector, steps: int) -> Detector:
     fired = alarm.fired & (state.left == 0)
     left = jnp.where(jnp.isnan(alarm.score), state.left, jnp.maximum(state.left - 1, 0))
     return CoolState(inner, jnp.where(fired, steps, left)), Alarm(fired, alarm.score)
+
   return Detector(lambda: CoolState(detector.init(), jnp.int32(0)), update)
 
 
 def _handed_on(ready: jax.Array, detector: Detector, inner, x: jax.Array):
   """The detector's update where `ready`; elsewhere its state stays and nothing is known."""
   new, alarm = detector.update(inner, jnp.where(ready, x, 0.0))
-  return jax.tree.map(lambda a, b: jnp.where(ready, a, b), new, inner), Alarm(alarm.fired & ready, jnp.where(ready, alarm.score, jnp.nan))
+  return jax.tree.map(lambda a, b: jnp.where(ready, a, b), new, inner), Alarm(
+    alarm.fired & ready, jnp.where(ready, alarm.score, jnp.nan)
+  )
 
 
 class StandardisedState(NamedTuple):
   """Attributes:
-    warm: reference. inner: state of the detector.
+  warm: reference. inner: state of the detector.
   """
+
   warm: Warm
   inner: Any
 
 
 def standardised(detector: Detector, warmup: int = 1000) -> Detector:
-  """Hands z = (x - mean) / max(std, 1e-6) to a detector of one number; mean, std of the first `warmup` samples, which it does not see."""
+  """Hands z = (x - mean) / max(std, 1e-6) to a detector of one number; mean, std of the first
+  `warmup` samples, which it does not see.
+  """
   demand("standardised", warmup=(warmup, warmup >= 2, "at least 2"))
 
   def update(state, x):
     warm, z, ready = standardise(state.warm, jnp.asarray(x, jnp.float32), warmup)
     inner, alarm = _handed_on(ready, detector, state.inner, z)
     return StandardisedState(warm, inner), alarm
+
   return Detector(lambda: StandardisedState(cold(), detector.init()), update)
 
 
 class WhitenedState(NamedTuple):
-  """Sums run over the first `warmup` samples, of d = x - origin; arrays (order + 1,) are indexed by lag.
+  """Sums run over the first `warmup` samples, of d = x - origin; arrays (order + 1,) are indexed by
+  lag.
 
   Attributes:
     count: int32 (), samples seen, at most warmup + order. origin: float32 (), the first sample.
     recent: float32 (order,), the last d, newest first; 0 where there is none.
-    products: float32 (order + 1,), sum of d_t d_{t-k}. first, last: float32 (order + 1,), sum of the first and of the last k samples' d.
+    products: float32 (order + 1,), sum of d_t d_{t-k}. first, last: float32 (order + 1,), sum of
+      the first and of the last k samples' d.
     total: float32 (), sum of d.
-    forward, backward: float32 (order + 1,), prediction error filters. error: float32 (), variance of their output.
+    forward, backward: float32 (order + 1,), prediction error filters. error: float32 (), variance
+      of their output.
     inner: state of the detector.
   """
+
   count: jax.Array
   origin: jax.Array
   recent: jax.Array
@@ -194,37 +241,57 @@ class WhitenedState(NamedTuple):
 
 
 def whitened(detector: Detector, order: int = 8, warmup: int = 1000) -> Detector:
-  """Hands a detector of one number the innovations of an autoregression that is fitted to the stream's own first samples.
+  """Hands a detector of one number the innovations of an autoregression that is fitted to the
+  stream's own first samples.
 
-    c_k = 1/N sum_{t=k+1..N} (x_t - m)(x_{t-k} - m),  m = mean of x_1..x_N,  N = warmup,  k = 0..order
-    sum_j a_j c_|i-j| = c_i, i = 1..order (Yule-Walker; its solution is stable),  e_t = x_t - m - sum_j a_j (x_{t-j} - m)
+    c_k = 1/N sum_{t=k+1..N} (x_t - m)(x_{t-k} - m),  m = mean of x_1..x_N,  N = warmup,  k =
+    0..order sum_j a_j c_|i-j| = c_i, i = 1..order (Yule-Walker; its solution is stable),  e_t = x_t
+    - m - sum_j a_j (x_{t-j} - m)
 
-  The equations are solved by Levinson's recursion, one order at each of the `order` samples after the warm-up, so that under vmap no step pays for
-  the whole solution. The detector sees e_t from sample warmup + order + 1 on and has its own warm-up from there. A shift D of the mean arrives as
-  D at its first sample and as D (1 - sum a_j) later: swings of the gait no longer pile up in a cumulative sum, and a lasting shift of a strongly
-  dependent stream is as small as it is.
+  The equations are solved by Levinson's recursion, one order at each of the `order` samples after
+  the warm-up, so that under vmap no step pays for the whole solution. The detector sees e_t from
+  sample warmup + order + 1 on and has its own warm-up from there. A shift D of the mean arrives as
+  D at its first sample and as D (1 - sum a_j) later: swings of the gait no longer pile up in a
+  cumulative sum, and a lasting shift of a strongly dependent stream is as small as it is.
 
   Args:
     order: samples that predict the next.
     warmup: samples that fit the autoregression [control steps].
+
   Returns:
     Detector of x, float32 (); Alarm.score is nan until the inner detector knows one.
-  Blind to: whatever repeats with the dependence of the healthy stream. Innovations are uncorrelated, not independent or Gaussian. Samples masked
+  Blind to: whatever repeats with the dependence of the healthy stream. Innovations are
+  uncorrelated, not independent or Gaussian. Samples masked
     out are skipped: their neighbours count as adjacent.
-  Reference: Alwan and Roberts 1988, J. Bus. Econ. Stat. 6, 87-95; Durbin 1960, Rev. Int. Stat. Inst. 28, 233-244.
+  Reference: Alwan and Roberts 1988, J. Bus. Econ. Stat. 6, 87-95; Durbin 1960, Rev. Int. Stat.
+  Inst. 28, 233-244.
   """
-  demand("whitened", order=(order, order >= 1, "at least 1"), warmup=(warmup, warmup > 2 * order, "more than twice the order"))
+  demand(
+    "whitened",
+    order=(order, order >= 1, "at least 1"),
+    warmup=(warmup, warmup > 2 * order, "more than twice the order"),
+  )
   lag = jnp.arange(order + 1)
   unit = (lag == 0).astype(jnp.float32)
 
   def fit(state: WhitenedState):
     """One order more of the recursion, from the sums."""
     mean = state.total / warmup
-    c = (state.products - mean * (2 * state.total - state.first - state.last) + (warmup - lag) * jnp.square(mean)) / warmup
+    c = (
+      state.products
+      - mean * (2 * state.total - state.first - state.last)
+      + (warmup - lag) * jnp.square(mean)
+    ) / warmup
     error = jnp.where(state.count == warmup, c[0], state.error)
     behind = jnp.concatenate([jnp.zeros(1), state.backward[:-1]])
-    reflection = jnp.sum(behind * c) / jnp.maximum(error, 1e-12)  # a deviation of 1e-6, the floor of base.standardise
-    return state.forward - reflection * behind, behind - reflection * state.forward, error * (1 - jnp.square(reflection))
+    reflection = jnp.sum(behind * c) / jnp.maximum(
+      error, 1e-12
+    )  # a deviation of 1e-6, the floor of base.standardise
+    return (
+      state.forward - reflection * behind,
+      behind - reflection * state.forward,
+      error * (1 - jnp.square(reflection)),
+    )
 
   def update(state, x):
     x = jnp.asarray(x, jnp.float32)
@@ -235,15 +302,38 @@ def whitened(detector: Detector, order: int = 8, warmup: int = 1000) -> Detector
     fitting, solving, ready = n < warmup, (n >= warmup) & (n < warmup + order), n >= warmup + order
     add = lambda old, new: jnp.where(fitting, new, old)
     last = jnp.concatenate([jnp.zeros(1), state.last[:-1] + d])
-    filters = [jnp.where(solving, new, old) for new, old in zip(fit(state), (state.forward, state.backward, state.error))]
+    filters = [
+      jnp.where(solving, new, old)
+      for new, old in zip(fit(state), (state.forward, state.backward, state.error))
+    ]
     innovation = jnp.sum(filters[0] * (window - state.total / warmup))
     inner, alarm = _handed_on(ready, detector, state.inner, innovation)
-    return WhitenedState(jnp.where(ready, n, n + 1), origin, window[:-1], add(state.products, state.products + d * window),
-                         add(state.first, state.first + jnp.where(n < lag, d, 0.0)), add(state.last, last), add(state.total, state.total + d),
-                         *filters, inner), alarm
+    return WhitenedState(
+      jnp.where(ready, n, n + 1),
+      origin,
+      window[:-1],
+      add(state.products, state.products + d * window),
+      add(state.first, state.first + jnp.where(n < lag, d, 0.0)),
+      add(state.last, last),
+      add(state.total, state.total + d),
+      *filters,
+      inner,
+    ), alarm
 
   def init():
     zeros = lambda: jnp.zeros(order + 1)
-    return WhitenedState(jnp.int32(0), jnp.float32(0), jnp.zeros(order), zeros(), zeros(), zeros(), jnp.float32(0), unit, unit, jnp.float32(0),
-                         detector.init())
+    return WhitenedState(
+      jnp.int32(0),
+      jnp.float32(0),
+      jnp.zeros(order),
+      zeros(),
+      zeros(),
+      zeros(),
+      jnp.float32(0),
+      unit,
+      unit,
+      jnp.float32(0),
+      detector.init(),
+    )
+
   return Detector(init, update)

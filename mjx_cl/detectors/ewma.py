@@ -1,4 +1,5 @@
 """A chart of the exponentially weighted moving average."""
+
 from __future__ import annotations
 
 from typing import NamedTuple
@@ -11,8 +12,10 @@ from mjx_cl.detectors.base import Alarm, Detector, Warm, above, cold, demand, sc
 
 class EwmaState(NamedTuple):
   """Attributes:
-    warm: reference. average: float32 (). forgotten: float32 (), (1 - rate)^(2 n) after n samples since the start or the last alarm.
+  warm: reference. average: float32 (). forgotten: float32 (), (1 - rate)^(2 n) after n samples
+  since the start or the last alarm.
   """
+
   warm: Warm
   average: jax.Array
   forgotten: jax.Array
@@ -28,18 +31,28 @@ def ewma(rate: float = 0.1, threshold: float = 3.0, warmup: int = 1000) -> Detec
     fired = score > threshold; then n = 0, average = 0, while mean and std are kept
 
   Args:
-    rate: weight of the newest sample, in (0, 1]; small ones find small shifts, 1 is the chart of single samples.
-    threshold: decision level [std of the average]. On independent Gaussian samples rate 0.1 and threshold 2.814 give ARL0 500 with the
-      asymptotic variance and 486 with the exact one, which is narrower at first and so fires more often just after a restart.
-    warmup: samples that fit mean and std; nothing fires before they end; 0: x is standardised already [control steps].
+    rate: weight of the newest sample, in (0, 1]; small ones find small shifts, 1 is the chart of
+      single samples.
+    threshold: decision level [std of the average]. On independent Gaussian samples rate 0.1 and
+      threshold 2.814 give ARL0 500 with the asymptotic variance and 486 with the exact one, which
+      is narrower at first and so fires more often just after a restart.
+    warmup: samples that fit mean and std; nothing fires before they end; 0: x is standardised
+      already [control steps].
+
   Returns:
-    Detector whose update takes x, float32 (), and gives Alarm(fired: bool (), score: float32 (), nan during warm-up).
-  Blind to: a shift below about threshold * sqrt(rate / (2 - rate)) deviations; a change of variance below the threshold.
-  Reference: Roberts 1959, Technometrics 1, 239-250; Lucas and Saccucci 1990, Technometrics 32, 1-12.
+    Detector whose update takes x, float32 (), and gives Alarm(fired: bool (), score: float32 (),
+    nan during warm-up).
+  Blind to: a shift below about threshold * sqrt(rate / (2 - rate)) deviations; a change of variance
+  below the threshold. Reference: Roberts 1959, Technometrics 1, 239-250; Lucas and Saccucci 1990,
+  Technometrics 32, 1-12.
   Example: _, out = jax.lax.scan(det.update, det.init(), xs)      # out.fired: bool (T,)
   """
-  demand("ewma", rate=(rate, 0 < rate <= 1, "in (0, 1]"), threshold=(threshold, above(threshold, 0), "above 0"),
-         warmup=(warmup, warmup == 0 or warmup >= 2, "0 or at least 2"))
+  demand(
+    "ewma",
+    rate=(rate, 0 < rate <= 1, "in (0, 1]"),
+    threshold=(threshold, above(threshold, 0), "above 0"),
+    warmup=(warmup, warmup == 0 or warmup >= 2, "0 or at least 2"),
+  )
 
   def init():
     return EwmaState(cold(), jnp.float32(0), jnp.float32(1))
@@ -51,6 +64,8 @@ def ewma(rate: float = 0.1, threshold: float = 3.0, warmup: int = 1000) -> Detec
     score = jnp.abs(average) * jax.lax.rsqrt(rate / (2 - rate) * (1 - forgotten))
     fired = ready & (score > threshold)
     keep = ready & ~fired
-    return EwmaState(warm, jnp.where(keep, average, 0.0), jnp.where(keep, forgotten, 1.0)), Alarm(fired, jnp.where(ready, score, jnp.nan))
+    return EwmaState(warm, jnp.where(keep, average, 0.0), jnp.where(keep, forgotten, 1.0)), Alarm(
+      fired, jnp.where(ready, score, jnp.nan)
+    )
 
   return Detector(init, update)

@@ -1,4 +1,7 @@
-"""The generalised likelihood ratio of a mean shift of unknown size at an unknown time, over all of the past."""
+"""The generalised likelihood ratio of a mean shift of unknown size at an unknown time, over all of
+the past.
+"""
+
 from __future__ import annotations
 
 from typing import NamedTuple
@@ -11,11 +14,13 @@ from mjx_cl.detectors.base import Alarm, Detector, Warm, above, cold, demand, sc
 
 class GlrState(NamedTuple):
   """Attributes:
-    warm: reference.
-    length: float32 (2, capacity), samples since each candidate time, oldest first; row 0 for a rise, row 1 for a fall.
-    total: float32 (2, capacity), sum of z (row 1: of -z) since then; -inf: no candidate.
-    live: bool (), false at the start, during warm-up and just after an alarm: the candidates do not count.
+  warm: reference.
+  length: float32 (2, capacity), samples since each candidate time, oldest first; row 0 for a rise,
+  row 1 for a fall. total: float32 (2, capacity), sum of z (row 1: of -z) since then; -inf: no
+  candidate. live: bool (), false at the start, during warm-up and just after an alarm: the
+  candidates do not count.
   """
+
   warm: Warm
   length: jax.Array
   total: jax.Array
@@ -24,48 +29,69 @@ class GlrState(NamedTuple):
 
 @scalar
 def glr(threshold: float = 12.0, capacity: int = 32, warmup: int = 1000) -> Detector:
-  """Two-sided generalised likelihood ratio, exact over every window and every size of the shift (FOCuS with a known mean before the change).
+  """Two-sided generalised likelihood ratio, exact over every window and every size of the shift
+  (FOCuS with a known mean before the change).
 
     z = (x - mean) / max(std, 1e-6)                    mean, std frozen after `warmup` samples
-    score = max over s < t of (z_{s+1} + .. + z_t)^2 / (2 (t - s)),  s from the start or the last alarm
+    score = max over s < t of (z_{s+1} + .. + z_t)^2 / (2 (t - s)),  s from the start or the last
+    alarm
     fired = score > threshold; then s starts anew, while mean and std are kept
 
-  For a rise, a time s can be the maximum, now or later, only if it is a corner of the convex minorant of the cumulative sum with a positive slope
-  ahead: if the mean of z since s is positive and above the mean since the candidate before it. The others are dropped for good. Of n samples
-  about ln(n) / 2 candidates are left on each side, ln(n) where the reference is off, and `capacity` fit. Where one more would come, it takes the
-  place of the newest. The score is then never too large, and still exact over shifts of at most twice the slope between the two newest candidates
-  before (the smallest such bound since the start), since all that are best for those are kept; a larger shift is seen through a window that begins
-  somewhat early.
+  For a rise, a time s can be the maximum, now or later, only if it is a corner of the convex
+  minorant of the cumulative sum with a positive slope ahead: if the mean of z since s is positive
+  and above the mean since the candidate before it. The others are dropped for good. Of n samples
+  about ln(n) / 2 candidates are left on each side, ln(n) where the reference is off, and `capacity`
+  fit. Where one more would come, it takes the place of the newest. The score is then never too
+  large, and still exact over shifts of at most twice the slope between the two newest candidates
+  before (the smallest such bound since the start), since all that are best for those are kept; a
+  larger shift is seen through a window that begins somewhat early.
 
   Args:
     threshold: decision level [nats].
     capacity: candidates kept on each side.
-    warmup: samples that fit mean and std; nothing fires before they end; 0: x is standardised already [control steps].
+    warmup: samples that fit mean and std; nothing fires before they end; 0: x is standardised
+      already [control steps].
+
   Returns:
-    Detector whose update takes x, float32 (), and gives Alarm(fired: bool (), score: float32 (), nan during warm-up).
-  Blind to: a change of variance alone. An error of the warm-up's mean is a shift like any other: given time it fires, sooner than for detectors
+    Detector whose update takes x, float32 (), and gives Alarm(fired: bool (), score: float32 (),
+    nan during warm-up).
+  Blind to: a change of variance alone. An error of the warm-up's mean is a shift like any other:
+  given time it fires, sooner than for detectors
     with a slack.
-  Reference: Lorden 1971, Ann. Math. Stat. 42, 1897-1908; Romano, Eckley, Fearnhead and Rigaill 2023, J. Mach. Learn. Res. 24(81).
+  Reference: Lorden 1971, Ann. Math. Stat. 42, 1897-1908; Romano, Eckley, Fearnhead and Rigaill
+  2023, J. Mach. Learn. Res. 24(81).
   Example: _, out = jax.lax.scan(det.update, det.init(), xs)      # out.fired: bool (T,)
   """
-  demand("glr", threshold=(threshold, above(threshold, 0), "above 0"), capacity=(capacity, capacity >= 2, "at least 2"),
-         warmup=(warmup, warmup == 0 or warmup >= 2, "0 or at least 2"))
+  demand(
+    "glr",
+    threshold=(threshold, above(threshold, 0), "above 0"),
+    capacity=(capacity, capacity >= 2, "at least 2"),
+    warmup=(warmup, warmup == 0 or warmup >= 2, "0 or at least 2"),
+  )
   slot = jnp.arange(capacity)
 
   def init():
-    return GlrState(cold(), jnp.ones((2, capacity)), jnp.full((2, capacity), -jnp.inf), jnp.bool_(False))
+    return GlrState(
+      cold(), jnp.ones((2, capacity)), jnp.full((2, capacity), -jnp.inf), jnp.bool_(False)
+    )
 
   def update(state, x):
     warm, z, ready = standardise(state.warm, jnp.asarray(x, jnp.float32), warmup)
     mean = state.total / state.length
-    # the means rise up to the tangent from the present and fall behind it: the last that rises is the last that is kept
+    # the means rise up to the tangent from the present and fall behind it: the last that rises is
+    # the last that is kept
     rises = mean > jnp.concatenate([jnp.zeros((2, 1)), mean[:, :-1]], 1)
     kept = jnp.where(state.live, jnp.max(jnp.where(rises, slot + 1, 0), 1, keepdims=True), 0)
     new = jnp.minimum(kept, capacity - 1)
     length = jnp.where(slot == new, 0.0, state.length) + 1.0
-    total = jnp.where(slot < new, state.total, jnp.where(slot == new, 0.0, -jnp.inf)) + jnp.stack([z, -z])[:, None]
+    total = (
+      jnp.where(slot < new, state.total, jnp.where(slot == new, 0.0, -jnp.inf))
+      + jnp.stack([z, -z])[:, None]
+    )
     score = 0.5 * jnp.max(jnp.square(jnp.maximum(total, 0.0)) / length)
     fired = ready & (score > threshold)
-    return GlrState(warm, length, total, ready & ~fired), Alarm(fired, jnp.where(ready, score, jnp.nan))
+    return GlrState(warm, length, total, ready & ~fired), Alarm(
+      fired, jnp.where(ready, score, jnp.nan)
+    )
 
   return Detector(init, update)

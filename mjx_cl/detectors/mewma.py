@@ -1,4 +1,5 @@
 """Multivariate EWMA chart."""
+
 from __future__ import annotations
 
 from typing import NamedTuple
@@ -6,55 +7,80 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from mjx_cl.detectors import many
+from mjx_cl.detectors import multivariate
 from mjx_cl.detectors.base import Alarm, Detector, above, demand
 
 
 class MewmaState(NamedTuple):
   """Attributes:
-    whitener: many.Whitener. mean: float32 (p,), the moving average of whitened samples. left: float32 (), (1 - rate)^(2 t).
+  whitener: many.Whitener. mean: float32 (p,), the moving average of whitened samples. left: float32
+  (), (1 - rate)^(2 t).
   """
-  whitener: many.Whitener
+
+  whitener: multivariate.Whitener
   mean: jax.Array
   left: jax.Array
 
 
-def mewma(rate: float = 0.02, threshold: float = 37.0, warmup: int = 1000, shrinkage: float = 0.1, exact: bool = False,
-          channels: str | tuple[str, ...] = "groups+opr+rpr+reward", log: bool = True) -> Detector:
-  """Multivariate exponentially weighted moving average of several channels against the warm-up's mean and covariance.
+def mewma(
+  rate: float = 0.02,
+  threshold: float = 37.0,
+  warmup: int = 1000,
+  shrinkage: float = 0.1,
+  exact: bool = False,
+  channels: str | tuple[str, ...] = "groups+opr+rpr+reward",
+  log: bool = True,
+) -> Detector:
+  """Multivariate exponentially weighted moving average of several channels against the warm-up's
+  mean and covariance.
 
     z_t = rate (x_t - mean) + (1 - rate) z_{t-1},  z_0 = 0;  score = z_t' V^-1 z_t
-    V = rate / (2 - rate) S, the asymptotic variance; exact: times 1 - (1 - rate)^(2 t), t samples since the warm-up or the last alarm
+    V = rate / (2 - rate) S, the asymptotic variance; exact: times 1 - (1 - rate)^(2 t), t samples
+    since the warm-up or the last alarm
     fired = score > threshold; then z = 0 and t = 0, while mean and S (see hotelling) are kept
 
-  Two-sided: the score is a squared distance, so a rise and a fall of any channel, the reward too, count alike.
-  With the asymptotic variance and independent Gaussian samples of known covariance, p = 4, rate = 0.1, threshold 12.73 the published ARL0 is 200
-  and a shift of one deviation is found after 12.2 samples. The exact variance finds a change at the start sooner, for a shorter ARL0.
-  Samples of a robot are correlated in time: calibrate. The default threshold has an ARL0 of about 10,000 on independent Gaussian samples.
+  Two-sided: the score is a squared distance, so a rise and a fall of any channel, the reward too,
+  count alike. With the asymptotic variance and independent Gaussian samples of known covariance, p
+  = 4, rate = 0.1, threshold 12.73 the published ARL0 is 200 and a shift of one deviation is found
+  after 12.2 samples. The exact variance finds a change at the start sooner, for a shorter ARL0.
+  Samples of a robot are correlated in time: calibrate. The default threshold has an ARL0 of about
+  10,000 on independent Gaussian samples.
 
   Args:
-    rate: in (0, 1], weight of the newest sample; 1 is Hotelling's chart of single samples. The memory is about 2 / rate samples.
+    rate: in (0, 1], weight of the newest sample; 1 is Hotelling's chart of single samples. The
+      memory is about 2 / rate samples.
     threshold: decision level [squared deviations].
     warmup, shrinkage, channels, log: as in hotelling.
     exact: the exact variance.
+
   Returns:
-    Detector whose update takes a monitor.Residual and gives Alarm(fired: bool (), score: float32 ()).
+    Detector whose update takes a monitor.Residual and gives Alarm(fired: bool (), score: float32
+    ()).
   Blind to: a change of variance alone at small rates; a change much shorter than 1 / rate samples.
-  Reference: Lowry, Woodall, Champ, Rigdon 1992, Technometrics 34, 46-53; run lengths: Runger, Prabhu 1996, J. Amer. Statist. Assoc. 91, 1701-1706.
-  Example: _, out = jax.lax.scan(det.update, det.init(), residuals)
+  Reference: Lowry, Woodall, Champ, Rigdon 1992, Technometrics 34, 46-53; run lengths: Runger,
+  Prabhu 1996, J. Amer. Statist. Assoc. 91, 1701-1706. Example: _, out = jax.lax.scan(det.update,
+  det.init(), residuals)
   """
-  names = many.split("mewma", channels)
+  names = multivariate.split("mewma", channels)
   p = len(names)
-  demand("mewma", rate=(rate, 0 < rate <= 1, "in (0, 1]"), threshold=(threshold, above(threshold, 0), "above 0"),
-         warmup=(warmup, warmup == 0 or warmup >= p + 2, f"0, or at least {p + 2}, the channels and two"),
-         shrinkage=(shrinkage, 0 <= shrinkage <= 1, "in [0, 1]"))
+  demand(
+    "mewma",
+    rate=(rate, 0 < rate <= 1, "in (0, 1]"),
+    threshold=(threshold, above(threshold, 0), "above 0"),
+    warmup=(
+      warmup,
+      warmup == 0 or warmup >= p + 2,
+      f"0, or at least {p + 2}, the channels and two",
+    ),
+    shrinkage=(shrinkage, 0 <= shrinkage <= 1, "in [0, 1]"),
+  )
 
   def init():
-    return MewmaState(many.whitener(p), jnp.zeros(p), jnp.float32(1))
+    return MewmaState(multivariate.whitener(p), jnp.zeros(p), jnp.float32(1))
 
   def update(state, residual):
-    x, known = many.pick(residual, names, log)
-    reference, y, ready = many.whiten(state.whitener, x, known, warmup, shrinkage)
+    x, known = multivariate.pick(residual, names, log)
+    reference, y, ready = multivariate.whiten(state.whitener, x, known, warmup, shrinkage)
     mean = jnp.where(ready, rate * y + (1 - rate) * state.mean, state.mean)
     left = jnp.where(ready, state.left * (1 - rate) ** 2, state.left)
     score = jnp.sum(jnp.square(mean)) * (2 - rate) / rate

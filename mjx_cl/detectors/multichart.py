@@ -1,4 +1,5 @@
 """Several charts at once, each in units of its own threshold on the robot."""
+
 from __future__ import annotations
 
 import jax
@@ -14,25 +15,32 @@ CHARTS = "cusum@surprise,ewma,e_detector"
 def multichart(threshold: float = 1.0, charts: str = CHARTS, robot: str | None = None) -> Detector:
   """Charts that look at different things, side by side; the alarm of any counts.
 
-    score = max_i s_i / h_i;  fired = score > threshold; the charts above it start afresh, as each does at its own alarm
-    s_i: score of chart i.  h_i: its threshold at which the robot, healthy, gives it one alarm in 100,000 control steps (detectors.board)
+    score = max_i s_i / h_i;  fired = score > threshold; the charts above it start afresh, as each
+    does at its own alarm s_i: score of chart i.  h_i: its threshold at which the robot, healthy,
+    gives it one alarm in 100,000 control steps (detectors.board)
 
-  No one chart is good on every robot: what a fault disturbs differs. In units of h_i all charts share one threshold and, near 1, one rate of false
-  alarms; k charts alarm at most k times as often as one of them, so that at threshold 1 the ARL0 is 100,000 / k or longer. Calibrate.
-  Each chart looks in its own direction: of the default ones cusum and ewma are two-sided, e_detector is one-sided, a rise alone.
+  No one chart is good on every robot: what a fault disturbs differs. In units of h_i all charts
+  share one threshold and, near 1, one rate of false alarms; k charts alarm at most k times as often
+  as one of them, so that at threshold 1 the ARL0 is 100,000 / k or longer. Calibrate. Each chart
+  looks in its own direction: of the default ones cusum and ewma are two-sided, e_detector is
+  one-sided, a rise alone.
 
   Args:
     threshold: decision level [thresholds h_i].
     charts: names on the leaderboard, joined by commas; those whose h_i is known.
     robot: whose h_i are taken; default, and for a robot without any: the walker's.
+
   Returns:
-    Detector whose update takes a monitor.Residual and gives Alarm(fired: bool (), score: float32 (), nan while no chart knows one).
+    Detector whose update takes a monitor.Residual and gives Alarm(fired: bool (), score: float32
+    (), nan while no chart knows one).
   Blind to: what all of its charts are blind to.
-  Reference: Tartakovsky, Nikiforov, Basseville 2014, Sequential Analysis, Chapman and Hall, section 9.3 (multichart procedures). The charts and how
+  Reference: Tartakovsky, Nikiforov, Basseville 2014, Sequential Analysis, Chapman and Hall, section
+  9.3 (multichart procedures). The charts and how
     they were chosen: benchmarks/multichart.py.
   Example: _, out = jax.lax.scan(det.update, det.init(), residuals)
   """
   from mjx_cl import detectors  # the table that names the charts holds this detector too
+
   demand("multichart", threshold=(threshold, above(threshold, 0), "above 0"))
   known = detectors.board().get(robot) or detectors.board()["walker"]
   if not isinstance(charts, str):
@@ -40,13 +48,21 @@ def multichart(threshold: float = 1.0, charts: str = CHARTS, robot: str | None =
   names = [name.strip() for name in charts.split(",")]
   for name in names:
     if name not in known or known[name]["settings"]["use"] == "multichart":
-      raise UserError(f"detector 'multichart': no chart {name!r}; choose from: {', '.join(n for n in known if known[n]['settings']['use'] != 'multichart')}")
+      raise UserError(
+        f"detector 'multichart': no chart {name!r}; choose from: "
+        f"{', '.join(n for n in known if known[n]['settings']['use'] != 'multichart')}"
+      )
   if len(set(names)) < len(names):
     raise UserError(f"detector 'multichart': a chart is named twice in {charts!r}")
 
   def chart(name: str) -> Detector:
     settings, unit = dict(known[name]["settings"]), known[name]["threshold"]
-    return in_units(detectors.make(settings.pop("use"), threshold=threshold * unit, robot=robot, **settings), unit, threshold)
+    return in_units(
+      detectors.make(settings.pop("use"), threshold=threshold * unit, robot=robot, **settings),
+      unit,
+      threshold,
+    )
+
   return any_of(*map(chart, names))
 
 
@@ -54,10 +70,16 @@ multichart.takes = "residual"
 
 
 def in_units(detector: Detector, unit: float, threshold: float) -> Detector:
-  """`detector`, built with the threshold `threshold * unit`, with its score in units of `unit`: fired if and only if score > threshold, rounding or not."""
+  """`detector`, built with the threshold `threshold * unit`, with its score in units of `unit`:
+  fired if and only if score > threshold, rounding or not.
+  """
+
   def update(state, x):
     new, alarm = detector.update(state, x)
     score, level = alarm.score / unit, jnp.asarray(threshold, jnp.float32)
-    score = jnp.where(alarm.fired, jnp.maximum(score, jnp.nextafter(level, jnp.inf)), jnp.minimum(score, level))
+    score = jnp.where(
+      alarm.fired, jnp.maximum(score, jnp.nextafter(level, jnp.inf)), jnp.minimum(score, level)
+    )
     return new, Alarm(alarm.fired, jnp.where(jnp.isnan(alarm.score), jnp.nan, score))
+
   return Detector(detector.init, update)

@@ -1,4 +1,5 @@
 """The Page-Hinkley test: cumulative deviations from the running mean, against their extreme so far."""
+
 from __future__ import annotations
 
 from typing import NamedTuple
@@ -13,10 +14,12 @@ MODES = ("both", "up", "down")
 
 class PageHinkleyState(NamedTuple):
   """Attributes:
-    warm: reference. count: float32 (), samples since the start or the last alarm. origin: float32 (), the first of them.
-    mean: float32 (), their mean less the origin, so that a distant level does not cost it digits.
-    rise: float32 (), up - low. low: float32 (), smallest `up` so far. fall: float32 (), high - down. high: float32 (), largest `down`.
+  warm: reference. count: float32 (), samples since the start or the last alarm. origin: float32 (),
+  the first of them. mean: float32 (), their mean less the origin, so that a distant level does not
+  cost it digits. rise: float32 (), up - low. low: float32 (), smallest `up` so far. fall: float32
+  (), high - down. high: float32 (), largest `down`.
   """
+
   warm: Warm
   count: jax.Array
   origin: jax.Array
@@ -28,19 +31,28 @@ class PageHinkleyState(NamedTuple):
 
 
 @scalar
-def page_hinkley(delta: float = 0.005, threshold: float = 50.0, alpha: float = 0.9999, mode: str = "both", min_instances: int = 30,
-                 warmup: int = 1000) -> Detector:
+def page_hinkley(
+  delta: float = 0.005,
+  threshold: float = 50.0,
+  alpha: float = 0.9999,
+  mode: str = "both",
+  min_instances: int = 30,
+  warmup: int = 1000,
+) -> Detector:
   """Page-Hinkley test with fading sums, as river.drift.PageHinkley defines it.
 
-    z = (x - centre) / max(std, 1e-6)                                centre, std frozen after `warmup` samples
+    z = (x - centre) / max(std, 1e-6)                                centre, std frozen after
+      `warmup` samples
     mean = mean of all z since the last alarm, this one among them,  dev = z - mean
     up = alpha up + dev - delta,    low = min(low, up)               both start at 0
     down = alpha down + dev + delta,  high = max(high, down)
     score = max(up - low, high - down), or the first alone (mode "up"), or the second (mode "down")
-    fired = score > threshold once `min_instances` samples are in the mean; then mean, sums and extremes start anew
+    fired = score > threshold once `min_instances` samples are in the mean; then mean, sums and
+    extremes start anew
 
-  The mean is evidence here, not reference: after an alarm the test takes whatever it then sees as normal. With warmup = 0 it fires at the samples
-  at which river's does, up to the digits of float32. The extremes do not fade while the sums do, so the differences are what is kept, with the
+  The mean is evidence here, not reference: after an alarm the test takes whatever it then sees as
+  normal. With warmup = 0 it fires at the samples at which river's does, up to the digits of
+  float32. The extremes do not fade while the sums do, so the differences are what is kept, with the
   term that this leaves: rise = max(0, alpha rise + dev - delta - (1 - alpha) low).
 
   Args:
@@ -48,18 +60,29 @@ def page_hinkley(delta: float = 0.005, threshold: float = 50.0, alpha: float = 0
     threshold: decision level [warm-up std, summed].
     alpha: share of the sums that is kept from sample to sample, in (0, 1].
     mode: `both`, `up` or `down`.
-    min_instances: samples after the warm-up, or after an alarm, before anything fires and a score is known [control steps].
+    min_instances: samples after the warm-up, or after an alarm, before anything fires and a score
+      is known [control steps].
     warmup: samples that fit centre and std; 0: x as it is [control steps].
+
   Returns:
-    Detector whose update takes x, float32 (), and gives Alarm(fired: bool (), score: float32 (), nan before min_instances).
-  Blind to: a shift below delta; a change slow enough for the running mean to follow; a change of variance alone; with alpha < 1 also a shift
+    Detector whose update takes x, float32 (), and gives Alarm(fired: bool (), score: float32 (),
+    nan before min_instances).
+  Blind to: a shift below delta; a change slow enough for the running mean to follow; a change of
+  variance alone; with alpha < 1 also a shift
     below about threshold * (1 - alpha), whose faded sum never gets there.
-  Reference: Page 1954, Biometrika 41, 100-115; Hinkley 1971, Biometrika 58, 509-523; river.drift.PageHinkley.
+  Reference: Page 1954, Biometrika 41, 100-115; Hinkley 1971, Biometrika 58, 509-523;
+  river.drift.PageHinkley.
   Example: _, out = jax.lax.scan(det.update, det.init(), xs)      # out.fired: bool (T,)
   """
-  demand("page_hinkley", delta=(delta, delta >= 0, "at least 0"), threshold=(threshold, above(threshold, 0), "above 0"),
-         alpha=(alpha, 0 < alpha <= 1, "in (0, 1]"), mode=(mode, mode in MODES, f"one of {', '.join(MODES)}"),
-         min_instances=(min_instances, min_instances >= 1, "at least 1"), warmup=(warmup, warmup == 0 or warmup >= 2, "0 or at least 2"))
+  demand(
+    "page_hinkley",
+    delta=(delta, delta >= 0, "at least 0"),
+    threshold=(threshold, above(threshold, 0), "above 0"),
+    alpha=(alpha, 0 < alpha <= 1, "in (0, 1]"),
+    mode=(mode, mode in MODES, f"one of {', '.join(MODES)}"),
+    min_instances=(min_instances, min_instances >= 1, "at least 1"),
+    warmup=(warmup, warmup == 0 or warmup >= 2, "0 or at least 2"),
+  )
 
   def init():
     return PageHinkleyState(cold(), *[jnp.float32(0)] * 7)
@@ -80,7 +103,9 @@ def page_hinkley(delta: float = 0.005, threshold: float = 50.0, alpha: float = 0
     known = ready & (count >= min_instances)
     fired = known & (score > threshold)
     keep = ready & ~fired
-    evidence = [jnp.where(keep, value, 0.0) for value in (count, origin, mean, rise, low, fall, high)]
+    evidence = [
+      jnp.where(keep, value, 0.0) for value in (count, origin, mean, rise, low, fall, high)
+    ]
     return PageHinkleyState(warm, *evidence), Alarm(fired, jnp.where(known, score, jnp.nan))
 
   return Detector(init, update)

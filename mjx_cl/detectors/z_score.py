@@ -1,4 +1,5 @@
 """A chart of single samples: so many deviations from the mean of the healthy stream."""
+
 from __future__ import annotations
 
 from typing import NamedTuple
@@ -11,9 +12,10 @@ from mjx_cl.detectors.base import Alarm, Detector, Warm, above, cold, demand, sc
 
 class ZScoreState(NamedTuple):
   """Attributes:
-    warm: reference. recent: float32 (smooth,), the last samples, zero where none. count: int32 (), samples seen.
-    beyond: bool (), the last score was above the threshold.
+  warm: reference. recent: float32 (smooth,), the last samples, zero where none. count: int32 (),
+  samples seen. beyond: bool (), the last score was above the threshold.
   """
+
   warm: Warm
   recent: jax.Array
   count: jax.Array
@@ -21,28 +23,41 @@ class ZScoreState(NamedTuple):
 
 
 @scalar
-def z_score(threshold: float = 4.0, two_sided: bool = True, smooth: int = 1, warmup: int = 1000) -> Detector:
+def z_score(
+  threshold: float = 4.0, two_sided: bool = True, smooth: int = 1, warmup: int = 1000
+) -> Detector:
   """Shewhart's chart with a frozen reference, of samples or of their trailing mean.
 
-    y_t = mean of x_{t-smooth+1..t} (of the samples there are);   mean, std of the first `warmup` y, frozen then
+    y_t = mean of x_{t-smooth+1..t} (of the samples there are);   mean, std of the first `warmup` y,
+      frozen then
     z = (y_t - mean) / max(std, 1e-6),  score = |z| (two-sided) or z
-    fired when score > threshold and the score before was not: one alarm per excursion, the next needs a score at or below the threshold first
+    fired when score > threshold and the score before was not: one alarm per excursion, the next
+    needs a score at or below the threshold first
 
   The reference is taken of y, not of x: std is right for a trailing mean of dependent samples too.
 
   Args:
-    threshold: decision level [std of y]; ARL0 on independent Gaussian samples is 1 / P(|z| > threshold): 370 at 3, 15,787 at 4.
+    threshold: decision level [std of y]; ARL0 on independent Gaussian samples is 1 / P(|z| >
+      threshold): 370 at 3, 15,787 at 4.
     two_sided: also a fall fires; False: a rise alone.
     smooth: samples of the trailing mean that is tested; 1: the samples themselves [control steps].
-    warmup: samples that fit mean and std; nothing fires before they end; 0: x is standardised already [control steps].
+    warmup: samples that fit mean and std; nothing fires before they end; 0: x is standardised
+      already [control steps].
+
   Returns:
-    Detector whose update takes x, float32 (), and gives Alarm(fired: bool (), score: float32 (), nan during warm-up).
-  Blind to: a shift well below threshold deviations of y, for it does not add evidence up; a change of the spread below them.
-  Reference: Shewhart 1931, Economic Control of Quality of Manufactured Product.
+    Detector whose update takes x, float32 (), and gives Alarm(fired: bool (), score: float32 (),
+    nan during warm-up).
+  Blind to: a shift well below threshold deviations of y, for it does not add evidence up; a change
+  of the spread below them. Reference: Shewhart 1931, Economic Control of Quality of Manufactured
+  Product.
   Example: _, out = jax.lax.scan(det.update, det.init(), xs)      # out.fired: bool (T,)
   """
-  demand("z_score", threshold=(threshold, above(threshold, 0), "above 0"), smooth=(smooth, smooth >= 1, "at least 1"),
-         warmup=(warmup, warmup == 0 or warmup >= 2, "0 or at least 2"))
+  demand(
+    "z_score",
+    threshold=(threshold, above(threshold, 0), "above 0"),
+    smooth=(smooth, smooth >= 1, "at least 1"),
+    warmup=(warmup, warmup == 0 or warmup >= 2, "0 or at least 2"),
+  )
 
   def init():
     return ZScoreState(cold(), jnp.zeros(smooth), jnp.int32(0), jnp.bool_(False))
@@ -56,8 +71,11 @@ def z_score(threshold: float = 4.0, two_sided: bool = True, smooth: int = 1, war
     warm, z, ready = standardise(state.warm, y, warmup)
     score = jnp.abs(z) if two_sided else z
     beyond = ready & (score > threshold)
-    # the count only says where in `recent` the next sample goes and how many there are: bounded, so that it never overflows
+    # the count only says where in `recent` the next sample goes and how many there are: bounded, so
+    # that it never overflows
     count = jnp.where(state.count + 1 < 2 * smooth, state.count + 1, smooth)
-    return ZScoreState(warm, recent, count, beyond), Alarm(beyond & ~state.beyond, jnp.where(ready, score, jnp.nan))
+    return ZScoreState(warm, recent, count, beyond), Alarm(
+      beyond & ~state.beyond, jnp.where(ready, score, jnp.nan)
+    )
 
   return Detector(init, update)

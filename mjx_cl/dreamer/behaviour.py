@@ -1,14 +1,19 @@
-"""Actor and critic on imagined states: the losses in one piece of plain code, and the same computed step by step for a CPU.
+"""Actor and critic on imagined states: the losses in one piece of plain code, and the same computed
+step by step for a CPU.
 
-With imagined states s_0..s_H (no gradient), R the lambda-return, S the return scale and omega the product of continues:
+With imagined states s_0..s_H (no gradient), R the lambda-return, S the return scale and omega the
+product of continues:
   policy = -mean omega_i [log pi(a_i | s_i) sg((R_i - v_i) / S) + eta H(pi(s_i))]
-  value  =  mean omega_i [CE(v(s_i), sg R_i) + CE(v(s_i), sg v_slow(s_i))],   i = 0..H-1, means over i and starts
+  value  =  mean omega_i [CE(v(s_i), sg R_i) + CE(v(s_i), sg v_slow(s_i))],   i = 0..H-1, means over
+    i and starts
 
-`stacked` keeps all states and puts one large product per layer through each head. `stepwise` reads the heads that need no gradient where the
-state is at hand, inside the imagination, and takes loss and gradient of actor and critic state by state in a second scan: nothing of the size
-(H, starts, bins) is ever written. On 2 CPU cores memory traffic is what costs (benchmarks/README.md); for a GPU `stacked` is a choice by expectation, not
-measured.
+`stacked` keeps all states and puts one large product per layer through each head. `stepwise` reads
+the heads that need no gradient where the state is at hand, inside the imagination, and takes loss
+and gradient of actor and critic state by state in a second scan: nothing of the size (H, starts,
+bins) is ever written. On 2 CPU cores memory traffic is what costs (benchmarks/README.md); for a GPU
+`stacked` is a choice by expectation, not measured.
 """
+
 from __future__ import annotations
 
 from typing import NamedTuple
@@ -26,9 +31,11 @@ class Imagined(NamedTuple):
 
   Attributes:
     deter (D,), stoch (S,), action (A,): state i and the action chosen there.
-    rew, con, val: predictions at states 1..H; con0 (N,): continue at state 0; val0: value at states 0..H-1; slow: slow critic there.
+    rew, con, val: predictions at states 1..H; con0 (N,): continue at state 0; val0: value at states
+      0..H-1; slow: slow critic there.
     pre: outputs (U,) of the first layer of policy and value, or None.
   """
+
   deter: jax.Array
   stoch: jax.Array
   action: jax.Array
@@ -42,30 +49,52 @@ class Imagined(NamedTuple):
 
 
 def readings(agent, params, slow, *features, pre=(None,) * 4):
-  """Reward, continue, value and slow value (...) at states (..., D), (..., S), or from the first layers' outputs `pre`."""
+  """Reward, continue, value and slow value (...) at states (..., D), (..., S), or from the first
+  layers' outputs `pre`.
+  """
   read = lambda head, own, pre: head.apply({"params": own}, *features, pre=pre)
   mean = lambda logits: nets.two_hot_mean(logits, agent.bins)
-  return (mean(read(agent.rew, params["rew"], pre[0])), jax.nn.sigmoid(read(agent.con, params["con"], pre[1])[..., 0]),
-          mean(read(agent.val, params["val"], pre[2])), mean(read(agent.val, slow, pre[3])))
+  return (
+    mean(read(agent.rew, params["rew"], pre[0])),
+    jax.nn.sigmoid(read(agent.con, params["con"], pre[1])[..., 0]),
+    mean(read(agent.val, params["val"], pre[2])),
+    mean(read(agent.val, slow, pre[3])),
+  )
 
 
 def step_losses(agent, pol, val, features, action, adv, omega, ret, slow, pre=(None, None)):
   """Sums over rows of the policy loss, the value loss and the entropy, three float32 ()."""
-  mean, std = nets.normal(*agent.pol.apply({"params": pol}, *features, pre=pre[0]), *agent.deviations)
+  mean, std = nets.normal(
+    *agent.pol.apply({"params": pol}, *features, pre=pre[0]), *agent.deviations
+  )
   entropy = nets.normal_entropy(std)
   policy = -omega * (nets.normal_logp(mean, std, action) * adv + agent.config.entropy * entropy)
   logits = agent.val.apply({"params": val}, *features, pre=pre[1])
-  value = omega * (nets.two_hot_loss(logits, ret, agent.bins) + nets.two_hot_loss(logits, slow, agent.bins))
+  value = omega * (
+    nets.two_hot_loss(logits, ret, agent.bins) + nets.two_hot_loss(logits, slow, agent.bins)
+  )
   return jnp.sum(policy), jnp.sum(value), jnp.sum(entropy)
 
 
-# ---- large products --------------------------------------------------------------------------------------------------------------
+# ---- large products ------------------------------------------------------------------------------
+
 
 def imagine_stacked(agent, params, slow, deter, stoch, key) -> Imagined:
   """`Imagined` from the stacked states of `agent.imagine`."""
   deter, stoch, action = agent.imagine(params, deter, stoch, key, agent.config.imagine)
   rew, con, val, slow_val = readings(agent, params, slow, deter, stoch)
-  return Imagined(deter[:-1], stoch[:-1], action[:-1], rew[1:], con[1:], val[1:], con[0], val[:-1], slow_val[:-1], None)
+  return Imagined(
+    deter[:-1],
+    stoch[:-1],
+    action[:-1],
+    rew[1:],
+    con[1:],
+    val[1:],
+    con[0],
+    val[:-1],
+    slow_val[:-1],
+    None,
+  )
 
 
 def sums_stacked(agent, pol, val, img: Imagined, *targets):
@@ -73,7 +102,7 @@ def sums_stacked(agent, pol, val, img: Imagined, *targets):
   return step_losses(agent, pol, val, (img.deter, img.stoch), img.action, *targets)
 
 
-# ---- state by state --------------------------------------------------------------------------------------------------------------
+# ---- state by state ------------------------------------------------------------------------------
 
 FIRST = ("mlp", "hidden0", "linear")  # where a head keeps its first layer
 
@@ -87,48 +116,88 @@ def first_layer(head):
 def imagine_stepwise(agent, params, slow, deter, stoch, key) -> Imagined:
   """`Imagined` with the heads read inside the scan; the same draws as `agent.imagine`.
 
-  The first layers of all heads and of the core's two projections meet the same state: one product with deter, one with stoch.
+  The first layers of all heads and of the core's two projections meet the same state: one product
+  with deter, one with stoch.
   """
   steps, rows, width = agent.config.imagine, deter.shape[0], deter.shape[1]
   uniform, noise = agent.draws(key, steps, rows)
   params = agent.prepare(params)
-  layers = [first_layer(head) for head in (params["pol"], params["val"], params["rew"], params["con"], slow)]
+  layers = [
+    first_layer(head) for head in (params["pol"], params["val"], params["rew"], params["con"], slow)
+  ]
   core = params["dyn"]["params"]
   own = [core[name]["linear"] for name in ("in_deter", "in_stoch")]
-  with_deter = jnp.concatenate([layer["kernel"][:width] for layer in layers] + [own[0]["kernel"]], 1)
-  with_stoch = jnp.concatenate([layer["kernel"][width:] for layer in layers] + [own[1]["kernel"]], 1)
+  with_deter = jnp.concatenate(
+    [layer["kernel"][:width] for layer in layers] + [own[0]["kernel"]], 1
+  )
+  with_stoch = jnp.concatenate(
+    [layer["kernel"][width:] for layer in layers] + [own[1]["kernel"]], 1
+  )
   bias = jnp.concatenate([layer["bias"] for layer in layers])
 
   def look(state):
     """(policy and value parts (N, 2 U), what the heads say, the core's parts)."""
     from_deter, from_stoch = state.deter @ with_deter, state.stoch @ with_stoch
-    pre = jnp.split(from_deter[:, :bias.size] + from_stoch[:, :bias.size] + bias, len(layers), 1)
+    pre = jnp.split(from_deter[:, : bias.size] + from_stoch[:, : bias.size] + bias, len(layers), 1)
     said = readings(agent, params, slow, pre=(pre[2], pre[3], pre[1], pre[4]))
-    return pre[:2], said, (from_deter[:, bias.size:] + own[0]["bias"], from_stoch[:, bias.size:] + own[1]["bias"])
+    return (
+      pre[:2],
+      said,
+      (from_deter[:, bias.size :] + own[0]["bias"], from_stoch[:, bias.size :] + own[1]["bias"]),
+    )
 
   def step(state, x):
     noise, uniform = x
     pre, said, parts = look(state)
-    mean, std = nets.normal(*agent.pol.apply({"params": params["pol"]}, pre=pre[0]), *agent.deviations)
+    mean, std = nets.normal(
+      *agent.pol.apply({"params": params["pol"]}, pre=pre[0]), *agent.deviations
+    )
     action = mean + std * noise
-    return agent.follow(params, state, action, uniform, parts), (state.deter, state.stoch, action, said, tuple(pre))
-  end, (deters, stochs, actions, (rew, con, val, slow_val), pre) = jax.lax.scan(step, agent.latent(params, deter, stoch), (noise[:-1], uniform))
+    return agent.follow(params, state, action, uniform, parts), (
+      state.deter,
+      state.stoch,
+      action,
+      said,
+      tuple(pre),
+    )
+
+  end, (deters, stochs, actions, (rew, con, val, slow_val), pre) = jax.lax.scan(
+    step, agent.latent(params, deter, stoch), (noise[:-1], uniform)
+  )
   last = look(end)[1]
   shift = lambda x, final: jnp.concatenate([x[1:], final[None]])
-  return Imagined(deters, stochs, actions, shift(rew, last[0]), shift(con, last[1]), shift(val, last[2]), con[0], val, slow_val, pre)
+  return Imagined(
+    deters,
+    stochs,
+    actions,
+    shift(rew, last[0]),
+    shift(con, last[1]),
+    shift(val, last[2]),
+    con[0],
+    val,
+    slow_val,
+    pre,
+  )
 
 
 def sums_stepwise(agent, pol, val, img: Imagined, *targets):
-  """`step_losses` added up over the states, gradients taken on the way: the backward pass only scales them."""
+  """`step_losses` added up over the states, gradients taken on the way: the backward pass only
+  scales them.
+  """
+
   def losses_at(pol, val, x):
     _, _, pre, action, targets = x
     return step_losses(agent, pol, val, (), action, *targets, pre=pre)
 
   def gradients_at(pol, val, x):
-    """Losses, and gradients of policy + value: the two share no parameter. Those of the first layers follow from that of `pre`."""
+    """Losses, and gradients of policy + value: the two share no parameter. Those of the first
+    layers follow from that of `pre`.
+    """
+
     def total(pol, val, pre):
       policy, value, entropy = losses_at(pol, val, (None, None, pre) + x[3:])
       return policy + value, (policy, value, entropy)
+
     (grad_pol, grad_val, grad_pre), out = jax.grad(total, (0, 1, 2), has_aux=True)(pol, val, x[2])
     joint = jnp.concatenate(grad_pre, 1)
     return out, (grad_pol, grad_val), (x[0].T @ joint, x[1].T @ joint, jnp.sum(joint, 0))
@@ -148,27 +217,35 @@ def sums_stepwise(agent, pol, val, img: Imagined, *targets):
 
   def forward(pol, val, xs):
     at = lambda x: gradients_at(pol, val, x)
-    start = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(at, jax.tree.map(lambda x: x[0], xs)))
-    (out, grads, first), _ = jax.lax.scan(lambda sums, x: (jax.tree.map(jnp.add, sums, at(x)), None), start, xs)
+    start = jax.tree.map(
+      lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(at, jax.tree.map(lambda x: x[0], xs))
+    )
+    (out, grads, first), _ = jax.lax.scan(
+      lambda sums, x: (jax.tree.map(jnp.add, sums, at(x)), None), start, xs
+    )
     return out, add_first(jax.tree.map(lambda x: x, grads), first)
 
   def backward(grads, cotangent):
     scale = lambda tree, factor: jax.tree.map(lambda g: factor * g, tree)
     # the entropy is a metric, its own gradient is left out; xs hold no gradient
     return scale(grads[0], cotangent[0]), scale(grads[1], cotangent[1]), None
+
   total.defvjp(forward, backward)
   return total(pol, val, (img.deter, img.stoch, img.pre, img.action, targets))
 
 
-# ---- both ------------------------------------------------------------------------------------------------------------------------
+# ---- both ----------------------------------------------------------------------------------------
+
 
 class Behaviour(NamedTuple):
   """Losses of actor and critic.
 
   Attributes:
-    policy, value: float32 (), means. boot: float32 (N,), imagined return from each start. range: (2,), the new percentile range.
+    policy, value: float32 (), means. boot: float32 (N,), imagined return from each start. range:
+      (2,), the new percentile range.
     metrics: name -> float32 ().
   """
+
   policy: jax.Array
   value: jax.Array
   boot: jax.Array
@@ -191,8 +268,20 @@ def behaviour(agent, params, slow, range_, deter, stoch, key, stepwise: bool) ->
   adv = (ret - img.val0) / scale
   out = sums(agent, params["pol"], params["val"], img, *sg((adv, omega, ret, img.slow)))
   policy, value, entropy = (x / adv.size for x in out)
-  every = lambda inner, first: (jnp.sum(inner) + jnp.sum(first)) / (inner.size + first.size)  # over states 0..H
-  metrics = {"adv": adv.mean(), "adv_std": adv.std(), "adv_mag": jnp.abs(adv).mean(), "ret": ((ret - range_[0]) / scale).mean(),
-             "val": every(img.val, img.val0[0]), "tar": ret.mean(), "rew": img.rew.mean(), "con": every(img.con, img.con0), "weight": omega.mean(),
-             "ent/action": entropy, "ret_scale": scale}
+  every = lambda inner, first: (
+    (jnp.sum(inner) + jnp.sum(first)) / (inner.size + first.size)
+  )  # over states 0..H
+  metrics = {
+    "adv": adv.mean(),
+    "adv_std": adv.std(),
+    "adv_mag": jnp.abs(adv).mean(),
+    "ret": ((ret - range_[0]) / scale).mean(),
+    "val": every(img.val, img.val0[0]),
+    "tar": ret.mean(),
+    "rew": img.rew.mean(),
+    "con": every(img.con, img.con0),
+    "weight": omega.mean(),
+    "ent/action": entropy,
+    "ret_scale": scale,
+  }
   return Behaviour(policy, value, ret[0], range_, metrics)

@@ -1,16 +1,20 @@
-"""Encoder, decoder and the four heads. Features of a state: [deter, stoch], for the decoder [stoch, deter].
+"""Encoder, decoder and the four heads. Features of a state: [deter, stoch], for the decoder [stoch,
+deter].
 
-`pre` in place of the features: the output of the first linear layer, where the caller has it already (behaviour.py).
+`pre` in place of the features: the output of the first linear layer, where the caller has it
+already (behaviour.py).
 """
+
 from __future__ import annotations
 
 import flax.linen as nn
 
-from mjx_cl.dreamer.nets import Linear, MLP, symlog
+from mjx_cl.dreamer.nets import MLP, Linear, symlog
 
 
 class Encoder(nn.Module):
   """symlog, then 3 hidden layers: observation (..., obs) -> tokens (..., units)."""
+
   units: int
 
   @nn.compact
@@ -20,6 +24,7 @@ class Encoder(nn.Module):
 
 class Decoder(nn.Module):
   """Mean of the observation in symlog space, (..., obs)."""
+
   units: int
   obs: int
 
@@ -29,7 +34,10 @@ class Decoder(nn.Module):
 
 
 class Head(nn.Module):
-  """`layers` hidden layers and one linear output: reward (1 layer, 255, outscale 0), continue (1, 1, 1), value (3, 255, 0)."""
+  """`layers` hidden layers and one linear output: reward (1 layer, 255, outscale 0), continue (1,
+  1, 1), value (3, 255, 0).
+  """
+
   layers: int
   units: int
   out: int
@@ -37,11 +45,14 @@ class Head(nn.Module):
 
   @nn.compact
   def __call__(self, *features, pre=None):
-    return Linear(self.out, self.outscale, name="out")(MLP(self.layers, self.units, name="mlp")(*features, pre=pre))
+    return Linear(self.out, self.outscale, name="out")(
+      MLP(self.layers, self.units, name="mlp")(*features, pre=pre)
+    )
 
 
 class PolicyHead(nn.Module):
   """3 hidden layers, two separate outputs: raw means and raw deviations, each (..., act)."""
+
   units: int
   act: int
 

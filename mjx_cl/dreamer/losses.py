@@ -1,4 +1,7 @@
-"""Targets of DreamerV3: lambda-returns, replay-value targets, return normaliser. Time runs along axis 0 unless said."""
+"""Targets of DreamerV3: lambda-returns, replay-value targets, return normaliser. Time runs along
+axis 0 unless said.
+"""
+
 from __future__ import annotations
 
 import jax
@@ -8,36 +11,45 @@ import jax.numpy as jnp
 def lambda_return(r_t, c_t, v_t, lam: float):
   """Imagined returns (H, N) from reward, continue and value at states 1..H, each (H, N).
 
-    R_i = r_{i+1} + c_{i+1} ((1 - lam) v_{i+1} + lam R_{i+1}),   i = H-1..0,   R_H = v_H;   c already holds the discount
+  R_i = r_{i+1} + c_{i+1} ((1 - lam) v_{i+1} + lam R_{i+1}),   i = H-1..0,   R_H = v_H;   c already
+    holds the discount
   """
+
   def step(ret, x):
     r, c, v = x
     ret = r + c * ((1.0 - lam) * v + lam * ret)
     return ret, ret
+
   return jax.lax.scan(step, v_t[-1], (r_t, c_t, v_t), reverse=True)[1]
 
 
 def replay_return(r_t, terminal_t, last_t, boot_t, lam: float, discount: float):
   """Replay-value targets (T-1, N) from arrays over T replayed steps.
 
-    G_{T-1} = b_{T-1};   G_t = r_{t+1} + (1 - terminal_{t+1}) discount [(1 - l_{t+1}) b_{t+1} + l_{t+1} G_{t+1}],   l = lam (1 - last)
+    G_{T-1} = b_{T-1};   G_t = r_{t+1} + (1 - terminal_{t+1}) discount [(1 - l_{t+1}) b_{t+1} +
+      l_{t+1} G_{t+1}],   l = lam (1 - last)
 
-  b is the imagined return from each state: a time limit bootstraps fully from b at the last state, a true terminal cuts off.
+  b is the imagined return from each state: a time limit bootstraps fully from b at the last state,
+  a true terminal cuts off.
   """
+
   def step(ret, x):
     r, terminal, last, boot = x
     mix = lam * (1.0 - last)
     ret = r + (1.0 - terminal) * discount * ((1.0 - mix) * boot + mix * ret)
     return ret, ret
+
   xs = (r_t[1:], terminal_t[1:], last_t[1:], boot_t[1:])
   return jax.lax.scan(step, boot_t[-1], xs, reverse=True)[1]
 
 
 def update_range(low_high, returns, rate: float):
-  """Percentile normaliser: EMA (rate, from 0, no bias correction) of the 5th and 95th percentile of `returns`.
+  """Percentile normaliser: EMA (rate, from 0, no bias correction) of the 5th and 95th percentile of
+  `returns`.
 
   Args:
     low_high: float32 (2,).
+
   Returns:
     New (2,) and the scale max(1, high - low), float32 ().
   """

@@ -1,8 +1,10 @@
 """Layers of DreamerV3 as flax modules, and the two output distributions.
 
-Linear layers always have a bias (initially 0). Kernels: standard normal truncated to [-2, 2], times 1.1368 sqrt(1 / fan_in), so that the
-deviation is sqrt(1 / fan_in), times `outscale`. A hidden layer is Linear -> RMSNorm -> SiLU.
+Linear layers always have a bias (initially 0). Kernels: standard normal truncated to [-2, 2], times
+1.1368 sqrt(1 / fan_in), so that the deviation is sqrt(1 / fan_in), times `outscale`. A hidden layer
+is Linear -> RMSNorm -> SiLU.
 """
+
 from __future__ import annotations
 
 import math
@@ -25,21 +27,32 @@ def symexp(x):
 
 
 def in_a_row(draw, key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
-  """`draw(key, shape)`, the same numbers, drawn as one row: loops over short axes are unrolled, which takes LLVM a second for every draw of an update."""
+  """`draw(key, shape)`, the same numbers, drawn as one row: loops over short axes are unrolled,
+  which takes LLVM a second for every draw of an update.
+  """
   return draw(key, (math.prod(shape),)).reshape(shape)
 
 
 def kernel_init(fan_in: int, outscale: float = 1.0):
   """Initialiser with the deviation outscale sqrt(1 / fan_in); outscale 0 gives exact zeros."""
+
   def init(key, shape, dtype=jnp.float32):
     if outscale == 0.0:
       return jnp.zeros(shape, dtype)
-    return 1.1368 * outscale * np.sqrt(1.0 / fan_in) * jax.random.truncated_normal(key, -2.0, 2.0, shape, dtype)
+    return (
+      1.1368
+      * outscale
+      * np.sqrt(1.0 / fan_in)
+      * jax.random.truncated_normal(key, -2.0, 2.0, shape, dtype)
+    )
+
   return init
 
 
 def parameter(module: nn.Module, name: str, init, shape: tuple[int, ...]) -> jax.Array:
-  """`module.param(name, init, shape)`. Flax traces the initialiser at every use, to compare shapes: an eighth of an update's tracing. Here they are compared as they are."""
+  """`module.param(name, init, shape)`. Flax traces the initialiser at every use, to compare shapes:
+  an eighth of an update's tracing. Here they are compared as they are.
+  """
   if not module.has_variable("params", name):
     return module.param(name, init, shape)
   value = module.get_variable("params", name)
@@ -49,8 +62,10 @@ def parameter(module: nn.Module, name: str, init, shape: tuple[int, ...]) -> jax
 
 
 class Linear(nn.Module):
-  """y = x W + b over the last axis. `split` inputs, given as a tuple, are multiplied one by one and added: the product of their
-  concatenation, without building it."""
+  """y = x W + b over the last axis. `split` inputs, given as a tuple, are multiplied one by one and
+  added: the product of their concatenation, without building it.
+  """
+
   units: int
   outscale: float = 1.0
 
@@ -61,14 +76,16 @@ class Linear(nn.Module):
     bias = parameter(self, "bias", nn.initializers.zeros, (self.units,))
     start, y = 0, bias
     for x in xs:
-      y = y + x @ kernel[start:start + x.shape[-1]]
+      y = y + x @ kernel[start : start + x.shape[-1]]
       start += x.shape[-1]
     return y
 
 
 def mean_square(x: jax.Array) -> jax.Array:
-  """Mean of x^2 over the last axis, kept as an axis of 1. As a product with ones: XLA's CPU backend does not vectorise a reduction over
-  the last axis that it has fused with the square (0.24 ms against 0.05 ms on 1,024 x 512)."""
+  """Mean of x^2 over the last axis, kept as an axis of 1. As a product with ones: XLA's CPU backend
+  does not vectorise a reduction over the last axis that it has fused with the square (0.24 ms
+  against 0.05 ms on 1,024 x 512).
+  """
   return jnp.square(x) @ jnp.full((x.shape[-1], 1), 1.0 / x.shape[-1], x.dtype)
 
 
@@ -83,15 +100,21 @@ class Norm(nn.Module):
 
 class Hidden(nn.Module):
   """Linear -> RMSNorm -> SiLU. `pre`: the linear layer's output, where the caller has it already."""
+
   units: int
 
   @nn.compact
   def __call__(self, *xs, pre=None):
-    return nn.silu(Norm(name="norm")(Linear(self.units, name="linear")(*xs) if pre is None else pre))
+    return nn.silu(
+      Norm(name="norm")(Linear(self.units, name="linear")(*xs) if pre is None else pre)
+    )
 
 
 class MLP(nn.Module):
-  """`layers` hidden layers of width `units`; several inputs are concatenated. `pre`: as in `Hidden`, of the first layer."""
+  """`layers` hidden layers of width `units`; several inputs are concatenated. `pre`: as in
+  `Hidden`, of the first layer.
+  """
+
   layers: int
   units: int
 
@@ -102,22 +125,29 @@ class MLP(nn.Module):
     return xs[0]
 
 
-# ---- two-hot ---------------------------------------------------------------------------------------------------------------------
+# ---- two-hot -------------------------------------------------------------------------------------
+
 
 def two_hot_bins(num: int = 255) -> np.ndarray:
-  """Bin centres, float32 (num,), num odd: symexp of an even grid on [-20, 20], mirrored so that pairs are exact opposites."""
+  """Bin centres, float32 (num,), num odd: symexp of an even grid on [-20, 20], mirrored so that
+  pairs are exact opposites.
+  """
   half = np.linspace(-20, 0, (num - 1) // 2 + 1, dtype=np.float32)
   half = (np.sign(half) * np.expm1(np.abs(half))).astype(np.float32)
   return np.concatenate([half, -half[:-1][::-1]])
 
 
 def two_hot(x: jax.Array, bins: jax.Array) -> jax.Array:
-  """Target distribution (..., bins) of x (...): weight on the two neighbouring bins, linear in raw distance, ends clipped."""
+  """Target distribution (..., bins) of x (...): weight on the two neighbouring bins, linear in raw
+  distance, ends clipped.
+  """
   below = jnp.clip(jnp.searchsorted(bins, x, side="right") - 1, 0, len(bins) - 2)
   low, high = bins[below], bins[below + 1]
   weight = jnp.clip((x - low) / (high - low), 0.0, 1.0)
   index = jnp.arange(len(bins))
-  return jnp.where(index == below[..., None], (1 - weight)[..., None], 0.0) + jnp.where(index == below[..., None] + 1, weight[..., None], 0.0)
+  return jnp.where(index == below[..., None], (1 - weight)[..., None], 0.0) + jnp.where(
+    index == below[..., None] + 1, weight[..., None], 0.0
+  )
 
 
 def two_hot_loss(logits: jax.Array, x: jax.Array, bins: jax.Array) -> jax.Array:
@@ -134,17 +164,24 @@ def two_hot_loss(logits: jax.Array, x: jax.Array, bins: jax.Array) -> jax.Array:
 
 
 def two_hot_mean(logits: jax.Array, bins: jax.Array) -> jax.Array:
-  """Expectation (...) of logits (..., bins), summed in opposite pairs so that equal logits give exactly 0."""
+  """Expectation (...) of logits (..., bins), summed in opposite pairs so that equal logits give
+  exactly 0.
+  """
   probs = jax.nn.softmax(logits, -1)
   middle = len(bins) // 2
-  upper = probs[..., middle + 1:] - probs[..., :middle][..., ::-1]
-  return jnp.sum(upper * bins[middle + 1:], -1)
+  upper = probs[..., middle + 1 :] - probs[..., :middle][..., ::-1]
+  return jnp.sum(upper * bins[middle + 1 :], -1)
 
 
-# ---- the policy's normal ---------------------------------------------------------------------------------------------------------
+# ---- the policy's normal -------------------------------------------------------------------------
 
-def normal(mean_raw: jax.Array, std_raw: jax.Array, least: float = 0.1, most: float = 1.0) -> tuple[jax.Array, jax.Array]:
-  """Mean tanh(m) and deviation least + (most - least) sigmoid(s + 2). Samples are neither squashed nor clipped."""
+
+def normal(
+  mean_raw: jax.Array, std_raw: jax.Array, least: float = 0.1, most: float = 1.0
+) -> tuple[jax.Array, jax.Array]:
+  """Mean tanh(m) and deviation least + (most - least) sigmoid(s + 2). Samples are neither squashed
+  nor clipped.
+  """
   return jnp.tanh(mean_raw), least + (most - least) * jax.nn.sigmoid(std_raw + 2.0)
 
 

@@ -1,15 +1,17 @@
 """Recurrent state-space model: block GRU core, categorical latents with straight-through gradients.
 
-State of one robot: deter (D,) and stoch (stoch, classes), one-hot rows, both zero at an episode's start.
+State of one robot: deter (D,) and stoch (stoch, classes), one-hot rows, both zero at an episode's
+start.
 """
+
 from __future__ import annotations
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from mjx_cl.dreamer.nets import Hidden, Linear, MLP, kernel_init, mean_square, parameter
-from mjx_cl.dreamer.sizes import Size
+from mjx_cl.dreamer.nets import MLP, Hidden, Linear, kernel_init, mean_square, parameter
+from mjx_cl.sizes import Size
 
 UNIMIX = 0.01
 
@@ -20,28 +22,42 @@ def dense_part(kernel, own: int):
 
 
 def hoist(params) -> dict:
-  """Variables of an `RSSM` with the re-arranged kernel beside the parameters: a scan over the core then does not re-arrange it every step."""
+  """Variables of an `RSSM` with the re-arranged kernel beside the parameters: a scan over the core
+  then does not re-arrange it every step.
+  """
   kernel, out = params["core_hidden"]["kernel"], params["core_hidden"]["bias"].size
-  return {"params": params, "hoisted": {"core_hidden": {"dense": dense_part(kernel, out // kernel.shape[0])}}}
+  return {
+    "params": params,
+    "hoisted": {"core_hidden": {"dense": dense_part(kernel, out // kernel.shape[0])}},
+  }
 
 
 class BlockLinear(nn.Module):
-  """Block-diagonal linear layer on (blocks, rows, in), plus inputs shared by all blocks (rows, shared).
+  """Block-diagonal linear layer on (blocks, rows, in), plus inputs shared by all blocks (rows,
+  shared).
 
-  kernel (blocks, in + shared, out): block g sees [own chunk, shared]. The shared part is one dense product. fan_in of the initialiser is
-  the width of the whole concatenated input, blocks (in + shared), as in the authors' code.
+  kernel (blocks, in + shared, out): block g sees [own chunk, shared]. The shared part is one dense
+  product. fan_in of the initialiser is the width of the whole concatenated input, blocks (in +
+  shared), as in the authors' code.
   """
+
   units: int  # outputs per block
 
   @nn.compact
   def __call__(self, x, shared=None):
     blocks, rows, own = x.shape
     extra = 0 if shared is None else shared.shape[-1]
-    kernel = parameter(self, "kernel", kernel_init(blocks * (own + extra)), (blocks, own + extra, self.units))
+    kernel = parameter(
+      self, "kernel", kernel_init(blocks * (own + extra)), (blocks, own + extra, self.units)
+    )
     bias = parameter(self, "bias", nn.initializers.zeros, (blocks * self.units,))
     y = jnp.einsum("gni,gio->gno", x, kernel[:, :own]) + bias.reshape(blocks, 1, self.units)
     if shared is not None:
-      dense = self.get_variable("hoisted", "dense") if self.has_variable("hoisted", "dense") else dense_part(kernel, own)
+      dense = (
+        self.get_variable("hoisted", "dense")
+        if self.has_variable("hoisted", "dense")
+        else dense_part(kernel, own)
+      )
       y = y + (shared @ dense).reshape(rows, blocks, self.units).transpose(1, 0, 2)
     return y
 
@@ -52,31 +68,46 @@ class BlockNorm(nn.Module):
   @nn.compact
   def __call__(self, x):
     blocks, _, width = x.shape
-    gain = parameter(self, "gain", nn.initializers.ones, (blocks * width,)).reshape(blocks, 1, width)
+    gain = parameter(self, "gain", nn.initializers.ones, (blocks * width,)).reshape(
+      blocks, 1, width
+    )
     return x * jax.lax.rsqrt(jnp.mean(mean_square(x), 0, keepdims=True) + 1e-4) * gain
 
 
 def clip_action(action):
-  """a / sg(max(1, |a|)): outside [-1, 1] the bound, inside the identity."""
+  """A / sg(max(1, |a|)): outside [-1, 1] the bound, inside the identity."""
   return action / jax.lax.stop_gradient(jnp.maximum(1.0, jnp.abs(action)))
 
 
 class RSSM(nn.Module):
   """Core, prior and posterior on rows: deter (N, D), stoch (N, stoch * classes), action (N, A).
 
-    x0, x1, x2 = hidden(deter), hidden(stoch), hidden(clip(action))
-    h  = silu(norm(block([chunk_g(deter), x0, x1, x2])));   r, c, u = block(h), cut per block in this order
-    deter' = sigmoid(u - 1) tanh(sigmoid(r) c) + (1 - sigmoid(u - 1)) deter
+  x0, x1, x2 = hidden(deter), hidden(stoch), hidden(clip(action))
+  h  = silu(norm(block([chunk_g(deter), x0, x1, x2])));   r, c, u = block(h), cut per block in this
+    order
+  deter' = sigmoid(u - 1) tanh(sigmoid(r) c) + (1 - sigmoid(u - 1)) deter
   """
+
   size: Size
 
   def setup(self):
     s = self.size
-    self.in_deter, self.in_stoch, self.in_action = (Hidden(s.hidden, name=n) for n in ("in_deter", "in_stoch", "in_action"))
-    self.core_hidden, self.core_norm = BlockLinear(s.deter // s.blocks, name="core_hidden"), BlockNorm(name="core_norm")
+    self.in_deter, self.in_stoch, self.in_action = (
+      Hidden(s.hidden, name=n) for n in ("in_deter", "in_stoch", "in_action")
+    )
+    self.core_hidden, self.core_norm = (
+      BlockLinear(s.deter // s.blocks, name="core_hidden"),
+      BlockNorm(name="core_norm"),
+    )
     self.core_gates = BlockLinear(3 * s.deter // s.blocks, name="core_gates")
-    self.prior_mlp, self.prior_out = MLP(2, s.hidden, name="prior_mlp"), Linear(s.stoch * s.classes, name="prior_out")
-    self.post_hidden, self.post_out = Hidden(s.hidden, name="post_hidden"), Linear(s.stoch * s.classes, name="post_out")
+    self.prior_mlp, self.prior_out = (
+      MLP(2, s.hidden, name="prior_mlp"),
+      Linear(s.stoch * s.classes, name="prior_out"),
+    )
+    self.post_hidden, self.post_out = (
+      Hidden(s.hidden, name="post_hidden"),
+      Linear(s.stoch * s.classes, name="post_out"),
+    )
 
   def __call__(self, deter, stoch, action, tokens):  # touches every parameter, for initialisation
     deter = self.core(deter, stoch, action)
@@ -88,17 +119,25 @@ class RSSM(nn.Module):
     return deter.reshape(deter.shape[0], blocks, -1).transpose(1, 0, 2)
 
   def core(self, deter, stoch, action):
-    """deter' (N, D)."""
+    """Deter' (N, D)."""
     return join(self.core_cut(self.cut(deter), deter, stoch, action))
 
   def core_cut(self, chunks, deter, stoch, action, pre=(None, None)):
-    """The core where deter is at hand in both layouts; gives deter' as (blocks, N, D / blocks). `pre`: linear parts of x0 and x1, where the
-    caller has them already.
+    """The core where deter is at hand in both layouts; gives deter' as (blocks, N, D / blocks).
+    `pre`: linear parts of x0 and x1, where the caller has them already.
 
-    A scan that carries both spares the cut, and keeps XLA from fusing the gates' tanh and sigmoid into the transposition that follows, where
-    they are not vectorised (3.3 ms against 0.2 ms a step on 1,024 rows of size1m).
+    A scan that carries both spares the cut, and keeps XLA from fusing the gates' tanh and sigmoid
+    into the transposition that follows, where they are not vectorised (3.3 ms against 0.2 ms a step
+    on 1,024 rows of size1m).
     """
-    shared = jnp.concatenate([self.in_deter(deter, pre=pre[0]), self.in_stoch(stoch, pre=pre[1]), self.in_action(clip_action(action))], -1)
+    shared = jnp.concatenate(
+      [
+        self.in_deter(deter, pre=pre[0]),
+        self.in_stoch(stoch, pre=pre[1]),
+        self.in_action(clip_action(action)),
+      ],
+      -1,
+    )
     h = nn.silu(self.core_norm(self.core_hidden(chunks, shared)))
     r, c, u = jnp.split(self.core_gates(h), 3, -1)
     update = jax.nn.sigmoid(u - 1.0)
@@ -106,11 +145,15 @@ class RSSM(nn.Module):
 
   def prior(self, deter):
     """Logits (N, stoch, classes) of p(z | deter)."""
-    return self.prior_out(self.prior_mlp(deter)).reshape(deter.shape[:-1] + (self.size.stoch, self.size.classes))
+    return self.prior_out(self.prior_mlp(deter)).reshape(
+      deter.shape[:-1] + (self.size.stoch, self.size.classes)
+    )
 
   def posterior(self, deter, tokens):
     """Logits (N, stoch, classes) of q(z | deter, tokens), tokens (N, units) from the encoder."""
-    return self.post_out(self.post_hidden(deter, tokens)).reshape(deter.shape[:-1] + (self.size.stoch, self.size.classes))
+    return self.post_out(self.post_hidden(deter, tokens)).reshape(
+      deter.shape[:-1] + (self.size.stoch, self.size.classes)
+    )
 
 
 def join(chunks):
@@ -137,6 +180,8 @@ def sample(logits: jax.Array, uniform: jax.Array) -> jax.Array:
 
 
 def kl(logits_q: jax.Array, logits_p: jax.Array) -> jax.Array:
-  """KL(q || p) [nats] (...), summed over the categorical variables, both with the 1 % uniform mixture."""
+  """KL(q || p) [nats] (...), summed over the categorical variables, both with the 1 % uniform
+  mixture.
+  """
   q, p = probs(logits_q), probs(logits_p)
   return jnp.sum(q * (jnp.log(q) - jnp.log(p)), (-2, -1))

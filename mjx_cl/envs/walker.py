@@ -1,7 +1,9 @@
 """Walker-walk: a planar walker of seven capsules keeps upright and walks at 1 m/s.
 
-Model, observation, reward and reset follow DeepMind Control Suite's walker-walk (Tassa et al. 2018; figures from dm_control 1.0.50).
+Model, observation, reward and reset follow DeepMind Control Suite's walker-walk (Tassa et al. 2018;
+figures from dm_control 1.0.50).
 """
+
 from __future__ import annotations
 
 import importlib.resources
@@ -14,20 +16,49 @@ from mjx_cl import physics as physics_lib
 from mjx_cl.types import EnvState, Model, Spec, Step, Var
 
 STAND_HEIGHT = 1.2  # [m]
-WALK_SPEED = 1.0    # [m/s]
+WALK_SPEED = 1.0  # [m/s]
 BODIES = ("torso", "right_thigh", "right_leg", "right_foot", "left_thigh", "left_leg", "left_foot")
 # deviation of each channel over 64 robots and 900 steps of the shipped agent
-SCALES = (0.027, 0.14, 0.46, 0.34, 0.22, 0.46, 0.52, 0.67, 0.045, 0.14, 0.2, 0.21, 0.1, 0.28, 0.067, 0.67, 0.55, 2.2, 10.0, 16.0, 15.0, 3.0, 5.7, 7.4)
+SCALES = (
+  0.027,
+  0.14,
+  0.46,
+  0.34,
+  0.22,
+  0.46,
+  0.52,
+  0.67,
+  0.045,
+  0.14,
+  0.2,
+  0.21,
+  0.1,
+  0.28,
+  0.067,
+  0.67,
+  0.55,
+  2.2,
+  10.0,
+  16.0,
+  15.0,
+  3.0,
+  5.7,
+  7.4,
+)
 JOINTS = ("right_hip", "right_knee", "right_ankle", "left_hip", "left_knee", "left_ankle")
 
 
 def load_model() -> mujoco.MjModel:
   """The walker as mujoco.MjModel (28.540 kg, 6 motors, physics step 0.0025 s)."""
-  return mujoco.MjModel.from_xml_string(importlib.resources.files("mjx_cl.envs").joinpath("assets/walker.xml").read_text())
+  return mujoco.MjModel.from_xml_string(
+    importlib.resources.files("mjx_cl.envs").joinpath("assets/walker.xml").read_text()
+  )
 
 
 def angles(qpos: jax.Array) -> jax.Array:
-  """Angle of each body about +y [rad], (7,) in tree order, from qpos (9,) = rootz, rootx, rooty, right leg, left leg."""
+  """Angle of each body about +y [rad], (7,) in tree order, from qpos (9,) = rootz, rootx, rooty,
+  right leg, left leg.
+  """
   root = qpos[2]
   right = root - jnp.cumsum(qpos[3:6])  # leg hinges turn about -y
   left = root - jnp.cumsum(qpos[6:9])
@@ -37,9 +68,9 @@ def angles(qpos: jax.Array) -> jax.Array:
 def center_x(qpos: jax.Array, mass: jax.Array) -> jax.Array:
   """Position of the centre of mass along x [m], (), for body masses (7,) [kg].
 
-  Chain of each leg: hip 0.3 m below the torso's centre, thigh centre 0.225 below the hip, knee 0.45 below the hip, leg centre 0.25 below
-  the knee, ankle 0.5 below the knee, foot centre 0.06 ahead of the ankle. A point (dx, dz) of a body at angle a lies at
-  x + cos(a) dx + sin(a) dz.
+  Chain of each leg: hip 0.3 m below the torso's centre, thigh centre 0.225 below the hip, knee 0.45
+  below the hip, leg centre 0.25 below the knee, ankle 0.5 below the knee, foot centre 0.06 ahead of
+  the ankle. A point (dx, dz) of a body at angle a lies at x + cos(a) dx + sin(a) dz.
   """
   sin, cos = jnp.sin(angles(qpos)), jnp.cos(angles(qpos))
   torso = qpos[1]
@@ -47,12 +78,18 @@ def center_x(qpos: jax.Array, mass: jax.Array) -> jax.Array:
   xs = [torso]
   for thigh, leg, foot in ((1, 2, 3), (4, 5, 6)):
     knee = hip - 0.45 * sin[thigh]
-    xs += [hip - 0.225 * sin[thigh], knee - 0.25 * sin[leg], knee - 0.5 * sin[leg] + 0.06 * cos[foot]]
+    xs += [
+      hip - 0.225 * sin[thigh],
+      knee - 0.25 * sin[leg],
+      knee - 0.5 * sin[leg] + 0.06 * cos[foot],
+    ]
   return jnp.dot(jnp.stack(xs), mass) / jnp.sum(mass)
 
 
 def observe(qpos: jax.Array, qvel: jax.Array) -> jax.Array:
-  """Observation, float32 (24,): (cos, sin) of each body's angle (14), torso height [m] (1), qvel [m/s, rad/s] (9)."""
+  """Observation, float32 (24,): (cos, sin) of each body's angle (14), torso height [m] (1), qvel
+  [m/s, rad/s] (9).
+  """
   a = angles(qpos)
   orientation = jnp.stack([jnp.cos(a), jnp.sin(a)], -1).reshape(-1)  # xmat xx and xz
   return jnp.concatenate([orientation, 1.3 + qpos[:1], qvel])
@@ -61,12 +98,20 @@ def observe(qpos: jax.Array, qvel: jax.Array) -> jax.Array:
 REWARD_TERMS = {"standing": 3.0, "upright": 1.0, "move": 5.0}  # weights
 
 
-def reward(qpos: jax.Array, qvel: jax.Array, mass: jax.Array, weights=tuple(REWARD_TERMS.values()), speed_asked=WALK_SPEED) -> jax.Array:
-  """Walk reward in [0, 1], float32 (), for weights (3, 1, 5) of REWARD_TERMS and the speed asked for [m/s].
+def reward(
+  qpos: jax.Array,
+  qvel: jax.Array,
+  mass: jax.Array,
+  weights=tuple(REWARD_TERMS.values()),
+  speed_asked=WALK_SPEED,
+) -> jax.Array:
+  """Walk reward in [0, 1], float32 (), for weights (3, 1, 5) of REWARD_TERMS and the speed asked
+  for [m/s].
 
-    standing = 1 if height >= 1.2 m else 0.1 ** (((1.2 - height) / 0.6) ** 2)
-    upright  = (1 + cos(torso angle)) / 2
-    reward   = (3 standing + upright) / 4 * (5 clip(v_x / speed asked, 0, 1) + 1) / 6       v_x = centre-of-mass velocity [m/s]
+  standing = 1 if height >= 1.2 m else 0.1 ** (((1.2 - height) / 0.6) ** 2)
+  upright  = (1 + cos(torso angle)) / 2
+  reward   = (3 standing + upright) / 4 * (5 clip(v_x / speed asked, 0, 1) + 1) / 6       v_x =
+    centre-of-mass velocity [m/s]
   """
   height = 1.3 + qpos[0]
   short = jnp.maximum(STAND_HEIGHT - height, 0.0) / 0.6
@@ -78,10 +123,12 @@ def reward(qpos: jax.Array, qvel: jax.Array, mass: jax.Array, weights=tuple(REWA
 
 
 class Walker:
-  """Walker-walk. No early termination; truncated after 1,000 control steps of 0.025 s (10 physics steps).
+  """Walker-walk. No early termination; truncated after 1,000 control steps of 0.025 s (10 physics
+  steps).
 
-  Reset (DMC's): the six leg joints uniform in their ranges, torso angle uniform in (-pi, pi), everything else 0, torso centre at 1.3 m,
-  not settled. Observation and reward use their own kinematics of qpos and qvel, so they are current and equal on both backends.
+  Reset (DMC's): the six leg joints uniform in their ranges, torso angle uniform in (-pi, pi),
+  everything else 0, torso centre at 1.3 m, not settled. Observation and reward use their own
+  kinematics of qpos and qvel, so they are current and equal on both backends.
   """
 
   def __init__(self, physics: str = "auto"):
@@ -91,25 +138,65 @@ class Walker:
     self._low, self._high = jnp.asarray(low, jnp.float32), jnp.asarray(high, jnp.float32)
     self._mass = jnp.asarray(self.mj_model.body_mass[1:], jnp.float32)
     orientation = [Var(f"{b}_{k}", "1", -1, 1) for b in BODIES for k in ("xx", "xz")]
-    speeds = [Var("vel_rootz", "m/s"), Var("vel_rootx", "m/s"), Var("vel_rooty", "rad/s")] + [Var(f"vel_{j}", "rad/s") for j in JOINTS]
-    obs = tuple(v._replace(scale=s) for v, s in zip(orientation + [Var("height", "m")] + speeds, SCALES))
+    speeds = [Var("vel_rootz", "m/s"), Var("vel_rootx", "m/s"), Var("vel_rooty", "rad/s")] + [
+      Var(f"vel_{j}", "rad/s") for j in JOINTS
+    ]
+    obs = tuple(
+      v._replace(scale=s) for v, s in zip(orientation + [Var("height", "m")] + speeds, SCALES)
+    )
     self.spec = Spec(
-        name="walker", obs=obs, act=tuple(Var(j, "1", -1, 1) for j in JOINTS),
-        control_s=0.025, episode_steps=1000,
-        acceptance=0.8,         # mean reward per step; one that stands still earns 0.17, one that walks and never falls 0.95
-        posture=(14, 0.9),      # mean torso height [m]; 1.2 is standing, 0.3 is lying
-        targets=JOINTS, act_groups=(("right_leg", (0, 1, 2)), ("left_leg", (3, 4, 5)), ("all", tuple(range(6)))),
-        obs_groups=(("orientations", tuple(range(14))), ("height", (14,)), ("velocities", tuple(range(15, 24)))),
-        feet=(("right_foot", (self.mj_model.geom("right_foot").id,)), ("left_foot", (self.mj_model.geom("left_foot").id,))),
-        bodies=tuple((b, (self.mj_model.body(b).id,)) for b in BODIES),
-        watched=(("torso_orientation", (0, 1)), ("right_orientation", tuple(range(2, 8))), ("left_orientation", tuple(range(8, 14))), ("height", (14,)),
-                 ("torso_velocity", (15, 16)), ("torso_pitch_rate", (17,)), ("right_velocity", (18, 19, 20)), ("left_velocity", (21, 22, 23))))
+      name="walker",
+      obs=obs,
+      act=tuple(Var(j, "1", -1, 1) for j in JOINTS),
+      control_s=0.025,
+      episode_steps=1000,
+      # mean reward per step; one that stands still earns 0.17, one that walks and never falls 0.95
+      acceptance=0.8,
+      posture=(14, 0.9),  # mean torso height [m]; 1.2 is standing, 0.3 is lying
+      targets=JOINTS,
+      act_groups=(("right_leg", (0, 1, 2)), ("left_leg", (3, 4, 5)), ("all", tuple(range(6)))),
+      obs_groups=(
+        ("orientations", tuple(range(14))),
+        ("height", (14,)),
+        ("velocities", tuple(range(15, 24))),
+      ),
+      feet=(
+        ("right_foot", (self.mj_model.geom("right_foot").id,)),
+        ("left_foot", (self.mj_model.geom("left_foot").id,)),
+      ),
+      bodies=tuple((b, (self.mj_model.body(b).id,)) for b in BODIES),
+      watched=(
+        ("torso_orientation", (0, 1)),
+        ("right_orientation", tuple(range(2, 8))),
+        ("left_orientation", tuple(range(8, 14))),
+        ("height", (14,)),
+        ("torso_velocity", (15, 16)),
+        ("torso_pitch_rate", (17,)),
+        ("right_velocity", (18, 19, 20)),
+        ("left_velocity", (21, 22, 23)),
+      ),
+    )
     self.reward_terms = tuple(REWARD_TERMS)
     self.model = Model(
-        mj=physics_lib.leaves(self.mj_model, "actuator_gear", "geom_friction", "body_mass", "body_inertia", "body_ipos", "dof_armature", "dof_damping",
-                              "dof_frictionloss", "jnt_range", "gravity"),
-        task={"reward_weights": jnp.asarray(list(REWARD_TERMS.values()), jnp.float32), "command_range": jnp.asarray([WALK_SPEED], jnp.float32)},
-        force=jnp.zeros(self.mj_model.nv))
+      mj=physics_lib.leaves(
+        self.mj_model,
+        "actuator_gear",
+        "geom_friction",
+        "body_mass",
+        "body_inertia",
+        "body_ipos",
+        "dof_armature",
+        "dof_damping",
+        "dof_frictionloss",
+        "jnt_range",
+        "gravity",
+      ),
+      task={
+        "reward_weights": jnp.asarray(list(REWARD_TERMS.values()), jnp.float32),
+        "command_range": jnp.asarray([WALK_SPEED], jnp.float32),
+      },
+      force=jnp.zeros(self.mj_model.nv),
+    )
 
   def init(self, model: Model, key: jax.Array) -> tuple[EnvState, jax.Array]:
     """A fresh episode drawn from `key`: state and observation (24,)."""
@@ -124,10 +211,14 @@ class Walker:
 
   def step(self, model: Model, state: EnvState, action: jax.Array) -> tuple[EnvState, Step]:
     """One control step with action (6,), clipped to [-1, 1]."""
-    inner, out = self.physics.step(model.mj, state.physics, jnp.clip(action, -1.0, 1.0), force=model.force)
+    inner, out = self.physics.step(
+      model.mj, state.physics, jnp.clip(action, -1.0, 1.0), force=model.force
+    )
     obs = observe(out["qpos"], out["qvel"])
     step = state.step + 1
     mass = model.mj["body_mass"][1:] if "body_mass" in model.mj else self._mass
-    earned = reward(out["qpos"], out["qvel"], mass, model.task["reward_weights"], model.task["command_range"][0])
+    earned = reward(
+      out["qpos"], out["qvel"], mass, model.task["reward_weights"], model.task["command_range"][0]
+    )
     result = Step(obs, earned, jnp.bool_(False), step >= self.spec.episode_steps, obs)
     return EnvState(inner, step), result

@@ -1,8 +1,11 @@
-"""What can break (one function per fault), and when (`schedule.py`); named settings are in ../fault_presets.py. `FAULTS` is the one table.
+"""What can break (one function per fault), and when (`schedule.py`); named settings are in
+../fault_presets.py. `FAULTS` is the one table.
 
-A robot may have several faults in one compiled program, at once or one after the other: wherever a Fault is taken, a tuple of them is too. Their
-severities, onsets, schedules and targets are arrays, so any mix over a batch of robots is one trace.
+A robot may have several faults in one compiled program, at once or one after the other: wherever a
+Fault is taken, a tuple of them is too. Their severities, onsets, schedules and targets are arrays,
+so any mix over a batch of robots is one trace.
 """
+
 from __future__ import annotations
 
 import inspect
@@ -13,26 +16,55 @@ import jax.numpy as jnp
 
 from mjx_cl.errors import PluginError, UserError, choose
 from mjx_cl.faults.actuator import ACTUATOR
-from mjx_cl.faults.base import (Fault, Injection, Ports, State, as_tuple, begin, drive, fault, none, owned_model, sense)
+from mjx_cl.faults.base import (
+  Fault,
+  Injection,
+  Ports,
+  State,
+  as_tuple,
+  begin,
+  drive,
+  fault,
+  none,
+  owned_model,
+  sense,
+)
 from mjx_cl.faults.body import BODY
 from mjx_cl.faults.contact import CONTACT
 from mjx_cl.faults.schedule import FOREVER, SCHEDULES, Plan, plan
 from mjx_cl.faults.sensor import SENSOR
 from mjx_cl.faults.task import TASK
 from mjx_cl.faults.transfer import TRANSFER
-from mjx_cl.plugins import Registry, line
+from mjx_cl.io.plugins import Registry, line
 
-FAMILIES = {"actuator": ACTUATOR, "body": BODY, "contact": CONTACT, "sensor": SENSOR, "transfer": TRANSFER, "task": TASK}
-FAULTS = Registry("mjx_cl.faults", "fault", {"none": none} | {name: make for family in FAMILIES.values() for name, make in family.items()})
+FAMILIES = {
+  "actuator": ACTUATOR,
+  "body": BODY,
+  "contact": CONTACT,
+  "sensor": SENSOR,
+  "transfer": TRANSFER,
+  "task": TASK,
+}
+FAULTS = Registry(
+  "mjx_cl.faults",
+  "fault",
+  {"none": none} | {name: make for family in FAMILIES.values() for name, make in family.items()},
+)
 
 
 def family(name: str) -> str:
   """Name of the family of fault `name`; those of other packages and files are of family `plugin`."""
-  return next((f for f, members in FAMILIES.items() if name in members), "none" if name == "none" else "plugin")
+  return next(
+    (f for f, members in FAMILIES.items() if name in members),
+    "none" if name == "none" else "plugin",
+  )
 
 
 class Said(NamedTuple):
-  """What the docstring of a fault says of it. Attributes: what: happens, its first line. severity, target, owns: in words, "" where it does not say."""
+  """What the docstring of a fault says of it. Attributes: what: happens, its first line. severity,
+  target, owns: in words, "" where it does not say.
+  """
+
   what: str
   severity: str
   target: str
@@ -43,36 +75,52 @@ def said(name: str) -> Said:
   """`Said` of fault `name`."""
   text = inspect.getdoc(FAULTS[name]) or ""
   last = " ".join(text.split("\n\n")[-1].split()).replace("`", "")
-  found = {word: re.search(rf"\b{word}:? (.*?)\.(?: [A-Z]|$)", last) for word in ("Severity", "Target", "Owns")}
+  found = {
+    word: re.search(rf"\b{word}:? (.*?)\.(?: [A-Z]|$)", last)
+    for word in ("Severity", "Target", "Owns")
+  }
   return Said(text.split("\n")[0], *(hit[1] if hit else "" for hit in found.values()))
 
 
 def about(name: str) -> str:
-  """One line on fault `name` from its docstring: family, what happens, what severity means, what a target is, what it owns."""
+  """One line on fault `name` from its docstring: family, what happens, what severity means, what a
+  target is, what it owns.
+  """
   own = said(name)
-  return "; ".join([f"{family(name)}: {own.what}"] + [f"{word}: {getattr(own, word)}" for word in Said._fields[1:] if getattr(own, word)])
+  return "; ".join(
+    [f"{family(name)}: {own.what}"]
+    + [f"{word}: {getattr(own, word)}" for word in Said._fields[1:] if getattr(own, word)]
+  )
 
 
 def make(name: str, env) -> Fault:
   """Builds fault `name` for the robot `env`.
 
   Raises:
-    UserError for an unknown name, a fault that has nothing to act on in this robot, and whatever goes wrong in one of another package.
+    UserError for an unknown name, a fault that has nothing to act on in this robot, and whatever
+    goes wrong in one of another package.
   """
   build = choose("fault", name, FAULTS)
   try:
     made = build(env)
     if not isinstance(made, Fault):
-      raise PluginError(f"fault {name!r} gives {type(made).__name__} in place of a Fault, see mjx_cl.faults.base.fault")
+      raise PluginError(
+        f"fault {name!r} gives {type(made).__name__} in place of a Fault, see "
+        "mjx_cl.faults.base.fault"
+      )
     return made
   except UserError:
     raise
   except Exception as e:  # whatever a foreign function raises
     if getattr(e, "name", None) == "mj_model" and not hasattr(env, "mj_model"):
-      raise UserError(f"fault {name!r} acts on a MuJoCo model, which robot {env.spec.name!r} does not have") from None
+      raise UserError(
+        f"fault {name!r} acts on a MuJoCo model, which robot {env.spec.name!r} does not have"
+      ) from None
     if name in FAULTS.own:
       raise
-    raise PluginError(f"fault {name!r} cannot be built for robot {env.spec.name!r}: {line(e)}") from e
+    raise PluginError(
+      f"fault {name!r} cannot be built for robot {env.spec.name!r}: {line(e)}"
+    ) from e
 
 
 def available(env) -> dict[str, Fault]:
@@ -93,7 +141,10 @@ def target_index(fault: Fault, target: str | None) -> int:
   if target in (None, "random"):
     return -1
   if target not in fault.targets:
-    raise UserError(f"unknown target {target!r} of fault {fault.name!r}; choose from: random, {', '.join(fault.targets)}")
+    raise UserError(
+      f"unknown target {target!r} of fault {fault.name!r}; choose from: random, "
+      f"{', '.join(fault.targets)}"
+    )
   return fault.targets.index(target)
 
 
@@ -101,12 +152,19 @@ def build(changes, env, onset: int = 0):
   """The changes of a run (fault_presets.Change) on one robot.
 
   Returns:
-    (faults, plan, targets): tuple of F Faults, Plan with leading (F,), int32 (F,); what `rollout.start` takes.
+    (faults, plan, targets): tuple of F Faults, Plan with leading (F,), int32 (F,); what
+    `rollout.start` takes.
   """
   made = tuple(make(c.fault, env) for c in changes)
   targets = [target_index(f, c.target) for f, c in zip(made, changes)]
   column = lambda get: [get(c) for c in changes]
   kinds = [list(SCHEDULES).index(c.schedule) for c in changes]
-  when = plan(column(lambda c: c.severity), column(lambda c: onset + c.after), column(lambda c: c.duration or FOREVER), kinds,
-              column(lambda c: c.period), column(lambda c: c.share))
+  when = plan(
+    column(lambda c: c.severity),
+    column(lambda c: onset + c.after),
+    column(lambda c: c.duration or FOREVER),
+    kinds,
+    column(lambda c: c.period),
+    column(lambda c: c.share),
+  )
   return made, when, jnp.asarray(targets, jnp.int32)

@@ -1,11 +1,14 @@
 """What every fault is: a pure map of owned leaves, driven by a severity in [0, 1].
 
-A fault returns the new values of the leaves that it owns, by name; `fault` puts them in place where the severity is above 0. So severity 0 is
-nominal bit for bit, and a leaf that is not owned cannot be touched, whatever the fault's author wrote.
+A fault returns the new values of the leaves that it owns, by name; `fault` puts them in place where
+the severity is above 0. So severity 0 is nominal bit for bit, and a leaf that is not owned cannot
+be touched, whatever the fault's author wrote.
 """
+
 from __future__ import annotations
 
-from typing import Any, Callable, NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,12 +22,14 @@ class Ports(NamedTuple):
   """The places at which a fault can act on one robot in one control step.
 
   Attributes:
-    model: types.Model, nominal on the way in (or as the faults before this one left it in the same step): no fault compounds over time.
+    model: types.Model, nominal on the way in (or as the faults before this one left it in the same
+      step): no fault compounds over time.
     ctrl: float32 (A,), the action as the agent gave it, or None where the sensors are read.
     obs: float32 (O,), what the sensors report, or None where the robot is driven.
     first: bool (), this decision or observation is the first of an episode.
     since: int32 (), control steps since the onset; negative before.
   """
+
   model: Model
   ctrl: jax.Array | None = None
   obs: jax.Array | None = None
@@ -37,9 +42,11 @@ class State(NamedTuple):
 
   Attributes:
     target: int32 (), index into its `targets`.
-    row: what the target stands for (a mask, a direction), looked up once; the target itself where there is no table.
+    row: what the target stands for (a mask, a direction), looked up once; the target itself where
+      there is no table.
     memory: a pytree (delay lines, held values), () where there is none.
   """
+
   target: jax.Array
   row: Any
   memory: Any
@@ -47,15 +54,17 @@ class State(NamedTuple):
 
 class Fault(NamedTuple):
   """Attributes:
-    name: registry name.
-    owns: leaves it may write: "mj.actuator_gear", "task.strength", "force", "ctrl" or "obs"; severity 0 leaves them bit-identical.
-    targets: names that a target index stands for.
-    drawn: a target that is not named is drawn from the first so many.
-    init: (key, target int32 () or -1 to draw it) -> State.
-    apply: (State, severity float32 (), key, Ports) -> (State, Ports).
-    senses: it acts where the sensors are read; the others act where the robot is driven.
-    not_monotone: why a greater severity need not make a greater difference at first, "" where it must.
+  name: registry name.
+  owns: leaves it may write: "mj.actuator_gear", "task.strength", "force", "ctrl" or "obs"; severity
+  0 leaves them bit-identical. targets: names that a target index stands for.
+  drawn: a target that is not named is drawn from the first so many.
+  init: (key, target int32 () or -1 to draw it) -> State.
+  apply: (State, severity float32 (), key, Ports) -> (State, Ports).
+  senses: it acts where the sensors are read; the others act where the robot is driven.
+  not_monotone: why a greater severity need not make a greater difference at first, "" where it
+  must.
   """
+
   name: str
   owns: tuple[str, ...]
   targets: tuple[str, ...]
@@ -74,6 +83,7 @@ class Injection(NamedTuple):
     plan: schedule.Plan with leading (F,).
     walk: float32 (F,), where a random walk of the severity stands.
   """
+
   states: tuple[State, ...]
   plan: schedule.Plan
   walk: jax.Array
@@ -87,29 +97,54 @@ class Injection(NamedTuple):
 def read(ports: Ports, name: str) -> jax.Array:
   """Value of the leaf `name`."""
   kind, _, leaf = name.partition(".")
-  return getattr(ports.model, kind)[leaf] if leaf else ports.model.force if kind == "force" else getattr(ports, kind)
+  return (
+    getattr(ports.model, kind)[leaf]
+    if leaf
+    else ports.model.force
+    if kind == "force"
+    else getattr(ports, kind)
+  )
 
 
 def write(ports: Ports, name: str, value: jax.Array) -> Ports:
   """Ports with `value` in the leaf `name`."""
   kind, _, leaf = name.partition(".")
   if leaf:
-    return ports._replace(model=ports.model._replace(**{kind: getattr(ports.model, kind) | {leaf: value}}))
-  return ports._replace(model=ports.model._replace(force=value)) if kind == "force" else ports._replace(**{kind: value})
+    return ports._replace(
+      model=ports.model._replace(**{kind: getattr(ports.model, kind) | {leaf: value}})
+    )
+  return (
+    ports._replace(model=ports.model._replace(force=value))
+    if kind == "force"
+    else ports._replace(**{kind: value})
+  )
 
 
-def fault(name: str, env, owns: tuple[str, ...], targets, act, memory=(), drawn: int | None = None, not_monotone: str = "", rows=None) -> Fault:
+def fault(
+  name: str,
+  env,
+  owns: tuple[str, ...],
+  targets,
+  act,
+  memory=(),
+  drawn: int | None = None,
+  not_monotone: str = "",
+  rows=None,
+) -> Fault:
   """Builds a Fault of `env`.
 
   Args:
     name: registry name.
     owns: names of its leaves; "obs" is owned alone.
     targets: names, the ones that may be drawn first.
-    act: (row, memory, severity, key, ports) -> (memory', {owned leaf: new value}); for severity > 0 the values take effect.
+    act: (row, memory, severity, key, ports) -> (memory', {owned leaf: new value}); for severity > 0
+      the values take effect.
     memory: initial memory, a pytree of arrays; renewed where ports.first says so by `act` itself.
     drawn: a target that is not named is drawn from the first so many; None: from all.
     not_monotone: why a greater severity need not make a greater difference at first.
-    rows: array of what each target stands for, leading (targets,); `act` gets the row of its target. None: it gets the target's index.
+    rows: array of what each target stands for, leading (targets,); `act` gets the row of its
+      target. None: it gets the target's index.
+
   Raises:
     UserError where `env` lacks one of the leaves.
   """
@@ -120,18 +155,25 @@ def fault(name: str, env, owns: tuple[str, ...], targets, act, memory=(), drawn:
     raise UserError(f"fault {name!r} finds nothing to act on in robot {env.spec.name!r}")
   senses = "obs" in owns
   if senses and len(owns) > 1:
-    raise ValueError(f"fault {name!r} owns obs and {', '.join(o for o in owns if o != 'obs')}: sensors are read at another moment; make two faults")
+    raise ValueError(
+      f"fault {name!r} owns obs and {', '.join(o for o in owns if o != 'obs')}: sensors are "
+      "read at another moment; make two faults"
+    )
   count = drawn or len(targets)
 
   def init(key, target=-1):
     target = jnp.asarray(target)
     index = jnp.where(target < 0, jax.random.randint(key, (), 0, count), target).astype(jnp.int32)
-    return State(index, index if rows is None else jnp.asarray(rows)[index], jax.tree.map(jnp.asarray, memory))
+    return State(
+      index, index if rows is None else jnp.asarray(rows)[index], jax.tree.map(jnp.asarray, memory)
+    )
 
   def apply(state, severity, key, ports: Ports):
     kept, values = act(state.row, state.memory, severity, key, ports)
     if set(values) != set(owns):
-      raise ValueError(f"fault {name!r} owns {', '.join(owns)} but gave {', '.join(sorted(values))}")
+      raise ValueError(
+        f"fault {name!r} owns {', '.join(owns)} but gave {', '.join(sorted(values))}"
+      )
     for leaf, value in values.items():
       old = read(ports, leaf)
       ports = write(ports, leaf, jnp.where(severity > 0, value.astype(old.dtype), old))
@@ -151,9 +193,15 @@ def require(env, leaf: str, name: str) -> None:
 
 
 def owned_model(faults: tuple[Fault, ...], model: Model) -> Model:
-  """The leaves of `model` that the physics must be told of: those `mj` leaves and that force which some fault owns; the task in full."""
+  """The leaves of `model` that the physics must be told of: those `mj` leaves and that force which
+  some fault owns; the task in full.
+  """
   owned = {leaf for f in faults for leaf in f.owns}
-  return Model({k: v for k, v in model.mj.items() if f"mj.{k}" in owned}, model.task, model.force if "force" in owned else None)
+  return Model(
+    {k: v for k, v in model.mj.items() if f"mj.{k}" in owned},
+    model.task,
+    model.force if "force" in owned else None,
+  )
 
 
 def as_tuple(faults) -> tuple[Fault, ...]:
@@ -179,20 +227,34 @@ def drive(faults, injection: Injection, t: jax.Array, key: jax.Array, ports: Por
   faults = as_tuple(faults)
   walk = schedule.walk(injection.plan, injection.walk, t, jax.random.fold_in(key, 10_000))
   injection = injection._replace(walk=walk)
-  severity = schedule.severity(injection.plan, walk, t) * jnp.asarray([bool(f.owns) for f in faults], jnp.float32)  # `none` has no severity
+  severity = schedule.severity(injection.plan, walk, t) * jnp.asarray(
+    [bool(f.owns) for f in faults], jnp.float32
+  )  # `none` has no severity
   return *_apply(faults, injection, t, key, ports, severity, False), severity
 
 
-def sense(faults, injection: Injection, t: jax.Array, key: jax.Array, model: Model, obs: jax.Array, first=False):
-  """Applies every sensor fault to the observation that is read at control step t. Returns (injection', obs').
+def sense(
+  faults,
+  injection: Injection,
+  t: jax.Array,
+  key: jax.Array,
+  model: Model,
+  obs: jax.Array,
+  first=False,
+):
+  """Applies every sensor fault to the observation that is read at control step t. Returns
+  (injection', obs').
 
-  A severity that walks at random stands where `drive` left it, one control step ago: at the boundary of a period a sensor follows one step late.
+  A severity that walks at random stands where `drive` left it, one control step ago: at the
+  boundary of a period a sensor follows one step late.
   """
   faults = as_tuple(faults)
   if not any(f.senses for f in faults):
     return injection, obs
   severity = schedule.severity(injection.plan, injection.walk, t)
-  injection, ports = _apply(faults, injection, t, key, Ports(model, obs=obs, first=first), severity, True)
+  injection, ports = _apply(
+    faults, injection, t, key, Ports(model, obs=obs, first=first), severity, True
+  )
   return injection, ports.obs
 
 
@@ -208,22 +270,40 @@ def _apply(faults, injection, t, key, ports, severity, senses):
 
 
 def _check_owned(fault: Fault, before: Ports, after: Ports) -> None:
-  """Raises UserError, while the program is traced, where a Fault that was not built by `fault` has written a leaf that it does not own."""
-  leaves = lambda ports: {f"{kind}.{k}": v for kind in ("mj", "task") for k, v in getattr(ports.model, kind).items()} | {
-      "force": ports.model.force, "ctrl": ports.ctrl, "obs": ports.obs}
+  """Raises UserError, while the program is traced, where a Fault that was not built by `fault` has
+  written a leaf that it does not own.
+  """
+  leaves = lambda ports: (
+    {f"{kind}.{k}": v for kind in ("mj", "task") for k, v in getattr(ports.model, kind).items()}
+    | {"force": ports.model.force, "ctrl": ports.ctrl, "obs": ports.obs}
+  )
   old, new = leaves(before), leaves(after)
-  touched = sorted(k for k in old.keys() | new.keys() if old.get(k) is not new.get(k) and k not in fault.owns)
+  touched = sorted(
+    k for k in old.keys() | new.keys() if old.get(k) is not new.get(k) and k not in fault.owns
+  )
   if touched:
-    raise UserError(f"fault {fault.name!r} writes {', '.join(touched)}, which it does not own; it owns {', '.join(fault.owns) or 'nothing'}")
+    raise UserError(
+      f"fault {fault.name!r} writes {', '.join(touched)}, which it does not own; it owns "
+      f"{', '.join(fault.owns) or 'nothing'}"
+    )
 
 
 def none(env) -> Fault:
   """No fault at all: the nominal robot."""
   del env
-  return Fault("none", (), ("all",), 1, lambda key, target=-1: State(jnp.int32(0), (), ()), lambda state, severity, key, ports: (state, ports), False)
+  return Fault(
+    "none",
+    (),
+    ("all",),
+    1,
+    lambda key, target=-1: State(jnp.int32(0), (), ()),
+    lambda state, severity, key, ports: (state, ports),
+    False,
+  )
 
 
-# ---- targets -------------------------------------------------------------------------------------------------------------------------
+# ---- targets -------------------------------------------------------------------------------------
+
 
 def actuator_targets(env):
   """Single actuators, then groups, then all: (names, bool mask (targets, A), how many are single)."""
@@ -233,7 +313,9 @@ def actuator_targets(env):
 
 
 def channel_targets(env):
-  """Groups of the observation, `all`, then single channels: (names, bool mask (targets, O), how many may be drawn)."""
+  """Groups of the observation, `all`, then single channels: (names, bool mask (targets, O), how
+  many may be drawn).
+  """
   size = len(env.spec.obs)
   groups = list(env.spec.obs_groups)
   rows = groups + [("all", tuple(range(size)))]

@@ -1,4 +1,7 @@
-"""Faults of the body: masses, where they sit, joints. Masses bring their derived constants (mj_setConst, physics.DERIVING)."""
+"""Faults of the body: masses, where they sit, joints. Masses bring their derived constants
+(mj_setConst, physics.DERIVING).
+"""
+
 from __future__ import annotations
 
 import jax.numpy as jnp
@@ -12,24 +15,36 @@ from mjx_cl.faults.base import Fault, actuator_targets, fault
 def _bodies(env, name: str):
   """(names, bool mask (targets, nbody)) of spec.bodies."""
   if not env.spec.bodies or getattr(env, "mj_model", None) is None:
-    raise UserError(f"fault {name!r} needs bodies with a name and a mass, which robot {env.spec.name!r} does not have")
+    raise UserError(
+      f"fault {name!r} needs bodies with a name and a mass, which robot {env.spec.name!r} does "
+      "not have"
+    )
   size = env.mj_model.nbody
-  return tuple(n for n, _ in env.spec.bodies), jnp.asarray([[i in hit for i in range(size)] for _, hit in env.spec.bodies])
+  return tuple(n for n, _ in env.spec.bodies), jnp.asarray(
+    [[i in hit for i in range(size)] for _, hit in env.spec.bodies]
+  )
 
 
 def payload(env) -> Fault:
   """The trunk carries a load, spread as its own mass is.
 
-    m' = m (1 + 0.4 severity M / m),  I' = I m' / m                       M whole mass, m the trunk's
+    m' = m (1 + 0.4 severity M / m),  I' = I m' / m                       M whole mass, m the
+      trunk's
 
-  Severity: 1 is a load of 40 % of the whole robot [kg]: quadruped 20.9 kg (Isaac Lab randomises by +-5 kg, severity 0.24), walker
-  11.4, car 1.5. Target: trunk, the only one. Owns `mj.body_mass`, `mj.body_inertia`, or `task.mass`, `task.inertia` where there is no MuJoCo model.
-  Source: payloads, facts 4.2.
+  Severity: 1 is a load of 40 % of the whole robot [kg]: quadruped 20.9 kg (Isaac Lab randomises by
+  +-5 kg, severity 0.24), walker 11.4, car 1.5. Target: trunk, the only one. Owns `mj.body_mass`,
+  `mj.body_inertia`, or `task.mass`, `task.inertia` where there is no MuJoCo model. Source:
+  payloads, facts 4.2.
   """
   if "mass" in env.model.task:
+
     def act(target, memory, severity, key, ports):
       grown = 1.0 + 0.4 * severity
-      return memory, {"task.mass": ports.model.task["mass"] * grown, "task.inertia": ports.model.task["inertia"] * grown}
+      return memory, {
+        "task.mass": ports.model.task["mass"] * grown,
+        "task.inertia": ports.model.task["inertia"] * grown,
+      }
+
     return fault("payload", env, ("task.mass", "task.inertia"), ("trunk",), act)
   _, mask = _bodies(env, "payload")
   mass = np.asarray(env.mj_model.body_mass)
@@ -38,7 +53,11 @@ def payload(env) -> Fault:
 
   def act(target, memory, severity, key, ports):
     grown = jnp.where(jnp.arange(mass.size) == trunk, 1.0 + 0.4 * severity * share, 1.0)
-    return memory, {"mj.body_mass": ports.model.mj["body_mass"] * grown, "mj.body_inertia": ports.model.mj["body_inertia"] * grown[:, None]}
+    return memory, {
+      "mj.body_mass": ports.model.mj["body_mass"] * grown,
+      "mj.body_inertia": ports.model.mj["body_inertia"] * grown[:, None],
+    }
+
   return fault("payload", env, ("mj.body_mass", "mj.body_inertia"), ("trunk",), act)
 
 
@@ -47,9 +66,10 @@ def com(env) -> Fault:
 
     r' = r + 0.5 severity g e,   g = sqrt(trace(I) / (2 m)) radius of gyration, e the direction
 
-  Severity: 1 moves it by half the radius of gyration [m]: quadruped 0.13 (VCMS trains with 0.1), walker 0.10. Target: a direction (drawn),
-  forward, backward, left, right, up, down as far as the robot can move there. Owns `mj.body_ipos`. Source: shifts of the trunk's centre of mass,
-  facts 4.2.
+  Severity: 1 moves it by half the radius of gyration [m]: quadruped 0.13 (VCMS trains with 0.1),
+  walker 0.10. Target: a direction (drawn), forward, backward, left, right, up, down as far as the
+  robot can move there. Owns `mj.body_ipos`. Source: shifts of the trunk's centre of mass, facts
+  4.2.
   """
   _bodies(env, "com")
   model, trunk = env.mj_model, int(env.spec.bodies[0][1][0])
@@ -58,74 +78,107 @@ def com(env) -> Fault:
   of_trunk = (jnp.arange(model.nbody) == trunk)[:, None]
 
   def act(direction, memory, severity, key, ports):
-    return memory, {"mj.body_ipos": ports.model.mj["body_ipos"] + jnp.where(of_trunk, 0.5 * severity * gyration * direction, 0.0)}
+    return memory, {
+      "mj.body_ipos": ports.model.mj["body_ipos"]
+      + jnp.where(of_trunk, 0.5 * severity * gyration * direction, 0.0)
+    }
+
   return fault("com", env, ("mj.body_ipos",), names, act, rows=directions)
 
 
 def limb_mass(env) -> Fault:
   """A limb grows heavier (mud, ice), its inertia with it.   m_b' = m_b (1 + 2 severity)
 
-  Severity: 1 triples the mass [kg], the upper end of Nagabandi et al.'s arm. Target: a body other than the trunk (drawn). Owns
-  `mj.body_mass`, `mj.body_inertia`. Source: limb masses, facts 4.2.
+  Severity: 1 triples the mass [kg], the upper end of Nagabandi et al.'s arm. Target: a body other
+  than the trunk (drawn). Owns `mj.body_mass`, `mj.body_inertia`. Source: limb masses, facts 4.2.
   """
   names, mask = _bodies(env, "limb_mass")
   names, mask = names[1:], mask[1:]
 
   def act(hit, memory, severity, key, ports):
     grown = jnp.where(hit, 1.0 + 2.0 * severity, 1.0)
-    return memory, {"mj.body_mass": ports.model.mj["body_mass"] * grown, "mj.body_inertia": ports.model.mj["body_inertia"] * grown[:, None]}
+    return memory, {
+      "mj.body_mass": ports.model.mj["body_mass"] * grown,
+      "mj.body_inertia": ports.model.mj["body_inertia"] * grown[:, None],
+    }
+
   return fault("limb_mass", env, ("mj.body_mass", "mj.body_inertia"), names, act, rows=mask)
 
 
 def joint_damping(env) -> Fault:
   """A joint grows stiff in motion.   damping_j' = damping_j + 10 severity [N m s/rad]
 
-  Severity: 1 adds 10 [N m s/rad], the upper end of realworldrl_suite's walker (nominal 0.1). Target: a joint (drawn), a leg or all. Owns
-  `mj.dof_damping`. Source: facts 4.5.
+  Severity: 1 adds 10 [N m s/rad], the upper end of realworldrl_suite's walker (nominal 0.1).
+  Target: a joint (drawn), a leg or all. Owns `mj.dof_damping`. Source: facts 4.5.
   """
   names, mask, single = actuator_targets(env)
   hits = mask.astype(jnp.float32) @ dofs(env, "joint_damping")
 
   def act(hit, memory, severity, key, ports):
     return memory, {"mj.dof_damping": ports.model.mj["dof_damping"] + 10.0 * severity * hit}
+
   return fault("joint_damping", env, ("mj.dof_damping",), names, act, drawn=single, rows=hits)
 
 
 def joint_friction(env) -> Fault:
   """Dry friction in a joint.   frictionloss_j' = frictionloss_j + 0.25 severity tau_j [N m]
 
-  Severity: 1 adds a quarter of the motor's greatest torque tau_j [N m]. Target: a joint (drawn), a leg or all. Owns `mj.dof_frictionloss`. MJX builds
-  no friction constraint for a model that has none and refuses it there; C MuJoCo (physics native) does. Source: MuJoCo Playground varies the Go1's by
-  a tenth, facts 1.7; the range is this project's own choice.
+  Severity: 1 adds a quarter of the motor's greatest torque tau_j [N m]. Target: a joint (drawn), a
+  leg or all. Owns `mj.dof_frictionloss`. MJX builds no friction constraint for a model that has
+  none and refuses it there; C MuJoCo (physics native) does. Source: MuJoCo Playground varies the
+  Go1's by a tenth, facts 1.7; the range is this project's own choice.
   """
   names, mask, single = actuator_targets(env)
   which = dofs(env, "joint_friction")
   model = env.mj_model
   torque = np.abs(model.actuator_gear[:, 0] * model.actuator_ctrlrange[:, 1]).astype(np.float32)
   if not (torque > 0).all():
-    raise UserError(f"fault 'joint_friction' needs motors with a greatest torque (ctrlrange), which robot {env.spec.name!r} does not state")
+    raise UserError(
+      "fault 'joint_friction' needs motors with a greatest torque (ctrlrange), which robot "
+      f"{env.spec.name!r} does not state"
+    )
   if env.physics.name == "mjx" and not (model.dof_frictionloss > 0).any():
-    raise UserError("fault 'joint_friction': MJX builds no friction constraint for a model whose joints have none, so it would do nothing; "
-                    "choose physics native")
+    raise UserError(
+      "fault 'joint_friction': MJX builds no friction constraint for a model whose joints have "
+      "none, so it would do nothing; "
+      "choose physics native"
+    )
 
   def act(greatest, memory, severity, key, ports):
-    return memory, {"mj.dof_frictionloss": ports.model.mj["dof_frictionloss"] + 0.25 * severity * greatest}
-  return fault("joint_friction", env, ("mj.dof_frictionloss",), names, act, drawn=single, rows=(mask * torque) @ which)
+    return memory, {
+      "mj.dof_frictionloss": ports.model.mj["dof_frictionloss"] + 0.25 * severity * greatest
+    }
+
+  return fault(
+    "joint_friction",
+    env,
+    ("mj.dof_frictionloss",),
+    names,
+    act,
+    drawn=single,
+    rows=(mask * torque) @ which,
+  )
 
 
 def range_loss(env) -> Fault:
-  """A joint's range shrinks towards the angle at which the robot stands.   low' = low + 0.95 severity (q0 - low), high alike
+  """A joint's range shrinks towards the angle at which the robot stands.   low' = low + 0.95
+    severity (q0 - low), high alike
 
-  Severity: 1 leaves 5 % of the range [rad]. Target: a joint (drawn), a leg or all, of those that have limits. Owns `mj.jnt_range`. Not visible to: a
-  gait that does not come near the limits. Source: none; fault and range are this project's own choice.
+  Severity: 1 leaves 5 % of the range [rad]. Target: a joint (drawn), a leg or all, of those that
+  have limits. Owns `mj.jnt_range`. Not visible to: a gait that does not come near the limits.
+  Source: none; fault and range are this project's own choice.
   """
   names, mask, single = actuator_targets(env)
   dofs(env, "range_loss")
   model = env.mj_model
   joints = model.actuator_trnid[:, 0]
   if not model.jnt_limited[joints].all():
-    raise UserError(f"fault 'range_loss' needs joints with limits; these have none in robot {env.spec.name!r}: "
-                    + ", ".join(env.spec.targets[i] for i in np.flatnonzero(~model.jnt_limited[joints].astype(bool))))
+    raise UserError(
+      f"fault 'range_loss' needs joints with limits; these have none in robot {env.spec.name!r}: "
+      + ", ".join(
+        env.spec.targets[i] for i in np.flatnonzero(~model.jnt_limited[joints].astype(bool))
+      )
+    )
   stance = getattr(env, "stance", None)  # joint angles of standing, in actuator order
   stance = model.qpos0[model.jnt_qposadr[joints]] if stance is None else np.asarray(stance)
   middle = np.zeros((model.njnt, 1), np.float32)
@@ -134,15 +187,27 @@ def range_loss(env) -> Fault:
 
   def act(hit, memory, severity, key, ports):
     value = ports.model.mj["jnt_range"]
-    return memory, {"mj.jnt_range": jnp.where(hit[:, None], value + 0.95 * severity * (middle - value), value)}
+    return memory, {
+      "mj.jnt_range": jnp.where(hit[:, None], value + 0.95 * severity * (middle - value), value)
+    }
+
   return fault("range_loss", env, ("mj.jnt_range",), names, act, drawn=single, rows=hits)
 
 
-DIRECTIONS = {"forward": (1, 0, 0), "backward": (-1, 0, 0), "left": (0, 1, 0), "right": (0, -1, 0), "up": (0, 0, 1), "down": (0, 0, -1)}
+DIRECTIONS = {
+  "forward": (1, 0, 0),
+  "backward": (-1, 0, 0),
+  "left": (0, 1, 0),
+  "right": (0, -1, 0),
+  "up": (0, 0, 1),
+  "down": (0, 0, -1),
+}
 
 
 def heading_targets(env, names):
-  """(names, unit vectors (targets, 3)) of the directions in which the robot's trunk is free to move."""
+  """(names, unit vectors (targets, 3)) of the directions in which the robot's trunk is free to
+  move.
+  """
   free = np.abs(force_map(env)).sum(1) > 0
   kept = [n for n in names if free[np.flatnonzero(DIRECTIONS[n])[0]]]
   return tuple(kept), jnp.asarray([DIRECTIONS[n] for n in kept], jnp.float32)
@@ -151,10 +216,11 @@ def heading_targets(env, names):
 def force_map(env) -> np.ndarray:
   """(3, nv): a force F (world axes) [N] on the trunk is the generalised force F @ map.
 
-  The trunk's slide joints, or the translations of its free joint (the force then acts at the body's origin). Without a MuJoCo model the
-  force's first two entries are along x and y of the world.
+  The trunk's slide joints, or the translations of its free joint (the force then acts at the body's
+  origin). Without a MuJoCo model the force's first two entries are along x and y of the world.
   """
   import mujoco
+
   model = getattr(env, "mj_model", None)
   if model is None:
     size = 0 if env.model.force is None else env.model.force.shape[0]
@@ -167,10 +233,17 @@ def force_map(env) -> np.ndarray:
   for j in range(model.body_jntadr[trunk], model.body_jntadr[trunk] + model.body_jntnum[trunk]):
     at = model.jnt_dofadr[j]
     if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE:
-      out[:, at:at + 3] = np.eye(3)
+      out[:, at : at + 3] = np.eye(3)
     elif model.jnt_type[j] == mujoco.mjtJoint.mjJNT_SLIDE:
       out[:, at] = model.jnt_axis[j]
   return out
 
 
-BODY = {"payload": payload, "com": com, "limb_mass": limb_mass, "joint_damping": joint_damping, "joint_friction": joint_friction, "range_loss": range_loss}
+BODY = {
+  "payload": payload,
+  "com": com,
+  "limb_mass": limb_mass,
+  "joint_damping": joint_damping,
+  "joint_friction": joint_friction,
+  "range_loss": range_loss,
+}

@@ -1,4 +1,5 @@
 """Faults between the robot and the world: grip, slope, pushes, wind."""
+
 from __future__ import annotations
 
 import jax
@@ -10,7 +11,7 @@ from mjx_cl.faults.base import Fault, fault, read
 from mjx_cl.faults.body import force_map, heading_targets
 
 PUSH_EVERY = 100  # control steps between two pushes
-PUSH_FOR = 4      # control steps that one lasts
+PUSH_FOR = 4  # control steps that one lasts
 
 
 def friction(env) -> Fault:
@@ -18,13 +19,17 @@ def friction(env) -> Fault:
 
     mu_i' = mu_i (1 - 0.95 severity)
 
-  Severity: 1 leaves 5 % of the friction coefficient [1]. Target: all, or a foot, wheel or axle (any of them drawn). Owns `mj.geom_friction` (n, 3) of
-  the touching geoms, or `task.friction`, one per axle. The geoms must have priority over the floor: MuJoCo takes the greater of two equal ones
+  Severity: 1 leaves 5 % of the friction coefficient [1]. Target: all, or a foot, wheel or axle (any
+  of them drawn). Owns `mj.geom_friction` (n, 3) of the touching geoms, or `task.friction`, one per
+  axle. The geoms must have priority over the floor: MuJoCo takes the greater of two equal ones
   otherwise, and the fault would do nothing. Source: friction figures, facts 4.3 and 4.5.
   """
   feet = list(env.spec.feet)
   if not feet:
-    raise UserError(f"fault 'friction' needs feet or wheels with a name, which robot {env.spec.name!r} does not have")
+    raise UserError(
+      f"fault 'friction' needs feet or wheels with a name, which robot {env.spec.name!r} does "
+      "not have"
+    )
   everything = tuple(sorted({i for _, hit in feet for i in hit}))
   feet = [("all", everything)] + feet
   names = tuple(name for name, _ in feet)
@@ -37,19 +42,31 @@ def friction(env) -> Fault:
 
   def act(hit, memory, severity, key, ports):
     value = read(ports, leaf)
-    return memory, {leaf: jnp.where(hit.reshape((-1,) + (1,) * (value.ndim - 1)), value * (1.0 - 0.95 * severity), value)}
+    return memory, {
+      leaf: jnp.where(
+        hit.reshape((-1,) + (1,) * (value.ndim - 1)), value * (1.0 - 0.95 * severity), value
+      )
+    }
+
   return fault("friction", env, (leaf,), names, act, rows=mask)
 
 
 def check_priority(env, geoms) -> None:
   """Raises UserError where a foot's friction is masked by what it stands on."""
   import mujoco
+
   model = env.mj_model
   floor = [g for g in range(model.ngeom) if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_PLANE]
-  masked = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, g) or str(g) for g in geoms
-            if any(model.geom_priority[g] <= model.geom_priority[f] for f in floor)]
+  masked = [
+    mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, g) or str(g)
+    for g in geoms
+    if any(model.geom_priority[g] <= model.geom_priority[f] for f in floor)
+  ]
   if masked:
-    raise UserError(f"fault 'friction': the floor masks the friction of {', '.join(masked)} in robot {env.spec.name!r}; give these geoms a higher priority")
+    raise UserError(
+      f"fault 'friction': the floor masks the friction of {', '.join(masked)} in robot "
+      f"{env.spec.name!r}; give these geoms a higher priority"
+    )
 
 
 def slope(env) -> Fault:
@@ -57,8 +74,10 @@ def slope(env) -> Fault:
 
     g' = |g| (sin(a) e - cos(a) z),   a = 20 degrees severity, e the direction downhill
 
-  Severity: 1 is a slope of 20 [degrees]. Target: where downhill is (drawn), forward, backward, left, right as far as the robot can move there. Owns
-  `mj.gravity` (3,) [m/s^2], or `task.gravity`. Source: slopes of Nagabandi et al. (learning_to_adapt), peers E; the range is this project's own choice.
+  Severity: 1 is a slope of 20 [degrees]. Target: where downhill is (drawn), forward, backward,
+  left, right as far as the robot can move there. Owns `mj.gravity` (3,) [m/s^2], or `task.gravity`.
+  Source: slopes of Nagabandi et al. (learning_to_adapt), peers E; the range is this project's own
+  choice.
   """
   names, directions = heading_targets(env, ("forward", "backward", "left", "right"))
   leaf = "task.gravity" if "gravity" in env.model.task else "mj.gravity"
@@ -66,47 +85,64 @@ def slope(env) -> Fault:
   def act(direction, memory, severity, key, ports):
     value = read(ports, leaf)
     angle = jnp.deg2rad(20.0) * severity
-    tilted = jnp.linalg.norm(value) * (jnp.sin(angle) * direction - jnp.cos(angle) * jnp.asarray([0.0, 0.0, 1.0]))
+    tilted = jnp.linalg.norm(value) * (
+      jnp.sin(angle) * direction - jnp.cos(angle) * jnp.asarray([0.0, 0.0, 1.0])
+    )
     return memory, {leaf: tilted}
+
   return fault("slope", env, (leaf,), names, act, rows=directions)
 
 
 def whole_mass(env) -> float:
   """Mass of the nominal robot [kg]."""
-  return float(np.asarray(env.model.task["mass"])) if "mass" in env.model.task else float(env.mj_model.body_mass.sum())
+  return (
+    float(np.asarray(env.model.task["mass"]))
+    if "mass" in env.model.task
+    else float(env.mj_model.body_mass.sum())
+  )
 
 
 def wind(env) -> Fault:
   """A steady force on the trunk.   F = 0.3 severity M g e [N]
 
-  Severity: 1 is 30 % of the weight [N]. Target: the direction of the wind in the world (drawn), forward (+x), backward, left, right as far as the robot
-  can move there. Owns `force` (nv,). Source: force faults of PEDM, Haider et al. 2023, peers B3; direction and range are this project's own choice.
+  Severity: 1 is 30 % of the weight [N]. Target: the direction of the wind in the world (drawn),
+  forward (+x), backward, left, right as far as the robot can move there. Owns `force` (nv,).
+  Source: force faults of PEDM, Haider et al. 2023, peers B3; direction and range are this project's
+  own choice.
   """
   names, directions = heading_targets(env, ("forward", "backward", "left", "right"))
   blows = 0.3 * 9.81 * whole_mass(env) * directions @ force_map(env)
 
   def act(blow, memory, severity, key, ports):
     return memory, {"force": ports.model.force + severity * blow}
+
   return fault("wind", env, ("force",), names, act, rows=blows)
 
 
 def push(env) -> Fault:
   """Blows to the trunk: every 100 control steps, for 4, each in a direction drawn anew.
 
-    F = severity M dv / (4 dt) e [N],   dv = 1.5 m/s, e = forward or backward (and sideways where the robot can move there)
+    F = severity M dv / (4 dt) e [N],   dv = 1.5 m/s, e = forward or backward (and sideways where
+      the robot can move there)
 
-  Severity: 1 changes the speed by 1.5 per blow [m/s] (Isaac Lab trains with 0.5, severity 1/3). Target: trunk, the only one. Owns `force` (nv,).
-  Memory: the direction of the latest blow. Source: pushes, facts 1.6 and 4.2.
+  Severity: 1 changes the speed by 1.5 per blow [m/s] (Isaac Lab trains with 0.5, severity 1/3).
+  Target: trunk, the only one. Owns `force` (nv,). Memory: the direction of the latest blow. Source:
+  pushes, facts 1.6 and 4.2.
   """
   _, directions = heading_targets(env, ("forward", "backward", "left", "right"))
-  blows = 1.5 * whole_mass(env) / (PUSH_FOR * env.spec.control_s) * directions @ force_map(env)  # (directions, nv)
+  blows = (
+    1.5 * whole_mass(env) / (PUSH_FOR * env.spec.control_s) * directions @ force_map(env)
+  )  # (directions, nv)
 
   def act(target, memory, severity, key, ports):
     phase = jnp.mod(ports.since, PUSH_EVERY)
     which = jnp.where(phase == 0, jax.random.randint(key, (), 0, directions.shape[0]), memory)
     strength = jnp.where(phase < PUSH_FOR, severity, 0.0)
     chosen = (jnp.arange(blows.shape[0]) == which)[:, None]
-    return which, {"force": ports.model.force + strength * jnp.sum(jnp.where(chosen, blows, 0.0), 0)}
+    return which, {
+      "force": ports.model.force + strength * jnp.sum(jnp.where(chosen, blows, 0.0), 0)
+    }
+
   return fault("push", env, ("force",), ("trunk",), act, jnp.int32(0))
 
 

@@ -1,4 +1,7 @@
-"""When a fault acts: a factor in [0, 1] on its severity, as a pure function of the control step. `SCHEDULES` (fault_presets.py) is the one table."""
+"""When a fault acts: a factor in [0, 1] on its severity, as a pure function of the control step.
+`SCHEDULES` (fault_presets.py) is the one table.
+"""
+
 from __future__ import annotations
 
 from typing import NamedTuple
@@ -7,11 +10,12 @@ import jax
 import jax.numpy as jnp
 
 from mjx_cl.errors import UserError
-from mjx_cl.fault_presets import FOREVER, SCHEDULES
+from mjx_cl.faults.presets import FOREVER, SCHEDULES
 
 
 class Plan(NamedTuple):
-  """When and how strongly faults act; arrays () or (F,), all of them traced: they change between calls without a new compilation.
+  """When and how strongly faults act; arrays () or (F,), all of them traced: they change between
+  calls without a new compilation.
 
   Attributes:
     severity: float32, at most reached.
@@ -19,6 +23,7 @@ class Plan(NamedTuple):
     kind: int32, index into SCHEDULES.
     period: int32, control steps, at least 1. share: float32 in [0, 1].
   """
+
   severity: jax.Array
   onset: jax.Array
   duration: jax.Array
@@ -27,7 +32,9 @@ class Plan(NamedTuple):
   share: jax.Array
 
 
-def plan(severity=0.0, onset=0, duration=FOREVER, schedule="abrupt", period=1000, share=0.5) -> Plan:
+def plan(
+  severity=0.0, onset=0, duration=FOREVER, schedule="abrupt", period=1000, share=0.5
+) -> Plan:
   """A Plan from numbers or arrays; `schedule` is a name or an array of indices."""
   if isinstance(schedule, str):
     if schedule not in SCHEDULES:
@@ -43,15 +50,20 @@ def spread(plan: Plan, faults: int) -> Plan:
 
 
 def abrupt(t: jax.Array, onset: jax.Array, duration: jax.Array) -> jax.Array:
-  """1 for onset <= t < onset + duration, else 0, float32 (). `onset`, `duration` in control steps; FOREVER is never repaired."""
+  """1 for onset <= t < onset + duration, else 0, float32 (). `onset`, `duration` in control steps;
+  FOREVER is never repaired.
+  """
   return ((t >= onset) & (t - onset < duration)).astype(jnp.float32)
 
 
 def factor(plan: Plan, walk: jax.Array, t: jax.Array) -> jax.Array:
-  """Share of the severity that is in force at control step t, float32, of the shape of the plan's leaves.
+  """Share of the severity that is in force at control step t, float32, of the shape of the plan's
+  leaves.
 
-    abrupt 1;  ramp min(1, (since + 1) / period);  intermittent 1 if (since mod period) < share period else 0;
-    cyclic (1 - cos(2 pi (since + 1) / period)) / 2;  random walk: `walk`                                    since = t - onset
+    abrupt 1;  ramp min(1, (since + 1) / period);  intermittent 1 if (since mod period) < share
+    period else 0;
+    cyclic (1 - cos(2 pi (since + 1) / period)) / 2;  random walk: `walk`
+      since = t - onset
   Exactly 0 before the onset and from onset + duration on.
   """
   since = t - plan.onset
@@ -71,10 +83,12 @@ def severity(plan: Plan, walk: jax.Array, t: jax.Array) -> jax.Array:
 
 
 def walk(plan: Plan, value: jax.Array, t: jax.Array, key: jax.Array) -> jax.Array:
-  """Where the random walk stands at control step t: a new step at the onset and every `period` after it, reflected at 0 and 1."""
+  """Where the random walk stands at control step t: a new step at the onset and every `period`
+  after it, reflected at 0 and 1.
+  """
   since = t - plan.onset
   due = (since >= 0) & (jnp.mod(since, plan.period) == 0)
   moved = value + plan.share * jax.random.normal(key, value.shape)
-  moved = jnp.abs(moved)                                    # reflected at 0
-  moved = jnp.clip(1.0 - jnp.abs(1.0 - moved), 0.0, 1.0)    # and at 1
+  moved = jnp.abs(moved)  # reflected at 0
+  moved = jnp.clip(1.0 - jnp.abs(1.0 - moved), 0.0, 1.0)  # and at 1
   return jnp.where(due, moved, value)

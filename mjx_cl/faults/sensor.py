@@ -1,8 +1,11 @@
-"""Faults of what the robot senses. They act where an observation arrives: the agent, its replay and the monitor see the same faulty one.
+"""Faults of what the robot senses. They act where an observation arrives: the agent, its replay and
+the monitor see the same faulty one.
 
-`scale` of a channel is spec.obs[i].scale, its typical deviation on the healthy robot [unit of the channel]. A target is a group of channels, all, or
-one channel; a target that is not named is drawn from the groups. Where a fault remembers, an episode's start fills its memory anew.
+`scale` of a channel is spec.obs[i].scale, its typical deviation on the healthy robot [unit of the
+channel]. A target is a group of channels, all, or one channel; a target that is not named is drawn
+from the groups. Where a fault remembers, an episode's start fills its memory anew.
 """
+
 from __future__ import annotations
 
 import jax
@@ -11,154 +14,241 @@ import jax.numpy as jnp
 from mjx_cl.errors import UserError
 from mjx_cl.faults.base import Fault, channel_targets, fault
 
-MOST_DELAY = 9        # control steps at severity 1
-BURST = (0.1, 10)     # at severity 1: probability that one begins, control steps that it lasts; the hard level of realworldrl_suite
-DRIFT_STEPS = 2000    # control steps until a drift is complete
+MOST_DELAY = 9  # control steps at severity 1
+BURST = (
+  0.1,
+  10,
+  # at severity 1: probability that one begins, control steps that it lasts; the hard level of
+  # realworldrl_suite
+)
+DRIFT_STEPS = 2000  # control steps until a drift is complete
 
 
 def _sensor(name, env, change, memory=(), not_monotone=""):
-  """A fault of the observation alone; change(memory, severity, key, ports, scale) -> (memory', obs')."""
+  """A fault of the observation alone; change(memory, severity, key, ports, scale) -> (memory',
+  obs').
+  """
   names, mask, single = channel_targets(env)
   scale = jnp.asarray([v.scale for v in env.spec.obs], jnp.float32)
 
   def act(hit, memory, severity, key, ports):
     memory, value = change(memory, severity, key, ports, scale)
     return memory, {"obs": jnp.where(hit, value, ports.obs)}
+
   return fault(name, env, ("obs",), names, act, memory, single, not_monotone, mask)
 
 
 def bias(env) -> Fault:
   """A constant is added to a reading.   x_i' = x_i + 2 severity scale_i
 
-  Severity: 1 is two typical deviations [unit of the channel]. Target: a group of channels (drawn), all, or one channel. Owns `obs`. Source: bias
-  drift, which isaac-sim/IsaacLab#7451 asks for, peers 0, here as a step; the range is this project's own choice.
+  Severity: 1 is two typical deviations [unit of the channel]. Target: a group of channels (drawn),
+  all, or one channel. Owns `obs`. Source: bias drift, which isaac-sim/IsaacLab#7451 asks for, peers
+  0, here as a step; the range is this project's own choice.
   """
-  return _sensor("bias", env, lambda m, severity, key, ports, scale: (m, ports.obs + 2.0 * severity * scale))
+  return _sensor(
+    "bias", env, lambda m, severity, key, ports, scale: (m, ports.obs + 2.0 * severity * scale)
+  )
 
 
 def drift(env) -> Fault:
-  """A reading wanders off in a straight line.   x_i' = x_i + 2 severity scale_i min(1, (since + 1) / 2,000)
+  """A reading wanders off in a straight line.   x_i' = x_i + 2 severity scale_i min(1, (since + 1)
+    / 2,000)
 
-  Severity: 1 ends two typical deviations off [unit of the channel], 2,000 control steps after the onset. Target: a group of channels
-  (drawn), all, or one channel. Owns `obs`. Source: sensor drift of Danesh and Fern 2021, peers B3; the range is this project's own choice.
+  Severity: 1 ends two typical deviations off [unit of the channel], 2,000 control steps after the
+  onset. Target: a group of channels (drawn), all, or one channel. Owns `obs`. Source: sensor drift
+  of Danesh and Fern 2021, peers B3; the range is this project's own choice.
   """
+
   def change(m, severity, key, ports, scale):
     share = jnp.clip((ports.since + 1) / DRIFT_STEPS, 0.0, 1.0)
     return m, ports.obs + 2.0 * severity * scale * share
+
   return _sensor("drift", env, change)
 
 
 def scale(env) -> Fault:
   """A sensor's gain falls.   x_i' = x_i (1 - 0.9 severity)
 
-  Severity: 1 leaves a tenth of the gain [1]. Target: a group of channels (drawn), all, or one channel. Owns `obs`. Not visible to: a channel that
-  reads 0. Source: calibration faults (a reading times a constant) of Danesh and Fern 2021, peers B3; the range is this project's own choice.
+  Severity: 1 leaves a tenth of the gain [1]. Target: a group of channels (drawn), all, or one
+  channel. Owns `obs`. Not visible to: a channel that reads 0. Source: calibration faults (a reading
+  times a constant) of Danesh and Fern 2021, peers B3; the range is this project's own choice.
   """
-  return _sensor("scale", env, lambda m, severity, key, ports, _: (m, ports.obs * (1.0 - 0.9 * severity)))
+  return _sensor(
+    "scale", env, lambda m, severity, key, ports, _: (m, ports.obs * (1.0 - 0.9 * severity))
+  )
 
 
 def noise(env) -> Fault:
   """Gaussian noise on a reading.   x_i' = x_i + n,  n ~ N(0, (severity scale_i)^2)
 
-  Severity: standard deviation [typical deviations]; realworldrl_suite's levels are 0.1, 0.3, 1.0 in raw units. Target: a group of
-  channels (drawn), all, or one channel. Owns `obs`. Source: facts 4.5.
+  Severity: standard deviation [typical deviations]; realworldrl_suite's levels are 0.1, 0.3, 1.0 in
+  raw units. Target: a group of channels (drawn), all, or one channel. Owns `obs`. Source: facts
+  4.5.
   """
-  return _sensor("noise", env, lambda m, severity, key, ports, scale: (m, ports.obs + severity * scale * jax.random.normal(key, scale.shape)))
+  return _sensor(
+    "noise",
+    env,
+    lambda m, severity, key, ports, scale: (
+      m,
+      ports.obs + severity * scale * jax.random.normal(key, scale.shape),
+    ),
+  )
 
 
 def dropout(env) -> Fault:
-  """A reading is lost now and then: 0 in its place.   P(x_i' = 0) = 0.5 severity, each channel and step alone
+  """A reading is lost now and then: 0 in its place.   P(x_i' = 0) = 0.5 severity, each channel and
+    step alone
 
   A loss lasts one control step; those of `dropout_burst` last longer.
 
-  Severity: 1 loses every other reading [probability]; realworldrl_suite has 0.01, 0.05, 0.1. Target: a group of channels (drawn), all,
-  or one channel. Owns `obs`. Not visible to: a channel that reads 0. Source: dropped observations of realworldrl_suite, facts 4.5.
+  Severity: 1 loses every other reading [probability]; realworldrl_suite has 0.01, 0.05, 0.1.
+  Target: a group of channels (drawn), all, or one channel. Owns `obs`. Not visible to: a channel
+  that reads 0. Source: dropped observations of realworldrl_suite, facts 4.5.
   """
-  return _sensor("dropout", env, lambda m, severity, key, ports, _: (
-      m, jnp.where(jax.random.uniform(key, ports.obs.shape) < 0.5 * severity, 0.0, ports.obs)))
+  return _sensor(
+    "dropout",
+    env,
+    lambda m, severity, key, ports, _: (
+      m,
+      jnp.where(jax.random.uniform(key, ports.obs.shape) < 0.5 * severity, 0.0, ports.obs),
+    ),
+  )
 
 
 def freeze(env) -> Fault:
-  """A reading stands still: it is not renewed.   P(x_i'(t) = x_i'(t - 1)) = severity, each channel and step alone
+  """A reading stands still: it is not renewed.   P(x_i'(t) = x_i'(t - 1)) = severity, each channel
+    and step alone
 
-  A draw holds for one control step; a reading stands for longer only where draws repeat it, in `freeze_burst` for a while at once.
+  A draw holds for one control step; a reading stands for longer only where draws repeat it, in
+  `freeze_burst` for a while at once.
 
-  Severity: how likely a reading is held for another step [probability]; 1 holds it for ever. Target: a group of channels (drawn), all, or one channel.
-  Owns `obs`. Memory: the last reading; an episode's start renews it. Not visible to: a channel that does not change. Source: stuck sensors of
-  realworldrl_suite, facts 4.5.
+  Severity: how likely a reading is held for another step [probability]; 1 holds it for ever.
+  Target: a group of channels (drawn), all, or one channel. Owns `obs`. Memory: the last reading; an
+  episode's start renews it. Not visible to: a channel that does not change. Source: stuck sensors
+  of realworldrl_suite, facts 4.5.
   """
+
   def change(held, severity, key, ports, _):
     hold = (jax.random.uniform(key, ports.obs.shape) < severity) & ~jnp.asarray(ports.first)
     value = jnp.where(hold, held, ports.obs)
     return value, value
+
   return _sensor("freeze", env, change, jnp.zeros(len(env.spec.obs)))
 
 
 def _burst(left, severity, key, ports):
-  """Control steps (O,) that the burst of each channel still lasts, this one included; a new one may begin where none is under way."""
+  """Control steps (O,) that the burst of each channel still lasts, this one included; a new one may
+  begin where none is under way.
+  """
   begins = jax.random.uniform(key, ports.obs.shape) < BURST[0] * severity
-  lasts = jnp.maximum(1, jnp.ceil(BURST[1] * severity - 1e-4).astype(jnp.int32))  # 0.1, 0.5, 1 are 1, 5, 10, whatever float32 makes of them
+  lasts = jnp.maximum(
+    1, jnp.ceil(BURST[1] * severity - 1e-4).astype(jnp.int32)
+  )  # 0.1, 0.5, 1 are 1, 5, 10, whatever float32 makes of them
   left = jnp.where(ports.first, 0, left)
   return jnp.where(left > 0, left, jnp.where(begins, lasts, 0))
 
 
 def dropout_burst(env) -> Fault:
-  """A reading is lost now and then for a while: 0 in its place.   A burst begins with P = 0.1 severity, each channel alone, and lasts ceil(10 severity) control steps
+  """A reading is lost now and then for a while: 0 in its place.   A burst begins with P = 0.1
+    severity, each channel alone, and lasts ceil(10 severity) control steps
 
-  Severity: 0.1, 0.5, 1 are realworldrl_suite's easy, medium and hard: probability 0.01, 0.05, 0.1 [1], length 1, 5, 10 [control steps]. Target: a group of channels
-  (drawn), all, or one channel. Owns `obs`. Memory: how long a burst still lasts; an episode's start ends it. Not visible to: a channel that reads 0. Source: dropped
-  observations of realworldrl_suite, facts 4.5.
+  Severity: 0.1, 0.5, 1 are realworldrl_suite's easy, medium and hard: probability 0.01, 0.05, 0.1
+  [1], length 1, 5, 10 [control steps]. Target: a group of channels (drawn), all, or one channel.
+  Owns `obs`. Memory: how long a burst still lasts; an episode's start ends it. Not visible to: a
+  channel that reads 0. Source: dropped observations of realworldrl_suite, facts 4.5.
   """
+
   def change(left, severity, key, ports, _):
     left = _burst(left, severity, key, ports)
     return jnp.maximum(left - 1, 0), jnp.where(left > 0, 0.0, ports.obs)
+
   return _sensor("dropout_burst", env, change, jnp.zeros(len(env.spec.obs), jnp.int32))
 
 
 def freeze_burst(env) -> Fault:
-  """A reading stands still now and then for a while.   A burst begins with P = 0.1 severity, each channel alone, and holds the last reading for ceil(10 severity) control steps
+  """A reading stands still now and then for a while.   A burst begins with P = 0.1 severity, each
+    channel alone, and holds the last reading for ceil(10 severity) control steps
 
-  Severity: 0.1, 0.5, 1 are realworldrl_suite's easy, medium and hard: probability 0.01, 0.05, 0.1 [1], length 1, 5, 10 [control steps]. Target: a group of channels
-  (drawn), all, or one channel. Owns `obs`. Memory: the last reading and how long it is still held; an episode's start renews it. Not visible to: a channel that does
-  not change. Source: stuck sensors of realworldrl_suite, facts 4.5.
+  Severity: 0.1, 0.5, 1 are realworldrl_suite's easy, medium and hard: probability 0.01, 0.05, 0.1
+  [1], length 1, 5, 10 [control steps]. Target: a group of channels (drawn), all, or one channel.
+  Owns `obs`. Memory: the last reading and how long it is still held; an episode's start renews it.
+  Not visible to: a channel that does not change. Source: stuck sensors of realworldrl_suite, facts
+  4.5.
   """
+
   def change(memory, severity, key, ports, _):
     left, held = memory
     left = jnp.where(jnp.asarray(ports.first), 0, _burst(left, severity, key, ports))
     value = jnp.where(left > 0, held, ports.obs)
     return (jnp.maximum(left - 1, 0), value), value
-  return _sensor("freeze_burst", env, change, (jnp.zeros(len(env.spec.obs), jnp.int32), jnp.zeros(len(env.spec.obs))))
+
+  return _sensor(
+    "freeze_burst",
+    env,
+    change,
+    (jnp.zeros(len(env.spec.obs), jnp.int32), jnp.zeros(len(env.spec.obs))),
+  )
 
 
 def delay(env) -> Fault:
   """A reading arrives late.   x_i'(t) = x_i(t - d),  d = ceil(9 severity) control steps
 
-  Severity: 1/3, 2/3, 1 are delays of 3, 6, 9 [control steps], realworldrl_suite's easy, medium, hard. Target: a group of channels
-  (drawn), all, or one channel. Owns `obs`. Memory: the last 9 readings; an episode's start fills it with its first reading. Source: facts 4.5.
+  Severity: 1/3, 2/3, 1 are delays of 3, 6, 9 [control steps], realworldrl_suite's easy, medium,
+  hard. Target: a group of channels (drawn), all, or one channel. Owns `obs`. Memory: the last 9
+  readings; an episode's start fills it with its first reading. Source: facts 4.5.
   """
+
   def change(line, severity, key, ports, _):
-    line = jnp.where(ports.first, jnp.broadcast_to(ports.obs, line.shape), jnp.concatenate([ports.obs[None], line[:-1]]))
+    line = jnp.where(
+      ports.first,
+      jnp.broadcast_to(ports.obs, line.shape),
+      jnp.concatenate([ports.obs[None], line[:-1]]),
+    )
     return line, line[jnp.ceil(MOST_DELAY * severity).astype(jnp.int32)]
-  return _sensor("delay", env, change, jnp.zeros((MOST_DELAY + 1, len(env.spec.obs))), "an older reading may be nearer to the present one")
+
+  return _sensor(
+    "delay",
+    env,
+    change,
+    jnp.zeros((MOST_DELAY + 1, len(env.spec.obs))),
+    "an older reading may be nearer to the present one",
+  )
 
 
 def lidar_loss(env) -> Fault:
-  """Beams of a sector return nothing: they read the greatest range.   x_i' = high_i for the first ceil(severity n) of the sector's n beams
+  """Beams of a sector return nothing: they read the greatest range.   x_i' = high_i for the first
+    ceil(severity n) of the sector's n beams
 
-  Severity: share of the sector that is blind [1]; 1 is all of it. Target: a group of beams (drawn). Owns `obs`. Not visible to: beams that see no
-  wall. Source: none; fault and range are this project's own choice.
+  Severity: share of the sector that is blind [1]; 1 is all of it. Target: a group of beams (drawn).
+  Owns `obs`. Not visible to: beams that see no wall. Source: none; fault and range are this
+  project's own choice.
   """
   beams = [(name, index) for name, index in env.spec.obs_groups if name.startswith("lidar")]
   if not beams:
-    raise UserError(f"fault 'lidar_loss' needs a lidar, which robot {env.spec.name!r} does not have")
+    raise UserError(
+      f"fault 'lidar_loss' needs a lidar, which robot {env.spec.name!r} does not have"
+    )
   size = len(env.spec.obs)
-  rank = jnp.asarray([[hit.index(i) / len(hit) if i in hit else 2.0 for i in range(size)] for _, hit in beams])  # place in the sector, 2 outside it
+  rank = jnp.asarray(
+    [[hit.index(i) / len(hit) if i in hit else 2.0 for i in range(size)] for _, hit in beams]
+  )  # place in the sector, 2 outside it
   high = jnp.asarray([v.high if v.high < 1e9 else 0.0 for v in env.spec.obs], jnp.float32)
 
   def act(place, memory, severity, key, ports):
     return memory, {"obs": jnp.where(place < severity, high, ports.obs)}
+
   return fault("lidar_loss", env, ("obs",), [name for name, _ in beams], act, rows=rank)
 
 
-SENSOR = {"bias": bias, "drift": drift, "scale": scale, "noise": noise, "dropout": dropout, "freeze": freeze, "dropout_burst": dropout_burst,
-          "freeze_burst": freeze_burst, "delay": delay, "lidar_loss": lidar_loss}
+SENSOR = {
+  "bias": bias,
+  "drift": drift,
+  "scale": scale,
+  "noise": noise,
+  "dropout": dropout,
+  "freeze": freeze,
+  "dropout_burst": dropout_burst,
+  "freeze_burst": freeze_burst,
+  "delay": delay,
+  "lidar_loss": lidar_loss,
+}

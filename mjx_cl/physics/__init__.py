@@ -1,18 +1,23 @@
 """Two physics backends behind one interface.
 
-  native   C MuJoCo, the whole batch of a vmap stepped by mjbatch in one host callback; needs no compile time
-  mjx      the same model in pure JAX; for a GPU, and as the reference that parity is measured against
+  native   C MuJoCo, the whole batch of a vmap stepped by mjbatch in one host callback; needs no
+    compile time
+  mjx      the same model in pure JAX; for a GPU, and as the reference that parity is measured
+    against
 
-Both offer `init(qpos, qvel) -> state` and `step(fields, state, ctrl, task, force) -> (state, out)` for one robot, where `fields` maps
-MuJoCo field names (mjModel's and `gravity` of mjOption) to arrays that replace the model's own for this call, `force` (nv,) is a
-generalised force applied from outside [N, N m] or None, and `out` maps MjData names to float32 arrays.
+Both offer `init(qpos, qvel) -> state` and `step(fields, state, ctrl, task, force) -> (state, out)`
+for one robot, where `fields` maps MuJoCo field names (mjModel's and `gravity` of mjOption) to
+arrays that replace the model's own for this call, `force` (nv,) is a generalised force applied from
+outside [N, N m] or None, and `out` maps MjData names to float32 arrays.
 
-A motor law `law(xp, task, ctrl, qpos, qvel) -> (..., nu)` turns what the agent commands into what the actuators get, at every physics step.
-`xp` is numpy (native, the whole batch: ctrl (N, A), qpos (N, nq), qvel (N, nv), task name -> (N, ...)) or jax.numpy (one robot, no leading
-axis), so it is written with `xp` alone and with `...` indices. `task` holds the leaves of types.Model.task.
+A motor law `law(xp, task, ctrl, qpos, qvel) -> (..., nu)` turns what the agent commands into what
+the actuators get, at every physics step. `xp` is numpy (native, the whole batch: ctrl (N, A), qpos
+(N, nq), qvel (N, nv), task name -> (N, ...)) or jax.numpy (one robot, no leading axis), so it is
+written with `xp` alone and with `...` indices. `task` holds the leaves of types.Model.task.
 """
-from mjx_cl import runtime
+
 from mjx_cl.errors import UserError
+from mjx_cl.io import runtime
 
 # model fields after whose change MuJoCo asks for mj_setConst
 DERIVING = ("body_mass", "body_inertia", "body_ipos", "body_iquat", "dof_armature", "qpos0")
@@ -24,9 +29,11 @@ def make(name: str, mj_model, substeps: int, outputs: tuple[str, ...] = ("qpos",
     name = runtime.default_physics()
   if name == "native":
     from mjx_cl.physics.native import Native
+
     return Native(mj_model, substeps, outputs, law)
   if name == "mjx":
     from mjx_cl.physics.mjx import Mjx
+
     return Mjx(mj_model, substeps, outputs, law)
   raise UserError(f"unknown physics {name!r}; choose from: auto, native, mjx")
 
@@ -34,5 +41,6 @@ def make(name: str, mj_model, substeps: int, outputs: tuple[str, ...] = ("qpos",
 def leaves(mj_model, *names: str) -> dict:
   """Nominal values of model fields as float32 arrays, for types.Model.mj; `gravity` is mjOption's."""
   import jax.numpy as jnp
+
   value = lambda name: mj_model.opt.gravity if name == "gravity" else getattr(mj_model, name)
   return {name: jnp.asarray(value(name), jnp.float32) for name in names}

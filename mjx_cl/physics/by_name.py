@@ -1,14 +1,19 @@
 """Host functions that compiled programs call by name.
 
-A program with jax.pure_callback holds the address of its Python function, so that JAX cannot keep it in the compile cache: it is compiled anew in every process and for
-every instance of a robot, some 4 s for the walker's rollout. A call through XLA's foreign function interface names its target instead. `call` gives every program the one target
-`mjx_cl_host`, a C function pointer that ctypes makes of a Python function, and the name of the host function as an attribute. Names must say all that the function's
-results depend on: a program from the cache calls whatever this process has registered under the name that it was compiled with. A call also costs a fifth of a
-pure_callback's (results/host_call.json).
+A program with jax.pure_callback holds the address of its Python function, so that JAX cannot keep
+it in the compile cache: it is compiled anew in every process and for every instance of a robot,
+some 4 s for the walker's rollout. A call through XLA's foreign function interface names its target
+instead. `call` gives every program the one target `mjx_cl_host`, a C function pointer that ctypes
+makes of a Python function, and the name of the host function as an attribute. Names must say all
+that the function's results depend on: a program from the cache calls whatever this process has
+registered under the name that it was compiled with. A call also costs a fifth of a pure_callback's
+(results/host_call.json).
 
-Struct layouts: xla/ffi/api/c_api.h (API 0.3), which jaxlib ships; XLA only appends to them, and asks for the version when the target is registered. Where that
-fails (another jaxlib), `call` is a pure_callback as before.
+Struct layouts: xla/ffi/api/c_api.h (API 0.3), which jaxlib ships; XLA only appends to them, and
+asks for the version when the target is registered. Where that fails (another jaxlib), `call` is a
+pure_callback as before.
 """
+
 from __future__ import annotations
 
 import ctypes
@@ -21,25 +26,69 @@ import jax
 import numpy as np
 
 TARGET = "mjx_cl_host"
-_METADATA, _EXECUTE, _INTERNAL = 1, 3, 13  # XLA_FFI_Extension_Metadata, XLA_FFI_ExecutionStage_EXECUTE, XLA_FFI_Error_Code_INTERNAL
+_METADATA, _EXECUTE, _INTERNAL = (
+  1,
+  3,
+  13,
+)  # XLA_FFI_Extension_Metadata, XLA_FFI_ExecutionStage_EXECUTE, XLA_FFI_Error_Code_INTERNAL
 _P, _N = ctypes.c_void_p, ctypes.c_size_t
 
 
 def _struct(*fields):
   """A struct of the interface: its size, its extensions, then `fields`."""
-  return type("Struct", (ctypes.Structure,), {"_fields_": [("struct_size", _N), ("extension", _P), *fields]})
+  return type(
+    "Struct", (ctypes.Structure,), {"_fields_": [("struct_size", _N), ("extension", _P), *fields]}
+  )
 
 
 _Version = _struct(("major", ctypes.c_int), ("minor", ctypes.c_int))
-_Metadata = type("Metadata", (ctypes.Structure,), {"_fields_": [("struct_size", _N), ("version", _Version), ("traits", ctypes.c_uint32)]})
-_Extension = type("Extension", (ctypes.Structure,), {"_fields_": [("struct_size", _N), ("type", ctypes.c_int), ("next", _P), ("metadata", ctypes.POINTER(_Metadata))]})
+_Metadata = type(
+  "Metadata",
+  (ctypes.Structure,),
+  {"_fields_": [("struct_size", _N), ("version", _Version), ("traits", ctypes.c_uint32)]},
+)
+_Extension = type(
+  "Extension",
+  (ctypes.Structure,),
+  {
+    "_fields_": [
+      ("struct_size", _N),
+      ("type", ctypes.c_int),
+      ("next", _P),
+      ("metadata", ctypes.POINTER(_Metadata)),
+    ]
+  },
+)
 _Span = type("Span", (ctypes.Structure,), {"_fields_": [("data", _P), ("size", _N)]})
-_Buffer = _struct(("dtype", ctypes.c_int), ("data", _P), ("rank", ctypes.c_int64), ("dims", ctypes.POINTER(ctypes.c_int64)))
-_Buffers = _struct(("size", ctypes.c_int64), ("types", _P), ("at", ctypes.POINTER(ctypes.POINTER(_Buffer))))
-_Attributes = _struct(("size", ctypes.c_int64), ("types", _P), ("names", _P), ("at", ctypes.POINTER(ctypes.POINTER(_Span))))
+_Buffer = _struct(
+  ("dtype", ctypes.c_int),
+  ("data", _P),
+  ("rank", ctypes.c_int64),
+  ("dims", ctypes.POINTER(ctypes.c_int64)),
+)
+_Buffers = _struct(
+  ("size", ctypes.c_int64), ("types", _P), ("at", ctypes.POINTER(ctypes.POINTER(_Buffer)))
+)
+_Attributes = _struct(
+  ("size", ctypes.c_int64),
+  ("types", _P),
+  ("names", _P),
+  ("at", ctypes.POINTER(ctypes.POINTER(_Span))),
+)
 _ErrorArgs = _struct(("message", ctypes.c_char_p), ("code", ctypes.c_int))
-_Api = _struct(("version", _Version), ("internal", _P), ("error_create", ctypes.CFUNCTYPE(_P, ctypes.POINTER(_ErrorArgs))))
-_Frame = _struct(("api", ctypes.POINTER(_Api)), ("context", _P), ("stage", ctypes.c_int), ("args", _Buffers), ("results", _Buffers), ("attributes", _Attributes))
+_Api = _struct(
+  ("version", _Version),
+  ("internal", _P),
+  ("error_create", ctypes.CFUNCTYPE(_P, ctypes.POINTER(_ErrorArgs))),
+)
+_Frame = _struct(
+  ("api", ctypes.POINTER(_Api)),
+  ("context", _P),
+  ("stage", ctypes.c_int),
+  ("args", _Buffers),
+  ("results", _Buffers),
+  ("attributes", _Attributes),
+)
 
 _functions: weakref.WeakValueDictionary = weakref.WeakValueDictionary()
 _lock = threading.Lock()
@@ -48,15 +97,21 @@ _BETWEEN = "|"  # in an attribute: between name and word
 
 def _array(buffer: _Buffer) -> np.ndarray:
   """The buffer's numbers, uint32, without a copy."""
-  shape = buffer.dims[:buffer.rank]
+  shape = buffer.dims[: buffer.rank]
   size = 4 * int(np.prod(shape, dtype=np.int64))
-  return np.frombuffer((ctypes.c_char * size).from_address(buffer.data), np.uint32).reshape(shape) if size else np.zeros(shape, np.uint32)
+  return (
+    np.frombuffer((ctypes.c_char * size).from_address(buffer.data), np.uint32).reshape(shape)
+    if size
+    else np.zeros(shape, np.uint32)
+  )
 
 
 def _look_up(name: str, word: str):
   function = _functions.get(name)
   if function is None:
-    raise LookupError(f"the host function {name} of this program is gone; keep its robot for as long as the program")
+    raise LookupError(
+      f"the host function {name} of this program is gone; keep its robot for as long as the program"
+    )
   return functools.partial(function, word)
 
 
@@ -102,7 +157,9 @@ def registered() -> bool:
 
 
 def shared(name: str, make):
-  """What is registered under `name`, or else `make()`, registered for as long as someone holds it: a function (word, uint32 array) -> uint32 array."""
+  """What is registered under `name`, or else `make()`, registered for as long as someone holds it:
+  a function (word, uint32 array) -> uint32 array.
+  """
   if _BETWEEN in name:
     raise ValueError(f"a name without {_BETWEEN!r}, not {name!r}")
   with _lock:
@@ -113,11 +170,17 @@ def shared(name: str, make):
 
 
 def call(name: str, word: str, width: int, operand: jax.Array) -> jax.Array:
-  """The function `name` on (word, operand), uint32 (n,) -> (width,); under vmap one call on (..., n) -> (..., width).
+  """The function `name` on (word, operand), uint32 (n,) -> (width,); under vmap one call on (...,
+  n) -> (..., width).
 
-  Its operand is read-only memory of the program, valid during the call. An exception ends the program, with its traceback in the message.
+  Its operand is read-only memory of the program, valid during the call. An exception ends the
+  program, with its traceback in the message.
   """
   shape = jax.ShapeDtypeStruct((width,), np.uint32)
   if jax.default_backend() == "cpu" and registered():
-    return jax.ffi.ffi_call(TARGET, shape, vmap_method="broadcast_all")(operand, name=name + _BETWEEN + word)
-  return jax.pure_callback(lambda x: _look_up(name, word)(np.asarray(x)), shape, operand, vmap_method="broadcast_all")
+    return jax.ffi.ffi_call(TARGET, shape, vmap_method="broadcast_all")(
+      operand, name=name + _BETWEEN + word
+    )
+  return jax.pure_callback(
+    lambda x: _look_up(name, word)(np.asarray(x)), shape, operand, vmap_method="broadcast_all"
+  )

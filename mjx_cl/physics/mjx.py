@@ -1,4 +1,5 @@
 """The same MuJoCo model in pure JAX."""
+
 from __future__ import annotations
 
 import contextlib
@@ -12,15 +13,26 @@ import numpy as np
 from mjx_cl.errors import UserError
 from mjx_cl.physics import DERIVING
 
-with contextlib.redirect_stdout(io.StringIO()):  # the import prints a line on standard output when warp is absent
+with contextlib.redirect_stdout(
+  io.StringIO()
+):  # the import prints a line on standard output when warp is absent
   from mujoco import mjx
 
 
 class Mjx:
-  """MuJoCo XLA. Arguments and methods as `native.Native`; float32 throughout; state is an `mjx.Data`."""
+  """MuJoCo XLA. Arguments and methods as `native.Native`; float32 throughout; state is an
+  `mjx.Data`.
+  """
+
   name = "mjx"
 
-  def __init__(self, mj_model: mujoco.MjModel, substeps: int, outputs: tuple[str, ...] = ("qpos", "qvel"), law=None):
+  def __init__(
+    self,
+    mj_model: mujoco.MjModel,
+    substeps: int,
+    outputs: tuple[str, ...] = ("qpos", "qvel"),
+    law=None,
+  ):
     self.mj_model, self.substeps, self.outputs, self.law = mj_model, substeps, tuple(outputs), law
     self._forward = any(o not in ("qpos", "qvel") for o in outputs)
     self._model = _anywhere(mjx.put_model(mj_model, impl="jax"))
@@ -28,16 +40,22 @@ class Mjx:
 
   def init(self, qpos: jax.Array, qvel: jax.Array):
     """mjx.Data at qpos (nq,), qvel (nv,)."""
-    return self._data.replace(qpos=jnp.asarray(qpos, jnp.float32), qvel=jnp.asarray(qvel, jnp.float32))
+    return self._data.replace(
+      qpos=jnp.asarray(qpos, jnp.float32), qvel=jnp.asarray(qvel, jnp.float32)
+    )
 
   def model(self, fields: dict[str, jax.Array]):
     """The mjx.Model with `fields` in place of its own, and the constants that follow from them.
 
     Raises:
-      UserError for a field without effect here: MJX decides at compile time which constraints exist.
+      UserError for a field without effect here: MJX decides at compile time which constraints
+        exist.
     """
     if "dof_frictionloss" in fields and not (self.mj_model.dof_frictionloss > 0).any():
-      raise UserError("dof_frictionloss: MJX builds no friction constraint for a model whose joints have none, so it would do nothing; choose physics native")
+      raise UserError(
+        "dof_frictionloss: MJX builds no friction constraint for a model whose joints have "
+        "none, so it would do nothing; choose physics native"
+      )
     fields = dict(fields)
     model = self._model
     if "gravity" in fields:
@@ -48,22 +66,31 @@ class Mjx:
     return model
 
   def derived(self, model) -> dict[str, jax.Array]:
-    """What mj_setConst recomputes of masses and MJX uses, in pure JAX at qpos0: no interpolation, so faults of mass may be combined.
+    """What mj_setConst recomputes of masses and MJX uses, in pure JAX at qpos0: no interpolation,
+    so faults of mass may be combined.
 
-      body_subtreemass_b = sum of masses below b
-      dof_invweight0     = diagonal of M^-1, averaged over the rotations and over the translations of a free or ball joint
-      body_invweight0_b  = mean diagonal of J M^-1 J^T, J (3, nv) of b's centre of mass, for translation and rotation
+    body_subtreemass_b = sum of masses below b
+    dof_invweight0     = diagonal of M^-1, averaged over the rotations and over the translations of
+      a free or ball joint
+    body_invweight0_b  = mean diagonal of J M^-1 J^T, J (3, nv) of b's centre of mass, for
+    translation and rotation
     """
     m, host = model, self.mj_model
     data = mjx.com_pos(m, mjx.kinematics(m, self._data.replace(qpos=m.qpos0)))
     mass = mjx.full_m(m, mjx.crb(m, data))
     inverse = jnp.linalg.inv(mass)
-    children = jnp.asarray([[_below(host, b, root) for b in range(host.nbody)] for root in range(host.nbody)], jnp.float32)
+    children = jnp.asarray(
+      [[_below(host, b, root) for b in range(host.nbody)] for root in range(host.nbody)],
+      jnp.float32,
+    )
     dof = jnp.diag(inverse)
     for j in range(host.njnt):
       at = host.jnt_dofadr[j]
-      for begin in {mujoco.mjtJoint.mjJNT_FREE: (at, at + 3), mujoco.mjtJoint.mjJNT_BALL: (at,)}.get(host.jnt_type[j], ()):
-        dof = dof.at[begin:begin + 3].set(jnp.mean(dof[begin:begin + 3]))
+      for begin in {
+        mujoco.mjtJoint.mjJNT_FREE: (at, at + 3),
+        mujoco.mjtJoint.mjJNT_BALL: (at,),
+      }.get(host.jnt_type[j], ()):
+        dof = dof.at[begin : begin + 3].set(jnp.mean(dof[begin : begin + 3]))
     weights = [jnp.zeros(2)]
     for b in range(1, host.nbody):
       if host.body_weldid[b] == 0:
@@ -71,7 +98,11 @@ class Mjx:
         continue
       jacobians = mjx.jac(m, data, data.xipos[b], b)  # (nv, 3) each
       weights.append(jnp.stack([jnp.trace(j.T @ inverse @ j) / 3 for j in jacobians]))
-    return {"body_subtreemass": children @ m.body_mass, "dof_invweight0": dof, "body_invweight0": jnp.stack(weights)}
+    return {
+      "body_subtreemass": children @ m.body_mass,
+      "dof_invweight0": dof,
+      "body_invweight0": jnp.stack(weights),
+    }
 
   def step(self, fields: dict[str, jax.Array], state, ctrl: jax.Array, task=None, force=None):
     model = self.model(fields)
@@ -80,13 +111,19 @@ class Mjx:
     extra = {}
     if self.law is None:
       state = state.replace(ctrl=jnp.asarray(ctrl, state.ctrl.dtype))
-      state, _ = jax.lax.scan(lambda d, _: (mjx.step(model, d), None), state, None, length=self.substeps)
+      state, _ = jax.lax.scan(
+        lambda d, _: (mjx.step(model, d), None), state, None, length=self.substeps
+      )
     else:
+
       def one(carry, _):
         d = carry[0]
         actuators = jnp.asarray(self.law(jnp, task, ctrl, d.qpos, d.qvel), d.ctrl.dtype)
         return (mjx.step(model, d.replace(ctrl=actuators)), actuators, d.qvel), None
-      (state, actuators, before), _ = jax.lax.scan(one, (state, state.ctrl, state.qvel), None, length=self.substeps)
+
+      (state, actuators, before), _ = jax.lax.scan(
+        one, (state, state.ctrl, state.qvel), None, length=self.substeps
+      )
       extra = {"ctrl": actuators, "qvel_before": before}
     if self._forward:
       state = mjx.forward(model, state)
@@ -94,8 +131,10 @@ class Mjx:
 
 
 def _anywhere(tree):
-  """The same arrays, bound to no device. MJX binds its own, which binds all that a step returns: a program called with what it returned itself would be compiled
-  a second time, for bound arguments, and robots could not be sharded."""
+  """The same arrays, bound to no device. MJX binds its own, which binds all that a step returns: a
+  program called with what it returned itself would be compiled a second time, for bound arguments,
+  and robots could not be sharded.
+  """
   return jax.tree.map(lambda x: jnp.asarray(np.asarray(x)), tree)
 
 

@@ -1,9 +1,11 @@
 """C MuJoCo inside jit: state crosses JAX as an opaque row, a callback steps the whole batch.
 
-The row is MuJoCo's float64 integration state (time, qpos, qvel, act, warm start, ctrl, applied forces, ...) viewed as uint32,
-so nothing is rounded on the way. Every call writes the whole row and every overridden model field before it steps, so no
-result depends on what the batch object held before: XLA may repeat or reorder callbacks, and instances of one model share a host.
+The row is MuJoCo's float64 integration state (time, qpos, qvel, act, warm start, ctrl, applied
+forces, ...) viewed as uint32, so nothing is rounded on the way. Every call writes the whole row and
+every overridden model field before it steps, so no result depends on what the batch object held
+before: XLA may repeat or reorder callbacks, and instances of one model share a host.
 """
+
 from __future__ import annotations
 
 import copy
@@ -27,22 +29,26 @@ from mjx_cl.physics import DERIVING, by_name
 def float64_bits(x: jax.Array) -> jax.Array:
   """Float32 (n,) -> uint32 (2n,), the little-endian bits of the same numbers as float64.
 
-  Exact for every normal float32 and for zero; a denormal (below 1.2e-38) becomes zero. Written with integer operations since
-  a CPU program without 64-bit mode has no float64.
+  Exact for every normal float32 and for zero; a denormal (below 1.2e-38) becomes zero. Written with
+  integer operations since a CPU program without 64-bit mode has no float64.
   """
   bits = jax.lax.bitcast_convert_type(jnp.asarray(x, jnp.float32), jnp.uint32)
   sign, exponent, mantissa = bits & jnp.uint32(0x80000000), (bits >> 23) & 0xFF, bits & 0x7FFFFF
   normal = exponent > 0
-  high = jnp.where(normal, sign | ((exponent + 896) << 20) | (mantissa >> 3), sign)  # 1023 - 127 = 896
+  high = jnp.where(
+    normal, sign | ((exponent + 896) << 20) | (mantissa >> 3), sign
+  )  # 1023 - 127 = 896
   low = jnp.where(normal, (mantissa & 7) << 29, jnp.uint32(0))
   return jnp.stack([low, high], -1).reshape(-1)
 
 
 def identity(mj_model: mujoco.MjModel, substeps: int, outputs: tuple[str, ...], law) -> str:
-  """A name for all that a host's results depend on: 32 hexadecimal digits, the same in every process, of the model's bytes, the arguments and the motor law.
+  """A name for all that a host's results depend on: 32 hexadecimal digits, the same in every
+  process, of the model's bytes, the arguments and the motor law.
 
-  A law counts by its module, code and what it closes over: a name has to tell the laws of one process apart, no more. Where it cannot (a callable object, a closure
-  over one), it is a new one each time, and programs with it are not found in the cache.
+  A law counts by its module, code and what it closes over: a name has to tell the laws of one
+  process apart, no more. Where it cannot (a callable object, a closure over one), it is a new one
+  each time, and programs with it are not found in the cache.
   """
   model = np.empty(mujoco.mj_sizeModel(mj_model), np.uint8)
   mujoco.mj_saveModel(mj_model, None, model)
@@ -68,7 +74,12 @@ def _words(x):
     return ("code", x.co_code, x.co_names, x.co_freevars, *map(_words, x.co_consts))
   if isinstance(x, types.FunctionType):
     cells = [c.cell_contents for c in x.__closure__ or ()]
-    return ("law", x.__module__, x.__qualname__, *map(_words, (x.__code__, cells, x.__defaults__, sorted((x.__kwdefaults__ or {}).items()))))
+    return (
+      "law",
+      x.__module__,
+      x.__qualname__,
+      *map(_words, (x.__code__, cells, x.__defaults__, sorted((x.__kwdefaults__ or {}).items()))),
+    )
   raise TypeError(f"no name for {type(x).__name__}")
 
 
@@ -78,22 +89,37 @@ class Native:
   Args:
     mj_model: mujoco.MjModel, copied.
     substeps: physics steps of one `step`.
-    outputs: MjData fields to return. `qpos` and `qvel` are current; a derived field (xpos, sensordata, ...) makes every call end
-      with mj_forward so that it is current too.
-    law: motor law, evaluated before every physics step, see physics.Law; None: `ctrl` goes to the actuators as it is. With a law the outputs
-      also hold `ctrl` (nu,), what the law gave last, and `qvel_before` (nv,), the velocity before the last physics step.
+    outputs: MjData fields to return. `qpos` and `qvel` are current; a derived field (xpos,
+      sensordata, ...) makes every call end with mj_forward so that it is current too.
+    law: motor law, evaluated before every physics step, see physics.Law; None: `ctrl` goes to the
+      actuators as it is. With a law the outputs also hold `ctrl` (nu,), what the law gave last, and
+      `qvel_before` (nv,), the velocity before the last physics step.
   """
+
   name = "native"
 
-  def __init__(self, mj_model: mujoco.MjModel, substeps: int, outputs: tuple[str, ...] = ("qpos", "qvel"), law=None):
+  def __init__(
+    self,
+    mj_model: mujoco.MjModel,
+    substeps: int,
+    outputs: tuple[str, ...] = ("qpos", "qvel"),
+    law=None,
+  ):
     try:
       import mjbatch  # noqa: F401
     except ImportError:
-      raise UserError("physics 'native' needs the package mjbatch (pip install mjbatch==0.1.4; Linux and macOS)") from None
+      raise UserError(
+        "physics 'native' needs the package mjbatch (pip install mjbatch==0.1.4; Linux and macOS)"
+      ) from None
     self.mj_model, self.substeps, self.outputs, self.law = mj_model, substeps, tuple(outputs), law
-    make, name = lambda: Host(copy.copy(mj_model), substeps, self.outputs, law), identity(mj_model, substeps, self.outputs, law)
+    make, name = (
+      lambda: Host(copy.copy(mj_model), substeps, self.outputs, law),
+      identity(mj_model, substeps, self.outputs, law),
+    )
     self.host = by_name.shared(name, make)
-    if getattr(self.host.law, "__globals__", None) is not getattr(law, "__globals__", None):  # the same words in another module of the same name
+    if getattr(self.host.law, "__globals__", None) is not getattr(
+      law, "__globals__", None
+    ):  # the same words in another module of the same name
       name = uuid.uuid4().hex
       self.host = by_name.shared(name, make)
     self._name = name
@@ -105,30 +131,46 @@ class Native:
     return self.host.seconds
 
   def init(self, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
-    """Row (uint32, opaque) of the model's initial state with qpos (nq,) and qvel (nv,). Makes no callback."""
+    """Row (uint32, opaque) of the model's initial state with qpos (nq,) and qvel (nv,). Makes no
+    callback.
+    """
     at = 2 * self._qpos_at
     nq, nv = 2 * self.mj_model.nq, 2 * self.mj_model.nv
     row = jnp.asarray(self.host.template)
-    return row.at[at:at + nq].set(float64_bits(qpos)).at[at + nq:at + nq + nv].set(float64_bits(qvel))
+    return (
+      row.at[at : at + nq]
+      .set(float64_bits(qpos))
+      .at[at + nq : at + nq + nv]
+      .set(float64_bits(qvel))
+    )
 
-  def step(self, fields: dict[str, jax.Array], state: jax.Array, ctrl: jax.Array, task=None, force=None):
+  def step(
+    self, fields: dict[str, jax.Array], state: jax.Array, ctrl: jax.Array, task=None, force=None
+  ):
     """`substeps` x mj_step of one robot; a vmap of it steps all robots in one call on all threads.
 
-    Everything crosses to the host and back as one array of bits each way: one operand, whatever the fields.
+    Everything crosses to the host and back as one array of bits each way: one operand, whatever the
+    fields.
     """
-    given = {"ctrl": ctrl} | ({} if force is None else {"force": force}) | {f"field {k}": v for k, v in fields.items()}
+    given = (
+      {"ctrl": ctrl}
+      | ({} if force is None else {"force": force})
+      | {f"field {k}": v for k, v in fields.items()}
+    )
     given |= {f"task {k}": v for k, v in (task or {}).items()} if self.law is not None else {}
     given = {k: jnp.asarray(v, jnp.float32) for k, v in given.items()}
     layout = json.dumps([(k, v.shape) for k, v in given.items()])
     bits = lambda x: jax.lax.bitcast_convert_type(x, jnp.uint32).reshape(-1)
     width = state.shape[0] + sum(int(np.prod(s)) for s in self.host.shapes.values())
-    out = by_name.call(self._name, layout, width, jnp.concatenate([state] + [bits(v) for v in given.values()]))
+    out = by_name.call(
+      self._name, layout, width, jnp.concatenate([state] + [bits(v) for v in given.values()])
+    )
     values, at = {}, state.shape[0]
     for name, shape in self.host.shapes.items():
       size = int(np.prod(shape))
-      values[name] = jax.lax.bitcast_convert_type(out[at:at + size], jnp.float32).reshape(shape)
+      values[name] = jax.lax.bitcast_convert_type(out[at : at + size], jnp.float32).reshape(shape)
       at += size
-    return out[:state.shape[0]], values
+    return out[: state.shape[0]], values
 
 
 @functools.cache
@@ -148,6 +190,7 @@ class Host:
 
   def __init__(self, mj_model: mujoco.MjModel, substeps: int, outputs: tuple[str, ...], law):
     import mjbatch
+
     self._mjbatch = mjbatch
     self.mj_model, self.substeps, self.outputs, self.law = mj_model, substeps, outputs, law
     self._forward = any(o not in ("qpos", "qvel") for o in outputs)
@@ -167,11 +210,21 @@ class Host:
     """`step` on one array of bits, (..., state + everything in `layout`) -> (..., state + outputs)."""
     lead, at, given = packed.shape[:-1], self.template.shape[0], {}
     for name, shape, size in _read(layout):
-      given[name] = packed[..., at:at + size].view(np.float32).reshape(lead + shape)
+      given[name] = packed[..., at : at + size].view(np.float32).reshape(lead + shape)
       at += size
-    part = lambda kind: {k[len(kind) + 1:]: v for k, v in given.items() if k.startswith(kind + " ")}
-    rows, out = self.step(part("field"), packed[..., :self.template.shape[0]], given["ctrl"], part("task"), given.get("force"))
-    return np.concatenate([rows] + [out[o].reshape(lead + (-1,)).view(np.uint32) for o in self.shapes], -1)
+    part = lambda kind: {
+      k[len(kind) + 1 :]: v for k, v in given.items() if k.startswith(kind + " ")
+    }
+    rows, out = self.step(
+      part("field"),
+      packed[..., : self.template.shape[0]],
+      given["ctrl"],
+      part("task"),
+      given.get("force"),
+    )
+    return np.concatenate(
+      [rows] + [out[o].reshape(lead + (-1,)).view(np.uint32) for o in self.shapes], -1
+    )
 
   def step(self, fields, state, ctrl, task=None, force=None):
     """`Native.step` on NumPy arrays with any leading axes: (rows, {output: float32})."""
@@ -179,7 +232,7 @@ class Host:
     state = np.asarray(state)
     lead, width = state.shape[:-1], state.shape[-1]
     num = int(np.prod(lead, dtype=np.int64))
-    flat = lambda x: np.asarray(x).reshape((num,) + np.shape(x)[len(lead):])
+    flat = lambda x: np.asarray(x).reshape((num,) + np.shape(x)[len(lead) :])
     with self._lock:
       batch, views = self._batch(num, tuple(sorted(fields)), force is not None)
       self._write_fields(batch, views, fields, num)
@@ -196,24 +249,36 @@ class Host:
         for k in range(self.substeps):
           views["ctrl"][...] = self.law(np, task, ctrl, qpos, qvel)
           if k == self.substeps - 1:
-            extra = {"ctrl": np.array(views["ctrl"], np.float32), "qvel_before": np.array(qvel, np.float32)}
+            extra = {
+              "ctrl": np.array(views["ctrl"], np.float32),
+              "qvel_before": np.array(qvel, np.float32),
+            }
           batch.step(nstep=1)
         extra = {k: v.reshape(lead + v.shape[1:]) for k, v in extra.items()}
-      out = {o: np.array(views["out " + o], np.float32).reshape(lead + self.shapes[o]) for o in self.outputs}
+      out = {
+        o: np.array(views["out " + o], np.float32).reshape(lead + self.shapes[o])
+        for o in self.outputs
+      }
       rows = np.array(views["state"]).view(np.uint32).reshape(lead + (width,))
       self.seconds += time.perf_counter() - begin
       return rows, out | extra
 
   def _write_fields(self, batch, views, fields, num: int) -> None:
-    """Model fields of every robot, in double precision where they are the nominal ones; constants derived of a changed mass are renewed."""
+    """Model fields of every robot, in double precision where they are the nominal ones; constants
+    derived of a changed mass are renewed.
+    """
     stale = np.zeros(num, bool)
     for name, value in fields.items():
       view, own, held = views["field " + name], views["nominal " + name], views["held " + name]
       value = np.asarray(value).reshape(view.shape)
-      if np.array_equal(value, held):  # what a field holds is a function of the last value written alone, so it is there already
+      if np.array_equal(
+        value, held
+      ):  # what a field holds is a function of the last value written alone, so it is there already
         continue
       held[...] = value
-      value = np.where(value == own.astype(np.float32), own, value)  # float32 cannot hold every nominal value: severity 0 is the model itself
+      value = np.where(
+        value == own.astype(np.float32), own, value
+      )  # float32 cannot hold every nominal value: severity 0 is the model itself
       if name in DERIVING:
         stale |= (view != value).reshape(num, -1).any(1)
       view[...] = value
@@ -224,11 +289,18 @@ class Host:
     key = (num, fields, force)
     if key not in self._batches:
       batch = self._mjbatch.Batch(self.mj_model, num, forward=self._forward)
-      views = {"state": batch.bind("state"), "ctrl": batch.bind("ctrl"), "qpos": batch.bind("qpos"), "qvel": batch.bind("qvel")}
+      views = {
+        "state": batch.bind("state"),
+        "ctrl": batch.bind("ctrl"),
+        "qpos": batch.bind("qpos"),
+        "qvel": batch.bind("qvel"),
+      }
       if force:
         views["force"] = batch.bind("qfrc_applied")
       views |= {"field " + f: batch.expand(f) for f in fields}
-      views |= {"held " + f: np.full(views["field " + f].shape, np.nan, np.float32) for f in fields}  # equal to nothing yet
+      views |= {
+        "held " + f: np.full(views["field " + f].shape, np.nan, np.float32) for f in fields
+      }  # equal to nothing yet
       views |= {"nominal " + f: np.array(views["field " + f][0]) for f in fields}
       views |= {"out " + o: batch.bind(o) for o in self.outputs}
       self._batches[key] = (batch, views)

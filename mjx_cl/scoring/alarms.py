@@ -1,4 +1,5 @@
 """Alarms against the true onset: latency, misses, false alarms. Times are control steps."""
+
 from __future__ import annotations
 
 from typing import NamedTuple
@@ -8,9 +9,10 @@ import numpy as np
 
 class AlarmScore(NamedTuple):
   """Attributes:
-    alarm_step: first alarm at or after onset, None where there is none (censored at the end). latency_steps: alarm_step - onset.
-    false_alarms: alarms before onset.
+  alarm_step: first alarm at or after onset, None where there is none (censored at the end).
+  latency_steps: alarm_step - onset. false_alarms: alarms before onset.
   """
+
   alarm_step: int | None
   latency_steps: int | None
   false_alarms: int

@@ -1,4 +1,5 @@
 """Distribution functions that intervals and tests need; SciPy is a dependency of the tests alone."""
+
 from __future__ import annotations
 
 import functools
@@ -10,9 +11,11 @@ TINY = 1e-300  # keeps a continued fraction from dividing by zero
 
 
 def gamma_cdf(a: float, x: float) -> float:
-  """P(a, x) = integral_0^x t^(a-1) e^-t dt / Gamma(a), a > 0: the chance that a Poisson variable of mean x is at least a (a whole).
+  """P(a, x) = integral_0^x t^(a-1) e^-t dt / Gamma(a), a > 0: the chance that a Poisson variable of
+  mean x is at least a (a whole).
 
-  Series below x = a + 1, Lentz's continued fraction above: about sqrt(a) terms where x is near a, relative error about 1e-12.
+  Series below x = a + 1, Lentz's continued fraction above: about sqrt(a) terms where x is near a,
+  relative error about 1e-12.
   """
   if x <= 0:
     return 0.0
@@ -41,7 +44,7 @@ def gamma_cdf(a: float, x: float) -> float:
 
 
 def normal_quantile(p: float) -> float:
-  """x with P(Z <= x) = p for a standard normal Z, by bisection of the error function."""
+  """X with P(Z <= x) = p for a standard normal Z, by bisection of the error function."""
   low, high = -9.0, 9.0
   for _ in range(60):
     x = (low + high) / 2
@@ -51,7 +54,9 @@ def normal_quantile(p: float) -> float:
 
 @functools.lru_cache(maxsize=4096)
 def gamma_quantile(a: float, p: float) -> float:
-  """x with gamma_cdf(a, x) = p, 0 < p < 1: Newton's steps from Wilson and Hilferty's cube, inside a bracket."""
+  """X with gamma_cdf(a, x) = p, 0 < p < 1: Newton's steps from Wilson and Hilferty's cube, inside a
+  bracket.
+  """
   x = max(a * (1 - 1 / (9 * a) + normal_quantile(p) / (3 * math.sqrt(a))) ** 3, 1e-8)
   low, high = 0.0, math.inf
   for _ in range(200):
@@ -85,9 +90,11 @@ def poisson_interval(count: int, level: float = 0.95) -> tuple[float, float]:
 
 @functools.lru_cache(maxsize=256)
 def studentised_range(members: int, p: float = 0.95) -> float:
-  """Quantile of the range of `members` independent standard normal variables: the studentised range with infinitely many degrees of freedom.
+  """Quantile of the range of `members` independent standard normal variables: the studentised range
+  with infinitely many degrees of freedom.
 
-    P(range <= r) = k integral phi(x) (Phi(x) - Phi(x - r))^(k-1) dx, by a sum over a grid of step 0.01, solved by bisection
+  P(range <= r) = k integral phi(x) (Phi(x) - Phi(x - r))^(k-1) dx, by a sum over a grid of step
+  0.01, solved by bisection
   """
   x = np.arange(-9, 9, 0.01)
   cdf = lambda v: 0.5 * np.array([math.erfc(-u / math.sqrt(2)) for u in v])

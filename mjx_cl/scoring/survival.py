@@ -1,4 +1,7 @@
-"""How long until recovery, where some streams had not recovered when the run ended: Kaplan-Meier and what follows from it."""
+"""How long until recovery, where some streams had not recovered when the run ended: Kaplan-Meier
+and what follows from it.
+"""
+
 from __future__ import annotations
 
 import math
@@ -6,21 +9,25 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mjx_cl.scoring import bootstrap, recovery
+from mjx_cl.scoring import intervals, recovery
 
 Z = 1.959963984540054  # 97.5 % quantile of the normal distribution
 
 
 class Curve(NamedTuple):
-  """P(not yet recovered by t), a step function: 1 before time[0], survival[i] from time[i] on; after `last` unknown unless it is 0.
+  """P(not yet recovered by t), a step function: 1 before time[0], survival[i] from time[i] on;
+  after `last` unknown unless it is 0.
 
   Attributes:
     time: float (k,), distinct times at which something happened, rising.
-    survival, low, high: float (k,), the estimate and its pointwise 95 % interval; nan where the interval is undefined.
+    survival, low, high: float (k,), the estimate and its pointwise 95 % interval; nan where the
+      interval is undefined.
     error: float (k,), Greenwood's standard error of `survival`.
-    at_risk, events: int (k,), streams under observation just before time[i], and those of them that recovered at it.
+    at_risk, events: int (k,), streams under observation just before time[i], and those of them that
+      recovered at it.
     last: longest time under observation.
   """
+
   time: np.ndarray
   survival: np.ndarray
   low: np.ndarray
@@ -34,13 +41,16 @@ class Curve(NamedTuple):
 def kaplan_meier(time, seen, interval: str = "log-log") -> Curve:
   """Kaplan and Meier's estimate from right-censored times.
 
-    S(t) = prod_{t_i <= t} (1 - d_i / n_i)       d_i events at t_i among the n_i still under observation; a stream censored at t_i counts in n_i
+    S(t) = prod_{t_i <= t} (1 - d_i / n_i)       d_i events at t_i among the n_i still under
+      observation; a stream censored at t_i counts in n_i
     V(t) = sum_{t_i <= t} d_i / (n_i (n_i - d_i)),   Greenwood's error = S sqrt(V)
     log-log: S^exp(+-z sqrt(V) / log S)           greenwood: S +- z S sqrt(V), cut to [0, 1]
 
   Args:
-    time: (n,) times of recovery or of censoring [any unit]. seen: bool (n,), the recovery was seen; False: censored.
+    time: (n,) times of recovery or of censoring [any unit]. seen: bool (n,), the recovery was seen;
+      False: censored.
     interval: log-log (stays within [0, 1], fair with ten streams) or greenwood.
+
   Returns:
     Curve over the times of events; empty arrays where none was seen.
   Undefined: the log-log interval where S is 0; Greenwood's too, since V is infinite there.
@@ -58,7 +68,7 @@ def kaplan_meier(time, seen, interval: str = "log-log") -> Curve:
     error = survival * root
     if interval == "log-log":
       arm = np.exp(Z * root / -np.log(survival))
-      low, high = survival ** arm, survival ** (1 / arm)
+      low, high = survival**arm, survival ** (1 / arm)
     else:
       low, high = np.clip(survival - Z * error, 0, 1), np.clip(survival + Z * error, 0, 1)
   unknown = ~np.isfinite(root)
@@ -67,29 +77,43 @@ def kaplan_meier(time, seen, interval: str = "log-log") -> Curve:
 
 
 def quantile(curve: Curve, share: float = 0.5) -> tuple[float | None, list[float | None]]:
-  """Time by which `share` of the streams have recovered, the median by default, with Brookmeyer and Crowley's interval.
+  """Time by which `share` of the streams have recovered, the median by default, with Brookmeyer and
+  Crowley's interval.
 
-    T = min {t : S(t) <= 1 - share},   interval: those t at which the curve's pointwise interval holds 1 - share
+    T = min {t : S(t) <= 1 - share},   interval: those t at which the curve's pointwise interval
+      holds 1 - share
 
   Returns:
-    (T, [low, high]); None where the curve, or an end of its interval, never falls that far: the quantile is censored.
-  Reference: Brookmeyer and Crowley 1982; with the curve's own interval, as R's survfit and SAS' lifetest have it.
+    (T, [low, high]); None where the curve, or an end of its interval, never falls that far: the
+    quantile is censored.
+  Reference: Brookmeyer and Crowley 1982; with the curve's own interval, as R's survfit and SAS'
+  lifetest have it.
   """
+
   def first(x):
-    hit = np.flatnonzero(x <= 1 - share + 1e-12)  # products of fractions: S may be 0.5 to the last bit but one
+    hit = np.flatnonzero(
+      x <= 1 - share + 1e-12
+    )  # products of fractions: S may be 0.5 to the last bit but one
     return float(curve.time[hit[0]]) if len(hit) else None
+
   gone = curve.survival == 0  # the pointwise interval is undefined there; no stream is left
-  return first(curve.survival), [first(np.where(gone, 0.0, curve.low)), first(np.where(gone, np.inf, curve.high))]
+  return first(curve.survival), [
+    first(np.where(gone, 0.0, curve.low)),
+    first(np.where(gone, np.inf, curve.high)),
+  ]
 
 
 def restricted_mean(time, seen, horizon: float) -> tuple[float | None, list[float] | None]:
   """Mean time to recovery up to a horizon: a stream that takes longer counts as `horizon`.
 
-    mean = integral_0^horizon S(t) dt,   variance = sum_{t_i <= horizon} A_i^2 d_i / (n_i (n_i - d_i)),   A_i = integral_{t_i}^horizon S
+    mean = integral_0^horizon S(t) dt,   variance = sum_{t_i <= horizon} A_i^2 d_i / (n_i (n_i -
+      d_i)),   A_i = integral_{t_i}^horizon S
 
   Returns:
-    (mean, [low, high] by the normal law, cut to [0, horizon]); (None, None) where the horizon is later than the longest time under observation and S
-    is above 0 there: what came after is unknown. The interval is None where every variance term is undefined or no event was seen.
+    (mean, [low, high] by the normal law, cut to [0, horizon]); (None, None) where the horizon is
+    later than the longest time under observation and S
+    is above 0 there: what came after is unknown. The interval is None where every variance term is
+      undefined or no event was seen.
   Reference: Klein and Moeschberger 2003, section 4.5; Irwin 1949.
   """
   curve = kaplan_meier(time, seen)
@@ -103,21 +127,28 @@ def restricted_mean(time, seen, horizon: float) -> tuple[float | None, list[floa
   left = np.cumsum(areas[::-1])[::-1][1:]  # A_i
   left_risk, events = curve.at_risk[inside], curve.events[inside]
   live = left_risk > events  # where nobody is left, A_i is 0
-  variance = float(np.sum(left[live] ** 2 * events[live] / (left_risk[live] * (left_risk[live] - events[live]))))
+  variance = float(
+    np.sum(left[live] ** 2 * events[live] / (left_risk[live] * (left_risk[live] - events[live])))
+  )
   mean, half = float(areas.sum()), Z * math.sqrt(variance)
   return mean, [max(0.0, mean - half), min(float(horizon), mean + half)] if live.any() else None
 
 
-def paired_difference(a, b, horizon: float, reps: int = bootstrap.REPS, seed: int = 0) -> tuple[float | None, list[float | None] | None]:
-  """Difference of the restricted means of two arms on the same seeds, a - b, with its 95 % percentile bootstrap interval.
+def paired_difference(
+  a, b, horizon: float, reps: int = intervals.REPS, seed: int = 0
+) -> tuple[float | None, list[float | None] | None]:
+  """Difference of the restricted means of two arms on the same seeds, a - b, with its 95 %
+  percentile bootstrap interval.
 
-  A draw takes seeds, and with each seed what both arms did in it, so that what a seed makes hard is hard for both.
+  A draw takes seeds, and with each seed what both arms did in it, so that what a seed makes hard is
+  hard for both.
 
   Args:
     a, b: (time (n,), seen bool (n,)), entry i of both from the same seed.
+
   Returns:
-    (difference, [low, high]). Draws in which a mean is undefined are left out; the interval is None for fewer than two seeds or where more than
-    half of the draws are.
+    (difference, [low, high]). Draws in which a mean is undefined are left out; the interval is None
+    for fewer than two seeds or where more than half of the draws are.
   """
   a, b = _checked(*a), _checked(*b)
   if len(a[0]) != len(b[0]):
@@ -126,38 +157,49 @@ def paired_difference(a, b, horizon: float, reps: int = bootstrap.REPS, seed: in
   difference = None if None in means else means[0] - means[1]
   if len(a[0]) < 2:
     return difference, None
-  drawn = bootstrap.draws(len(a[0]), reps, seed)
+  drawn = intervals.draws(len(a[0]), reps, seed)
   counts = np.zeros((reps, len(a[0])))
   np.add.at(counts, (np.arange(reps)[:, None], drawn), 1.0)
-  return difference, bootstrap.ends([_means(*a, horizon, counts) - _means(*b, horizon, counts)])[0]
+  return difference, intervals.ends([_means(*a, horizon, counts) - _means(*b, horizon, counts)])[0]
 
 
 def _means(time, seen, horizon, counts):
-  """Restricted means (reps,) of samples in which stream j stands counts[:, j] times; nan where undefined."""
+  """Restricted means (reps,) of samples in which stream j stands counts[:, j] times; nan where
+  undefined.
+  """
   at = np.unique(time[seen & (time < horizon)])
   events = counts @ ((time[:, None] == at) & seen[:, None])
   at_risk = counts @ (time[:, None] >= at)
   survival = np.cumprod(1 - events / np.maximum(1, at_risk), 1)
   whole = np.concatenate([np.ones((len(counts), 1)), survival], 1)
   last = np.max(np.where(counts > 0, time, -np.inf), 1)
-  return np.where((last < horizon) & (whole[:, -1] > 0), np.nan, whole @ np.diff(np.concatenate([[0.0], at, [horizon]])))
+  return np.where(
+    (last < horizon) & (whole[:, -1] > 0),
+    np.nan,
+    whole @ np.diff(np.concatenate([[0.0], at, [horizon]])),
+  )
 
 
 def of_runs(rows, steps: int) -> tuple[np.ndarray, np.ndarray]:
-  """Times to recovery of the affected streams of runs.parquet (a list of rows), in control steps since the onset, as (time, seen).
+  """Times to recovery of the affected streams of runs.parquet (a list of rows), in control steps
+  since the onset, as (time, seen).
 
-  A stream that has not recovered is censored 2,000 steps before the end of the run, or before its next change: recovery must hold for that
-  long, so none could be seen later.
+  A stream that has not recovered is censored 2,000 steps before the end of the run, or before its
+  next change: recovery must hold for that long, so none could be seen later.
   """
   hit = [(r, until) for r, until in zip(rows, watched(rows, steps)) if r["affected"]]
   seen = np.array([r["recovery_step"] is not None for r, _ in hit], bool)
-  time = [until if r["recovery_step"] is None else r["recovery_step"] - r["onset"] for r, until in hit]
+  time = [
+    until if r["recovery_step"] is None else r["recovery_step"] - r["onset"] for r, until in hit
+  ]
   return np.maximum(0.0, np.array(time, float)), seen
 
 
 def watched(rows, steps: int) -> list[int | None]:
-  """Control steps after its onset for which a recovery could be seen, of each row of runs.parquet: up to 2,000 before the stream's next change, or before the end
-  of the run. Below 0 where even that is earlier; None without an onset."""
+  """Control steps after its onset for which a recovery could be seen, of each row of runs.parquet:
+  up to 2,000 before the stream's next change, or before the end of the run. Below 0 where even that
+  is earlier; None without an onset.
+  """
   onsets: dict[int, list[int]] = {}
   for r in rows:
     if r["onset"] is not None:
@@ -169,7 +211,11 @@ def watched(rows, steps: int) -> list[int | None]:
 def _checked(time, seen):
   time, seen = np.asarray(time, float), np.asarray(seen, bool)
   if time.ndim != 1 or time.shape != seen.shape or not len(time):
-    raise ValueError(f"one time and one flag for each of at least one stream; got {time.shape} and {seen.shape}")
+    raise ValueError(
+      f"one time and one flag for each of at least one stream; got {time.shape} and {seen.shape}"
+    )
   if not np.isfinite(time).all() or (time < 0).any():
-    raise ValueError("times must be finite and at least 0; a censored one is the time until which it was watched")
+    raise ValueError(
+      "times must be finite and at least 0; a censored one is the time until which it was watched"
+    )
   return time, seen

@@ -1,0 +1,40 @@
+"""What `mjx-cl doctor` reports."""
+
+from __future__ import annotations
+
+import time
+
+import psutil
+
+
+def report() -> dict:
+  """Versions, devices, backend, memory, cache folder, and a speed check of about two seconds."""
+  import jax
+  import numpy as np
+
+  from mjx_cl import __version__, envs
+  from mjx_cl.io import runtime, tables
+  from mjx_cl.runs import suite
+
+  rows = {
+    "mjx_cl": __version__,
+    **{k: v for k, v in tables.provenance().items() if k in ("versions", "python", "machine")},
+  }
+  rows["devices"] = ", ".join(str(d) for d in jax.devices())
+  rows["physics"] = runtime.default_physics()
+  rows["free_memory_gib"] = round(psutil.virtual_memory().available / 2**30, 1)
+  rows["compile_cache"] = str(runtime.cache_dir())
+  rows["matmul_gflop_s"] = round(suite.matmul_rate() / 1e9)
+  env = envs.make("walker")
+  if env.physics.name == "native":
+    num = 256
+    keys = jax.random.split(jax.random.key(0), num)
+    state, _ = jax.vmap(lambda k: env.init(env.model, k))(keys)
+    rows_, ctrl = np.asarray(state.physics), np.zeros((num, 6), np.float32)
+    env.physics.host.step({}, rows_, ctrl)
+    steps, begin = 0, time.perf_counter()
+    while time.perf_counter() - begin < 1.0:
+      rows_, _ = env.physics.host.step({}, rows_, ctrl)
+      steps += num
+    rows["walker_control_steps_s"] = round(steps / (time.perf_counter() - begin))
+  return rows

@@ -1,0 +1,194 @@
+"""Ring buffers on the device: windows of consecutive records, uniform sampling, online queue,
+latent refresh.
+
+One `Replay` serves one agent and holds `envs` streams side by side, (envs, capacity, ...). Records
+are addressed by their absolute number in the stream; slot = number mod capacity. Latents are
+compact: deter as float16, the categorical variables as class indices.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from mjx_cl.dreamer.agent import Batch
+
+
+class Record(NamedTuple):
+  """One record: obs, the reward of arriving at it, the action chosen there, the latent of acting
+  there.
+
+  Attributes:
+    obs: float32 (O,). action: float32 (A,), unclipped, zero where `last`. reward: float32 ().
+    first, last, terminal: bool ().
+    deter: float16 (D,). stoch: uint8 (stoch,).
+    demo: float32 (A,), the demonstrator's action at obs. has_demo: bool ().
+  """
+
+  obs: jax.Array
+  action: jax.Array
+  reward: jax.Array
+  first: jax.Array
+  last: jax.Array
+  terminal: jax.Array
+  deter: jax.Array
+  stoch: jax.Array
+  demo: jax.Array
+  has_demo: jax.Array
+
+
+class Replay(NamedTuple):
+  """Attributes:
+  data: Record with leading (envs, capacity).
+  count: int32 (envs,), records ever written to each stream.
+  queue: int32 (envs,), number of the first record of the next window of the online queue.
+  """
+
+  data: Record
+  count: jax.Array
+  queue: jax.Array
+
+
+def record_bytes(obs_size: int, act_size: int, deter: int, stoch: int) -> int:
+  """Bytes of one record."""
+  return 4 * obs_size + 8 * act_size + 4 + 4 + 2 * deter + stoch
+
+
+def room(records: int) -> int:
+  """The least of 1,024, 1,280, 1,536, 1,792, 2,048, 2,560 and so on that holds `records`: at most a
+  quarter more than asked above 1,024, so that runs of about the same length share one compiled
+  program.
+  """
+  step = 256
+  while 8 * step < records:
+    step *= 2
+  return max(1024, -(-records // step) * step)
+
+
+def init(envs: int, capacity: int, obs_size: int, act_size: int, deter: int, stoch: int) -> Replay:
+  """An empty replay."""
+  zeros = lambda *shape, dtype=jnp.float32: jnp.zeros((envs, capacity) + shape, dtype)
+  flag = lambda: zeros(dtype=bool)
+  data = Record(
+    zeros(obs_size),
+    zeros(act_size),
+    zeros(),
+    flag(),
+    flag(),
+    flag(),
+    zeros(deter, dtype=jnp.float16),
+    zeros(stoch, dtype=jnp.uint8),
+    zeros(act_size),
+    flag(),
+  )
+  return Replay(data, jnp.zeros(envs, jnp.int32), jnp.zeros(envs, jnp.int32))
+
+
+def clear(replay: Replay) -> Replay:
+  """Forgets every record; the arrays stay."""
+  return replay._replace(count=jnp.zeros_like(replay.count), queue=jnp.zeros_like(replay.queue))
+
+
+def add(replay: Replay, records: Record, keep: jax.Array) -> Replay:
+  """Appends the records of a chunk.
+
+  Args:
+    records: Record with leading (envs, n), n at most the capacity.
+    keep: bool (envs, n); the others are left out, order is kept.
+  """
+  capacity = replay.data.reward.shape[1]
+
+  def one(data, count, records, keep):
+    number = count + jnp.cumsum(keep) - 1
+    slot = jnp.where(
+      keep, number % capacity, capacity
+    )  # capacity lies outside: the write is dropped
+    data = jax.tree.map(lambda d, r: d.at[slot].set(r.astype(d.dtype), mode="drop"), data, records)
+    return data, count + jnp.sum(keep)
+
+  data, count = jax.vmap(one)(replay.data, replay.count, records, keep)
+  return replay._replace(data=data, count=count.astype(jnp.int32))
+
+
+def windows(replay: Replay, length: int) -> jax.Array:
+  """Windows of `length` records that can be drawn, int32 ()."""
+  capacity = replay.data.reward.shape[1]
+  return jnp.sum(jnp.maximum(0, jnp.minimum(replay.count, capacity) - length + 1))
+
+
+def sample(replay: Replay, key: jax.Array, batch: int, length: int, only=None):
+  """Draws windows: first those waiting in the online queue, then uniformly over all windows.
+
+  The queue holds every non-overlapping window of each stream once, oldest first, so each fresh
+  sequence is seen once promptly. `first` is forced at index 0, `last` where the next record is a
+  first one.
+
+  Args:
+    batch, length: windows and records of each (context included).
+    only: int32 (), the one stream to draw from, as if the others held nothing; None: all.
+
+  Returns:
+    (replay', Batch with leading (batch, length), address). address = (stream (batch,), number of
+    the first record (batch,)). The caller makes sure that at least one window exists.
+  """
+  capacity = replay.data.reward.shape[1]
+  mine = True if only is None else jnp.arange(len(replay.count)) == only
+  oldest = jnp.maximum(0, replay.count - capacity)
+  queue = jnp.where(mine, jnp.maximum(replay.queue, oldest), replay.queue)
+  waiting = jnp.where(mine, jnp.maximum(0, (replay.count - queue) // length), 0)
+  ends = jnp.cumsum(waiting)
+  slot = jnp.arange(batch)
+  from_queue = slot < ends[-1]
+  q_stream = jnp.minimum(jnp.searchsorted(ends, slot, side="right"), len(ends) - 1)
+  rank = slot - (ends - waiting)[q_stream]
+  q_start = queue[q_stream] + rank * length
+  taken = jnp.clip(batch - (ends - waiting), 0, waiting)
+
+  valid = jnp.where(mine, jnp.maximum(0, replay.count - oldest - length + 1), 0)
+  valid_ends = jnp.cumsum(valid)
+  draw = jax.random.randint(key, (batch,), 0, jnp.maximum(1, valid_ends[-1]))
+  u_stream = jnp.minimum(jnp.searchsorted(valid_ends, draw, side="right"), len(ends) - 1)
+  u_start = oldest[u_stream] + draw - (valid_ends - valid)[u_stream]
+
+  stream = jnp.where(from_queue, q_stream, u_stream)
+  start = jnp.where(from_queue, q_start, u_start)
+  at = (start[:, None] + jnp.arange(length)) % capacity
+  out = jax.tree.map(lambda d: d[stream[:, None], at], replay.data)
+  last = out.last.at[:, :-1].set(out.last[:, :-1] | out.first[:, 1:])
+  batch_ = Batch(
+    out.obs,
+    out.action,
+    out.reward,
+    out.first.at[:, 0].set(True),
+    last,
+    out.terminal,
+    out.deter,
+    out.stoch.astype(jnp.int32),
+    out.demo,
+    out.has_demo,
+  )
+  return replay._replace(queue=queue + taken * length), batch_, (stream, start)
+
+
+def refresh(replay: Replay, address, latents) -> Replay:
+  """Overwrites the stored latents of records 1.. of each window with freshly computed ones, evicted
+  records apart.
+
+  Args:
+    address: as `sample` returned it.
+    latents: deter (batch, T, D), stoch (batch, T, stoch) of records 1..T of each window.
+  """
+  capacity = replay.data.reward.shape[1]
+  stream, start = address
+  deter, stoch = latents
+  number = start[:, None] + 1 + jnp.arange(deter.shape[1])
+  alive = number >= (replay.count - capacity)[stream][:, None]
+  slot = jnp.where(alive, number % capacity, capacity)
+  write = lambda d, x: d.at[stream[:, None], slot].set(x.astype(d.dtype), mode="drop")
+  return replay._replace(
+    data=replay.data._replace(
+      deter=write(replay.data.deter, deter), stoch=write(replay.data.stoch, stoch)
+    )
+  )

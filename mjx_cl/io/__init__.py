@@ -1,0 +1,1 @@
+"""Files and machines: tables, arrays, checkpoints, folders, JAX's start, memory, plug-ins, interrupts."""

@@ -1,0 +1,92 @@
+"""Ctrl-C and SIGTERM during a long run: noted at once, acted on between two chunks.
+
+Raising inside a physics callback would surface as an XLA error with half a chunk lived; a flag lets
+the chunk end, the state be saved, and then KeyboardInterrupt be raised.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+
+
+class Lasting:
+  """A text stream that swallows what cannot be written: where the reader of progress lines has gone
+  (`2>&1 | tee log` dies of the same Ctrl-C) the work goes on and is saved.
+  """
+
+  def __init__(self, stream):
+    self._stream = stream
+
+  def write(self, text: str) -> int:
+    try:
+      return self._stream.write(text)
+    except (OSError, ValueError):  # ValueError: it is closed
+      self._deaf()
+      return len(text)
+
+  def flush(self) -> None:
+    try:
+      self._stream.flush()
+    except (OSError, ValueError):
+      self._deaf()
+
+  def _deaf(self) -> None:
+    """From now on nothing is kept for a reader that is gone, so that the interpreter's last flush
+    finds nothing to fail on.
+    """
+    self._stream = open(os.devnull, "w")
+
+  def __getattr__(self, name):
+    return getattr(self._stream, name)
+
+
+def later(number: int, frame) -> bool:
+  """Whether the signal came within JAX's hook of the collector, where Python drops what is raised;
+  it is then sent once more, in a moment.
+  """
+  if frame is None or frame.f_code.co_name != "_xla_gc_callback":
+    return False
+  threading.Timer(0.01, signal.raise_signal, (number,)).start()
+  return True
+
+
+class Interruptible:
+  """Context in which SIGINT and SIGTERM set a flag; `check()` raises KeyboardInterrupt once it is
+  set. A second signal raises at once.
+
+  Attributes:
+    again: of the class, a second signal came. What it broke off, such as a save, may still be under
+      way on other threads: the process should end without them.
+  """
+
+  again = False
+
+  def __init__(self):
+    self._set = False
+    self._old: dict[int, object] = {}
+
+  def __enter__(self):
+    if threading.current_thread() is threading.main_thread():
+      for number in (signal.SIGINT, signal.SIGTERM):
+        self._old[number] = signal.signal(number, self._handle)
+    return self
+
+  def __exit__(self, *_):
+    for number, old in self._old.items():
+      signal.signal(number, old)
+
+  def _handle(self, number, frame):
+    if self._set:
+      if later(number, frame):
+        return
+      Interruptible.again = True
+      raise KeyboardInterrupt
+    self._set = True
+    print("mjx-cl: stopping after this chunk, saving", file=sys.stderr, flush=True)
+
+  def check(self) -> None:
+    if self._set:
+      raise KeyboardInterrupt

@@ -1,0 +1,153 @@
+"""Tables that others add to: robots, faults and detectors, by entry points of their packages or out
+of a file, path/to/file.py:Name.
+"""
+
+from __future__ import annotations
+
+import collections
+import functools
+import hashlib
+import importlib
+import importlib.metadata
+import importlib.util
+import os
+import pathlib
+import sys
+from collections.abc import Callable
+
+from mjx_cl.errors import FileError, PluginError, UserError
+
+
+class Registry(collections.UserDict):
+  """A table that the entry points of `group` join at its first use, so that a plug-in may import
+  whatever it likes of this package. A name with a colon, "path/to/file.py:Name" or "module:Name",
+  is what stands there, see `find`; the table does not list it.
+
+  Args:
+    group: of entry points, such as `mjx_cl.faults`. kind: what a message calls a member. own: the
+      members that are there already.
+
+  Raises:
+    PluginError at each use, one line: a name that is taken, a module that cannot be loaded, a
+      member that cannot be called; UserError for a name
+    with a colon where nothing of that name is.
+  """
+
+  def __init__(self, group: str, kind: str, own: dict):
+    self.group, self.kind, self.own, self.filled, self.members = (
+      group,
+      kind,
+      frozenset(own),
+      False,
+      dict(own),
+    )
+
+  @property
+  def data(self) -> dict:
+    """What UserDict reads and writes."""
+    self.fill()
+    return self.members
+
+  def fill(self) -> None:
+    """Loads the plug-ins unless that is done, or is being done: a plug-in that looks into the table
+    meanwhile sees what is there.
+    """
+    if self.filled:
+      return
+    self.filled = True
+    found = {}
+    try:
+      for entry in importlib.metadata.entry_points(group=self.group):
+        if entry.name in self.own or entry.name in found:
+          raise PluginError(
+            f"{self.kind} {entry.name!r} of {entry.value} is there already; a plug-in must "
+            "have a name of its own"
+          )
+        try:
+          found[entry.name] = entry.load()
+        except (Exception, SystemExit) as e:  # whatever a foreign module raises
+          raise PluginError(
+            f"{self.kind} {entry.name!r} of {entry.value} cannot be loaded: {line(e)}"
+          ) from e
+        if not callable(found[entry.name]):
+          raise PluginError(
+            f"{self.kind} {entry.name!r} of {entry.value} is nothing that can be called to make one"
+          )
+    except BaseException:
+      self.filled = False
+      raise
+    self.members |= found
+
+  def __contains__(self, name) -> bool:
+    return name in self.data or (isinstance(name, str) and ":" in name)
+
+  def __missing__(self, name):
+    if isinstance(name, str) and ":" in name:
+      return find(name, self.kind)
+    raise KeyError(name)
+
+  def plugged(self) -> list[str]:
+    """Names that are not this package's own."""
+    return [name for name in self if name not in self.own]
+
+
+def line(e: BaseException) -> str:
+  """An exception in one line."""
+  return f"{type(e).__name__}: {' '.join(str(e).split()) or 'without a message'}"
+
+
+def file_of(source: str) -> pathlib.Path | None:
+  """The file in "path/to/file.py:Name", absolute; None for any other name."""
+  where, colon, _ = source.rpartition(":")
+  if not colon or not where.endswith(".py"):
+    return None
+  return pathlib.Path(os.path.expanduser(where)).resolve()
+
+
+def find(source: str, kind: str) -> Callable:
+  """What "module:Name" or "path/to/file.py:Name" names; UserError, one line that begins with
+  `kind`, where there is nothing that can be called.
+  """
+  where, colon, name = source.rpartition(":")
+  if not colon or not where or not name:
+    raise UserError(f"{kind} {source!r}: give module:Name or path/to/file.py:Name")
+  path = file_of(source)
+  if path is None:
+    load = lambda: importlib.import_module(where)
+  elif not path.is_file():
+    raise FileError(f"{kind} {source}: no file {where}")
+  else:
+    load = lambda: _file(path, path.stat().st_mtime_ns)
+  try:
+    module = load()
+  except UserError:
+    raise
+  except ModuleNotFoundError as e:
+    if e.name and (where == e.name or where.startswith(e.name + ".")):
+      raise UserError(
+        f"{kind} {source}: no module {e.name!r} is installed; a file of your own is given as "
+        "path/to/file.py:Name"
+      ) from None
+    raise PluginError(f"{kind} {source}: importing {where} failed: {line(e)}") from None
+  except (Exception, SystemExit) as e:  # whatever a foreign module raises
+    raise PluginError(f"{kind} {source}: importing {where} failed: {line(e)}") from None
+  found = getattr(module, name, None)
+  if not callable(found):
+    raise UserError(f"{kind} {source}: {where} has nothing of the name {name!r} that can be called")
+  return found
+
+
+@functools.cache
+def _file(path: pathlib.Path, changed: int):
+  """The module in a file, loaded once for each time that it was written (`changed` [ns])."""
+  # under a name of its own: two files of one name must not be taken for each other
+  inner = f"mjx_cl_file_{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:12]}"
+  spec = importlib.util.spec_from_file_location(inner, path)
+  module = importlib.util.module_from_spec(spec)
+  sys.modules[inner] = module  # dataclasses look their module up there
+  try:
+    spec.loader.exec_module(module)
+  except BaseException:
+    del sys.modules[inner]
+    raise
+  return module

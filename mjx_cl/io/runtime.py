@@ -1,0 +1,178 @@
+"""What must be decided before JAX starts its first backend: XLA flags, compile cache, dispatch.
+
+Importing this module is free of JAX; `setup()` is idempotent. The command line calls it before a
+command that computes; a program of one's own calls it before its first use of JAX: `from mjx_cl
+import runtime; runtime.setup()`.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import pathlib
+import sys
+
+# jaxlib 0.10.x can lose a completion event in MJX programs and hang for ever (256 robots under
+# vmap: most runs); this flag cures it.
+_SCHEDULER_FLAG = "--xla_cpu_enable_concurrency_optimized_scheduler"
+_DEVICES_FLAG = "--xla_force_host_platform_device_count"
+_done = False
+
+
+def xla_flags(jaxlib_version: str, user_flags: str) -> str:
+  """XLA_FLAGS for this jaxlib: the user's own flags, unchanged and in order, plus what the version
+  needs.
+
+  Args:
+    jaxlib_version: e.g. "0.9.2".
+    user_flags: the present value of the environment variable, possibly empty.
+
+  Returns:
+    The value to set. A flag that the user has set to anything is left as the user set it.
+  """
+  major, minor = (int(x) for x in jaxlib_version.split(".")[:2])
+  flags = user_flags.split()
+  if (major, minor) == (0, 10) and not any(f.split("=")[0] == _SCHEDULER_FLAG for f in flags):
+    flags.append(f"{_SCHEDULER_FLAG}=false")
+  return " ".join(flags)
+
+
+def cache_dir() -> pathlib.Path:
+  """Folder of JAX's persistent compile cache: `MJX_CL_CACHE`, else the platform's user cache
+  folder.
+  """
+  override = os.environ.get("MJX_CL_CACHE")
+  if override:
+    return pathlib.Path(override).expanduser()
+  if sys.platform == "darwin":
+    return pathlib.Path("~/Library/Caches/mjx_cl").expanduser()
+  return pathlib.Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")).expanduser() / "mjx_cl"
+
+
+def keep_memory() -> bool:
+  """Tells glibc to keep freed memory instead of handing every large block back to the system; True
+  where that was done.
+
+  XLA takes the scratch memory of a program anew at each call. Through mmap every call then touches
+  fresh pages, and the page faults make a size1m update 1.2 to 1.4 times as long (row `update
+  size1m, default allocator / kept memory` of results/dreamer_update_xeon.json and
+  results/dreamer_update.json). The process stays as large as its peak. A user who has set
+  MALLOC_MMAP_MAX_, MALLOC_MMAP_THRESHOLD_ or MALLOC_TRIM_THRESHOLD_ is left alone; so is every
+  other C library.
+  """
+  if sys.platform != "linux" or any(
+    name in os.environ
+    for name in ("MALLOC_MMAP_MAX_", "MALLOC_MMAP_THRESHOLD_", "MALLOC_TRIM_THRESHOLD_")
+  ):
+    return False
+  import ctypes
+
+  trim_threshold, mmap_max = -1, -4  # M_TRIM_THRESHOLD and M_MMAP_MAX of malloc.h
+  try:
+    mallopt = ctypes.CDLL(None).mallopt
+  except (AttributeError, OSError):  # no glibc
+    return False
+  return bool(mallopt(mmap_max, 0) and mallopt(trim_threshold, -1))
+
+
+def give_back() -> bool:
+  """Hands free memory back to the system where glibc keeps it (`keep_memory`); True where that was
+  done. For after what needed much and comes seldom: a save.
+  """
+  if sys.platform != "linux":
+    return False
+  import ctypes
+
+  try:
+    return bool(ctypes.CDLL(None).malloc_trim(0))
+  except (AttributeError, OSError):  # no glibc
+    return False
+
+
+def cores() -> list[int]:
+  """Numbers of the cores that this process may use; where the system has no affinity, of all."""
+  return (
+    sorted(os.sched_getaffinity(0))
+    if hasattr(os, "sched_getaffinity")
+    else list(range(os.cpu_count() or 1))
+  )
+
+
+def sharing(seeds: int) -> int:
+  """How many of the cores share `seeds` seeds evenly: the greatest divisor of `seeds` that is no
+  more than the cores.
+  """
+  return max(n for n in range(1, min(seeds, len(cores())) + 1) if seeds % n == 0)
+
+
+def seeds_by() -> str:
+  """How the seeds of a device share a program of updates (train.make_learn): `map`, one after
+  another, on a CPU; `vmap`, all in each product, elsewhere.
+
+  On CPUs both take the same time: ten seeds of size1m 0.96 and 0.95 of ten times one
+  (results/dreamer_update_xeon.json), 0.98 and 1.02 (results/dreamer_update.json); `map` needs the
+  scratch memory of one seed. A GPU is not filled by one seed; there `vmap` is a choice by
+  expectation, not measured.
+  """
+  import jax
+
+  return "map" if jax.default_backend() == "cpu" else "vmap"
+
+
+def setup(devices: int = 1) -> None:
+  """Sets XLA flags, the compile cache, the allocator and synchronous CPU dispatch. Call before the
+  first JAX computation.
+
+  Args:
+    devices: as how many devices a CPU counts. A program that is sharded over them keeps the cores
+      busy with a share each, which a single program does only within its
+      larger products: ten seeds of a training take 0.59 to 0.73 of ten times one
+        (results/dreamer_update_xeon.json), 0.96 on one device. What is not sharded stays on the
+      first device and has all cores as before. A count in the user's own XLA_FLAGS or
+      JAX_NUM_CPU_DEVICES is left as it is.
+
+  Synchronous dispatch: a jax.pure_callback converts its arguments on a thread of the CPU client,
+  and with asynchronous dispatch that conversion can wait for itself (jax issues 24255 and 25861).
+  Physics calls the host by name, without a conversion, but falls back to pure_callback where a
+  jaxlib does not take that.
+  """
+  global _done
+  if _done:
+    return
+  _done = True
+  keep_memory()
+  flags = xla_flags(importlib.metadata.version("jaxlib"), os.environ.get("XLA_FLAGS", ""))
+  if flags:
+    os.environ["XLA_FLAGS"] = flags
+  # XLA's loader prints an error of a page for each cached program over two pseudo features of the
+  # compiler that no CPU reports
+  os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+  import jax
+
+  if devices > 1 and _DEVICES_FLAG not in flags and "JAX_NUM_CPU_DEVICES" not in os.environ:
+    jax.config.update("jax_num_cpu_devices", devices)
+  jax.config.update("jax_cpu_enable_async_dispatch", False)
+  folder = cache_dir()
+  try:
+    folder.mkdir(parents=True, exist_ok=True)
+  except OSError:
+    return  # a read-only home: everything works, programs are compiled anew
+  jax.config.update("jax_compilation_cache_dir", str(folder))
+  jax.config.update(
+    "jax_persistent_cache_min_compile_time_secs", 0.0
+  )  # a run starts with hundreds of small ones, some 30 ms each
+  jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
+
+
+def default_physics() -> str:
+  """`native` on a CPU where mjbatch is installed, else `mjx`."""
+  import jax
+
+  if jax.default_backend() != "cpu":
+    return "mjx"
+  try:
+    import mjbatch  # noqa: F401
+  except ImportError:
+    print("mjx-cl: mjbatch is not available on this platform, physics runs on mjx", file=sys.stderr)
+    return "mjx"
+  return "native"

@@ -1,0 +1,1 @@
+"""Detectors compared: recorded streams, one rate of false alarms, a board of scores."""

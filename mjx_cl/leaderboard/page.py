@@ -1,0 +1,370 @@
+"""The leaderboard as one HTML file that needs no network: tables, plots and a page per fault, drawn
+by assets/leaderboard.js.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import pathlib
+from typing import NamedTuple
+
+from mjx_cl.errors import FileError, UserError
+
+ASSETS = pathlib.Path(__file__).parent / "assets"
+REFERENCES = ("never", "always", "periodic", "random", "oracle")  # drawn in grey and not ranked
+PROFILES = {"standard": "standard", "few_false": "few false alarms", "few_misses": "few misses"}
+FAULT_KEYS = ("robot", "fault", "severity", "onset", "control_s", "channels", "alarms")
+LIFE_KEYS = ("seed", "onset", "channels", "alarms")
+POINT_KEYS = ("false_alarms_per_hour", "latency_mean_s", "detected")
+DIGITS = 6  # significant digits that are embedded; the tables show three
+
+
+class Column(NamedTuple):
+  """One column of the tables.
+
+  Attributes:
+    key: of a row. label, help: of the header and its tooltip. kind: text, number, integer, share
+      (shown in per cent), ratio or score.
+    better: 1 where a higher figure is better, -1 where a lower one is, 0 where neither; the first
+      click sorts the best to the top.
+    core: shown before `all columns` is chosen. tables: `rows`, `overall` or both. few: flag of a
+      row that marks the figure.
+    noted: a figure above it is marked, and the row's note told at the mark.
+  """
+
+  key: str
+  label: str
+  kind: str
+  better: int
+  help: str
+  core: bool = False
+  tables: tuple[str, ...] = ("rows",)
+  few: str | None = None
+  noted: float | None = None
+
+
+BOTH = ("rows", "overall")
+SCORE = (
+  "0: never alarms; 100: alarms at the onset of every fault and at no other time; negative: "
+  "worse than no detector."
+)
+COLUMNS = (
+  Column("detector", "Detector", "text", 0, "Name in the detector table", True, BOTH, "few"),
+  Column("robot", "Robot", "text", 0, "Robot that the streams come from", True),
+  Column(
+    "fault", "Fault", "text", 0, "Fault that begins at the onset; the link opens its page", True
+  ),
+  Column(
+    "severity", "Severity", "number", 0, "0: healthy, 1: the worst that the fault can do", True
+  ),
+  Column("cost_standard", "Cost score, standard", "score", 1, SCORE, True, BOTH),
+  Column(
+    "cost_few_false",
+    "Cost score, few false alarms",
+    "score",
+    1,
+    f"False alarms weigh more. {SCORE}",
+    True,
+    BOTH,
+  ),
+  Column(
+    "cost_few_misses",
+    "Cost score, few misses",
+    "score",
+    1,
+    f"Misses weigh more. {SCORE}",
+    True,
+    BOTH,
+  ),
+  Column(
+    "latency_median_s",
+    "Median latency [s]",
+    "number",
+    -1,
+    "Onset to first alarm, misses counted as later than all others; dash: half or more are missed",
+    True,
+  ),
+  Column(
+    "latency_median_steps", "Median latency [steps]", "number", -1, "The same in control steps"
+  ),
+  Column(
+    "miss_probability",
+    "Missed",
+    "share",
+    -1,
+    "Share of streams without an alarm before the horizon",
+    True,
+    BOTH,
+  ),
+  Column(
+    "detected_within_0.5s",
+    "Detected in 0.5\u00a0s",
+    "share",
+    1,
+    "Share of streams with an alarm at most 0.5 s after the onset",
+  ),
+  Column(
+    "detected_within_1s",
+    "Detected in 1\u00a0s",
+    "share",
+    1,
+    "Share of streams with an alarm at most 1 s after the onset",
+    True,
+    BOTH,
+  ),
+  Column(
+    "detected_within_5s",
+    "Detected in 5\u00a0s",
+    "share",
+    1,
+    "Share of streams with an alarm at most 5 s after the onset",
+    True,
+    BOTH,
+  ),
+  Column(
+    "detected_within_20s",
+    "Detected in 20\u00a0s",
+    "share",
+    1,
+    "Share of streams with an alarm at most 20 s after the onset",
+  ),
+  Column(
+    "mean_rank",
+    "Mean rank",
+    "number",
+    -1,
+    "Mean over robots, faults and severities of the rank by the standard cost score; 1 is best",
+    True,
+    ("overall",),
+  ),
+  Column(
+    "false_alarms_per_hour",
+    "False alarms per hour",
+    "number",
+    -1,
+    "In healthy operation, per hour of robot time",
+    True,
+    few="arl0_few",
+  ),
+  Column(
+    "arl0",
+    "ARL0 [steps]",
+    "number",
+    0,
+    "Healthy steps per alarm, with restarts",
+    True,
+    few="arl0_few",
+  ),
+  Column(
+    "arl0_alarms", "Alarms behind ARL0", "integer", 0, "Alarms that the ARL0 was counted from"
+  ),
+  Column(
+    "episode_alarm_probability",
+    "Alarm in a healthy episode",
+    "share",
+    -1,
+    "Share of healthy episodes with an alarm",
+    few="arl0_few",
+  ),
+  Column("threshold", "Threshold", "number", 0, "Decision level after calibration", few="arl0_few"),
+  Column(
+    "auroc",
+    "AUROC",
+    "ratio",
+    1,
+    "Ranks scores sample by sample; says nothing about delay or false alarms in a row",
+    True,
+  ),
+  Column(
+    "efficiency",
+    "Efficiency",
+    "ratio",
+    1,
+    "Delay of the likelihood-ratio oracle / delay of this detector, at equal ARL0",
+    True,
+    noted=1.0,
+  ),
+  Column(
+    "oracle_delay_steps",
+    "Oracle delay [steps]",
+    "number",
+    0,
+    "Delay of the likelihood-ratio test fitted on other seeds",
+  ),
+  Column(
+    "optimal_delay_steps",
+    "Optimal delay [steps]",
+    "number",
+    0,
+    "Closed form; printed only where its assumptions hold",
+  ),
+  Column(
+    "information_nats_per_step",
+    "Information [nats/step]",
+    "number",
+    0,
+    "Estimated divergence of faulty from healthy streams",
+  ),
+  Column(
+    "us_per_sample",
+    "Time per sample [µs]",
+    "number",
+    -1,
+    (
+      "Wall time of one update of one stream, beside the threads of other detectors on a shared "
+      "machine; dash: not timed (oracles, files of scores)"
+    ),
+  ),
+  Column("streams", "Streams", "integer", 0, "Streams that the row rests on"),
+  Column("note", "Note", "text", 0, "What is to be known about the row"),
+)
+
+HTML = """<!doctype html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta name="color-scheme" content="light dark">
+<meta http-equiv="Content-Security-Policy" content="default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data:">
+<link rel="icon" href="data:,">
+<title>mjx_cl leaderboard</title>
+<style>
+@CSS@</style>
+</head>
+<body>
+<header>
+<h1><a href="#"><svg viewBox="0 0 32 24" aria-hidden="true"><path d="M1 16h7l2-4 2 6 2-4h4V4l3 0v10h10"/></svg>mjx_cl leaderboard</a></h1>
+<p class="lead">Each detector watches what a robot fails to predict about itself and should raise an alarm soon after a fault begins, and not before.
+All thresholds were set on healthy robots to the same mean time between false alarms, and the cost score puts delay, misses and false alarms
+into one figure: 0 for a detector that never alarms, 100 for one that alarms at every onset and at no other time.</p>
+</header>
+<noscript><p>The tables and plots need JavaScript; all figures are in this file as JSON, in the element with the id "data".</p></noscript>
+<main id="board"></main>
+<main id="page" hidden></main>
+<footer id="about"></footer>
+<div id="tip" role="status" hidden></div>
+<script type="application/json" id="data">@DATA@</script>
+<script>
+@JS@</script>
+</body>
+</html>
+"""
+
+
+def write(
+  path, rows: list[dict], overall: list[dict], curves: dict, faults: list[dict], meta: dict
+) -> None:
+  """Writes the leaderboard to a temporary name and renames it. nan becomes null and is shown as a
+  dash; infinity is refused.
+
+  Args:
+    rows: one dict per detector x robot x fault x severity, with every key of COLUMNS for `rows`;
+      key_ci [low, high] or None is optional, and so is arl0_few, which marks figures that rest on
+      fewer than 50 alarms; a figure above Column.noted needs a note.
+    overall: one dict per detector, with every key of COLUMNS for `overall`, key_ci likewise.
+    curves: {detector: {robot: [point, ...]}}, a point has POINT_KEYS.
+    faults: dicts with FAULT_KEYS: onset [control steps], channels {name: values}, alarms {detector:
+      control step or None}, the first from the onset on; value k of a channel belongs to control
+      step first + k * every (optional keys, 0 and 1 where absent). Optional are early, {detector:
+      control step} of the first alarm that is shown before the onset, seed, target, and others: the
+      streams of further seeds, dicts with LIFE_KEYS, first, every, early and target likewise.
+    meta: printed at the foot as it is, save for critical_difference (of mean ranks, or None),
+      references (names drawn in grey, instead of REFERENCES) and notes (text, or a list of texts).
+
+  Raises:
+    UserError where a key or a note is missing or a figure is infinite; FileError where the file
+    cannot be written.
+  """
+  for name, table, keys in (
+    ("row", rows, _keys("rows")),
+    ("overall", overall, _keys("overall")),
+    ("fault", faults, FAULT_KEYS),
+  ):
+    for i, row in enumerate(table):
+      _demand(f"{name} {i}", row, keys)
+      for c in COLUMNS if name == "row" else ():
+        if c.noted is not None and (row[c.key] or 0) > c.noted and not row["note"]:
+          raise UserError(
+            f"page: row {i} of {row['detector']}: its {c.key} is above {c.noted:g}, and no "
+            "note says why"
+          )
+      for j, life in enumerate(row.get("others", ()) if name == "fault" else ()):
+        _demand(f"{name} {i}, other stream {j}", life, LIFE_KEYS)
+  for detector, robots in curves.items():
+    for robot, points in robots.items():
+      for i, point in enumerate(points):
+        _demand(f"curve of {detector} on {robot}, point {i}", point, POINT_KEYS)
+  keys = list(dict.fromkeys(key for row in rows for key in row))
+  data = {
+    "columns": [c._asdict() for c in COLUMNS],
+    "profiles": PROFILES,
+    "references": meta.get("references", REFERENCES),
+    "keys": keys,
+    "rows": [[row.get(key) for key in keys] for row in rows],  # keys once: half the size
+    "overall": overall,
+    "curves": curves,
+    "faults": faults,
+    "meta": {k: v for k, v in meta.items() if k != "references"},
+  }
+  parts = {
+    "@CSS@": _asset("leaderboard.css"),
+    "@JS@": _asset("leaderboard.js"),
+    "@DATA@": embed(data),
+  }
+  text = HTML
+  for mark, part in parts.items():  # the data last, since a name may hold a mark
+    text = text.replace(mark, part)
+  path = pathlib.Path(path)
+  tmp = path.with_name(path.name + ".tmp")
+  try:
+    tmp.write_text(text, encoding="utf-8")
+    os.replace(tmp, path)
+  except OSError as e:
+    tmp.unlink(missing_ok=True)
+    raise FileError(
+      f"cannot write {path}: {e.strerror or e}; what was there is unchanged"
+    ) from None
+
+
+def embed(value) -> str:
+  """JSON that may stand inside a script element: no <, > or & is left in it, so no name can end the
+  element or open a comment.
+  """
+  text = json.dumps(_clean(value, "page"), allow_nan=False, separators=(",", ":"))
+  return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+
+
+def _clean(value, where: str):
+  """Plain Python values, floats of DIGITS digits, nan as None."""
+  if hasattr(value, "tolist"):
+    value = value.tolist()
+  if isinstance(value, dict):
+    return {str(k): _clean(v, f"{where}: {k}") for k, v in value.items()}
+  if isinstance(value, (list, tuple)):
+    return [_clean(v, where) for v in value]
+  if isinstance(value, float):
+    if math.isinf(value):
+      raise UserError(f"{where}: infinite; give None for what is undefined")
+    return None if math.isnan(value) else float(f"{value:.{DIGITS}g}")
+  if value is None or isinstance(value, (str, int)):
+    return value
+  raise UserError(f"{where}: {type(value).__name__} is no JSON value")
+
+
+def _keys(table: str) -> list[str]:
+  return [c.key for c in COLUMNS if table in c.tables]
+
+
+def _demand(where: str, row: dict, keys) -> None:
+  missing = [key for key in keys if key not in row]
+  if missing:
+    raise UserError(f"page: {where} lacks {', '.join(missing)}")
+
+
+def _asset(name: str) -> str:
+  try:
+    return (ASSETS / name).read_text(encoding="utf-8")
+  except OSError as e:
+    raise FileError(f"cannot read {ASSETS / name}: {e.strerror or e}") from None

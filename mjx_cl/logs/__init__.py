@@ -1,0 +1,1 @@
+"""Logs of one's own as CSV files: reading them and watching them."""

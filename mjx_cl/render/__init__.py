@@ -1,0 +1,1 @@
+"""Pictures: robots at work as films, and the figures of a run."""

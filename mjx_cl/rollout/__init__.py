@@ -1,0 +1,1 @@
+"""Robots, agents and faults in one scan: acting, residuals of the predictions, transfer to another robot."""

@@ -1,0 +1,256 @@
+"""Prediction residuals: what the world model foresaw, step by step, against what came.
+
+At decision t the model imagines n steps from its posterior, one prior sample each, with the
+recorded actions; predictions are in raw units. With x_{t+i} the observation arrived at i steps
+later and o ranging over observation variables:
+
+  paper       e_t[o] = (1/n) sum_{i=1..n} |xhat_{t+i|t}[o] - x_{t+i}[o]|, in the row whose arrival
+    is t+n, when it is known
+  streaming   s_t[o] = (1/n) sum_{i=1..n} |xhat_{t|t-i}[o] - x_t[o]|, in the row whose arrival is t
+
+OPR = mean over o; RPR is the same sum over the reward. A window is cut at a reset and averaged over
+the steps left; fewer than
+`least` of them, or fewer than n steps since the run began, make the row invalid.   Source: the
+  paper, section on change detection.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_cl.dreamer import rssm
+from mjx_cl.errors import UserError
+from mjx_cl.types import Spec, Var
+
+GROUPS = 8  # parts of the observation with a residual of their own
+LATENT = 16  # dimensions of the latent's projection
+
+
+class Residual(NamedTuple):
+  """What detectors see of one row. Whatever is not known is nan.
+
+  Attributes:
+    opr, rpr: float32 (). variables: float32 (O,), in raw units. valid: bool (): opr, rpr, variables
+      and groups are known.
+    groups: float32 (8,), mean residual of the parts `spec.watched`, in typical deviations of each
+      variable.
+    reward: float32 (), of arriving. terminated: bool (), the episode ended in arriving.
+    surprise: float32 (), KL(posterior || prior) of the latent at the decision [nats].
+    latent: float32 (16,), a fixed projection of the posterior latent at the decision, see
+      `Monitor.project`.
+  """
+
+  opr: jax.Array
+  rpr: jax.Array
+  variables: jax.Array
+  valid: jax.Array
+  groups: jax.Array
+  reward: jax.Array
+  terminated: jax.Array
+  surprise: jax.Array
+  latent: jax.Array
+
+
+def unknown(leading: tuple[int, ...], variables: int) -> Residual:
+  """Rows of which nothing is known."""
+  nan, false = (
+    lambda *shape: jnp.full(leading + shape, jnp.nan),
+    lambda: jnp.zeros(leading, bool),
+  )  # no two fields share a buffer: all are donated
+  return Residual(
+    nan(), nan(), nan(variables), false(), nan(GROUPS), nan(), false(), nan(), nan(LATENT)
+  )
+
+
+def watched(spec) -> tuple[tuple[str, tuple[int, ...]], ...]:
+  """(name, indices) of the eight parts: `spec.watched`, or the observation in eight stretches of
+  about equal length.
+  """
+  if spec.watched:
+    return spec.watched
+  stretches = np.array_split(np.arange(len(spec.obs)), GROUPS)
+  return tuple(
+    (f"obs_{at[0]}_{at[-1]}" if len(at) else f"empty_{k}", tuple(int(i) for i in at))
+    for k, at in enumerate(stretches)
+  )
+
+
+class History(NamedTuple):
+  """The last n - 1 rows before a chunk, time-major (n - 1, groups, members, ...). `exists` is false
+  before the run began.
+  """
+
+  deter: jax.Array
+  stoch: jax.Array
+  action: jax.Array
+  obs: jax.Array
+  reward: jax.Array
+  done: jax.Array
+  exists: jax.Array
+
+
+class Monitor:
+  """Residuals of chunks.
+
+  Args:
+    agent: dreamer.agent.Agent.
+    n: decisions predicted.
+    form: `paper` or `streaming`.
+    actions: `recorded`, or `policy` (the literal reading of the paper: the policy imagines its own
+      actions).
+    least: fewest steps a cut window may keep.
+    spec: of the robot, for `groups`; None: eight stretches of the observation in raw units.
+  """
+
+  def __init__(
+    self,
+    agent,
+    n: int = 15,
+    form: str = "paper",
+    actions: str = "recorded",
+    least: int = 5,
+    spec=None,
+  ):
+    if form not in ("paper", "streaming"):
+      raise UserError(f"unknown residual form {form!r}; choose from: paper, streaming")
+    if actions not in ("recorded", "policy"):
+      raise UserError(f"unknown residual actions {actions!r}; choose from: recorded, policy")
+    if not 1 <= least <= n:
+      raise UserError(f"least must lie in 1..n={n}; got {least}")
+    self.agent, self.n, self.form, self.actions, self.least = agent, n, form, actions, least
+    spec = spec or Spec("", (Var("", ""),) * agent.obs_size, (), 1.0, 1, 0.0, None, ())
+    self._groups = np.zeros((agent.obs_size, GROUPS), np.float32)  # variables -> groups
+    for k, (_, at) in enumerate(watched(spec)):
+      for i in at:
+        self._groups[i, k] = 1.0 / (len(at) * spec.obs[i].scale)
+    rng = np.random.default_rng(LATENT)
+    self._projection = (
+      rng.standard_normal((agent.size.deter + agent.stoch_size, LATENT))
+      / np.sqrt(
+        np.concatenate(
+          [np.full(agent.size.deter, agent.size.deter), np.full(agent.stoch_size, agent.size.stoch)]
+        )
+      )[:, None]
+    ).astype(np.float32)
+
+  def init(self, groups: int, members: int) -> History:
+    """The history before a run."""
+    a = self.agent
+    zeros = lambda *shape: jnp.zeros((self.n - 1, groups, members) + shape)
+    return History(
+      zeros(a.size.deter),
+      jnp.zeros((self.n - 1, groups, members, a.size.stoch), jnp.int32),
+      zeros(a.act_size),
+      zeros(a.obs_size),
+      zeros(),
+      zeros().astype(bool),
+      zeros().astype(bool),
+    )
+
+  def update(self, params, history: History, rows, keys: jax.Array):
+    """Residuals of one chunk.
+
+    Args:
+      params: leading (groups,). rows: rollout.Row with leading (T, groups, members), T >= n - 1.
+        keys: (groups,).
+
+    Returns:
+      (history', Residual with leading (T, groups, members)).
+    """
+    seq = self._join(history, rows)
+    per_group = jax.vmap(self._group, (0, 1, 0), 1)
+    opr, rpr, variables, valid = per_group(params, seq, keys)
+    surprise, latent = jax.vmap(self._look, (0, 1, 1, 1), 1)(
+      params, rows.obs, rows.deter, rows.stoch
+    )
+    residual = Residual(
+      opr,
+      rpr,
+      variables,
+      valid,
+      variables @ self._groups,
+      rows.reward,
+      rows.terminated,
+      surprise,
+      latent,
+    )
+    return self._last(history, seq), residual
+
+  def update_each(self, params, history: History, rows, keys: jax.Array):
+    """`update` with a key for each member, (groups, members): no member's residuals depend on which
+    others there are, but for the last digit.
+    """
+    alone = lambda tree: jax.tree.map(lambda x: x[:, :, None], tree)
+    each = lambda h, r, k: self.update(params, alone(h), alone(r), k)
+    return jax.tree.map(lambda x: x[:, :, :, 0], jax.vmap(each, (2, 2, 1), 2)(history, rows, keys))
+
+  def remember(self, history: History, rows) -> History:
+    """The history after a chunk, as `update` gives it, without looking."""
+    return self._last(history, self._join(history, rows))
+
+  def _join(self, history: History, rows) -> History:
+    done = rows.terminated | rows.truncated
+    chunk = History(
+      rows.deter, rows.stoch, rows.action, rows.final_obs, rows.reward, done, jnp.ones_like(done)
+    )
+    return jax.tree.map(lambda a, b: jnp.concatenate([a, b.astype(a.dtype)]), history, chunk)
+
+  def _last(self, history: History, seq: History) -> History:
+    return jax.tree.map(lambda x: x[-(self.n - 1) :], seq) if self.n > 1 else history
+
+  def _group(self, params, seq: History, key):
+    """One parameter set; seq has leading (n - 1 + T, members)."""
+    n, total, members = self.n, seq.done.shape[0], seq.done.shape[1]
+    rows = total - n + 1
+    starts = rows if self.form == "paper" else total
+    # window[i, s] = row s + i, clamped; `inside` says that it exists
+    index = jnp.arange(starts)[None] + jnp.arange(n)[:, None]
+    inside = index < total
+    index = jnp.minimum(index, total - 1)
+    actions = seq.action[index].reshape(n, starts * members, -1)
+    deter = seq.deter[:starts].reshape(starts * members, -1)
+    stoch = self.agent.hot(seq.stoch[:starts]).reshape(starts * members, -1)
+    if self.actions == "recorded":
+      obs, reward = self.agent.open_loop(params, deter, stoch, actions, key)
+    else:
+      obs, reward = self.agent.dream(params, deter, stoch, n, key)
+    shape = (n, starts, members)
+    error = jnp.concatenate(
+      [
+        jnp.abs(obs.reshape(shape + (-1,)) - seq.obs[index]),
+        jnp.abs(reward.reshape(shape) - seq.reward[index])[..., None],
+      ],
+      -1,
+    )
+    ended = (
+      jnp.cumsum(seq.done[index].astype(jnp.int32), 0) - seq.done[index]
+    )  # resets before the i-th arrival
+    valid = inside[..., None] & (ended == 0) & seq.exists[:starts][None]
+    if self.form == "streaming":  # row k gathers the i-th prediction of start k - i + 1
+      row = jnp.arange(n - 1, total)[None] - jnp.arange(n)[:, None]
+      step = jnp.arange(n)[:, None]
+      error, valid = error[step, row], valid[step, row]
+    count = jnp.sum(valid, 0)
+    mean = jnp.sum(jnp.where(valid[..., None], error, 0.0), 0) / jnp.maximum(1, count)[..., None]
+    good = (count >= self.least) & seq.exists[:rows]  # n steps since the run began
+    mean = jnp.where(good[..., None], mean, jnp.nan)
+    return jnp.mean(mean[..., :-1], -1), mean[..., -1], mean[..., :-1], good
+
+  def _look(self, params, obs, deter, stoch):
+    """Surprise [nats] and projected latent (16,) of decisions: obs (..., O), deter (..., D), stoch
+    (..., stoch) int.
+    """
+    logits = [x.astype(jnp.float32) for x in self.agent.beliefs(params, deter, obs)]
+    return rssm.kl(*logits), self.project(deter, stoch)
+
+  def project(self, deter: jax.Array, stoch: jax.Array) -> jax.Array:
+    """float32 (..., 16): one fixed Gaussian projection (NumPy's default_rng(16)) of [deter /
+    sqrt(D), one-hot stoch / sqrt(variables)].
+    """
+    return (
+      jnp.concatenate([deter.astype(jnp.float32), self.agent.hot(stoch)], -1) @ self._projection
+    )

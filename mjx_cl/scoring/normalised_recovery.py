@@ -1,0 +1,171 @@
+"""Normalised recovery: how much of what the change cost an arm has won back, 0 without adaptation,
+1 as good as a reference.
+"""
+
+from __future__ import annotations
+
+import json
+import pathlib
+
+from mjx_cl.adapt.arms import ARMS, NEVER, ONSET
+from mjx_cl.errors import FileError, UserError
+from mjx_cl.scoring import intervals
+
+# share of reward_pre that must lie between the reference and no adaptation; as `affected` asks for
+LEAST = 0.1
+HALF = 0.5  # of normalised recovery: where no arm reaches it, the change counts as unrecoverable
+SAME = (
+  "env",
+  "fault",
+  "target",
+  "severity",
+  "onset",
+  "duration",
+  "schedule",
+  "period",
+  "share",
+  "agent",
+  "physics",
+  "deterministic",
+)
+
+
+def normalise(
+  final: float | None,
+  none: float | None,
+  reference: float | None,
+  pre: float | None,
+  least: float = LEAST,
+) -> float | None:
+  """(final - none) / (reference - none), None where that means little.
+
+  Args:
+    final, none, reference: mean reward of the last 2,000 steps of the arm, of arm `none`, of the
+      reference, in the same seed.
+    pre: mean reward before the change.
+    least: None is returned unless reference - none is at least this share of pre; neither is
+      anything made of a pre of 0 or less.
+  """
+  if None in (final, none, reference, pre) or pre <= 0 or reference - none < least * pre:
+    return None
+  return (final - none) / (reference - none)
+
+
+def rows(runs, expert=None, least: float = LEAST) -> list[dict]:
+  """Normalised recovery of every stream whose seed also lived in arm `none`.
+
+  Args:
+    runs: rows of runs.parquet; those of later changes are left out, since no stream without
+      adaptation shares their past.
+    expert: rows of the run that holds the expert, one arm of true-onset trigger: its reward_final
+      is the reference. None: reward_pre is.
+
+  Returns:
+    {stream, arm, seed, reward_final, reward_none, reward_pre, reward_reference, reference (`expert`
+    or `reward_pre`), normalised}; `normalised` is None where undefined. Seeds that the expert did
+    not live are left out.
+  """
+  first = [r for r in runs if not r.get("change")]
+  none = {
+    r["seed"]: r for r in first if ARMS[r["arm"]].trigger is NEVER and not ARMS[r["arm"]].agent
+  }
+  word, reference = "reward_pre", {seed: r["reward_pre"] for seed, r in none.items()}
+  if expert is not None:
+    word, reference = (
+      "expert",
+      {r["seed"]: r["reward_final"] for r in expert if not r.get("change")},
+    )
+  out = []
+  for r in first:
+    if r["seed"] in none and r["seed"] in reference and r["onset"] is not None:
+      base = none[r["seed"]]
+      out.append(
+        {
+          "stream": r["stream"],
+          "arm": r["arm"],
+          "seed": r["seed"],
+          "reward_final": r["reward_final"],
+          "reward_none": base["reward_final"],
+          "reward_pre": base["reward_pre"],
+          "reward_reference": reference[r["seed"]],
+          "reference": word,
+          "normalised": normalise(
+            r["reward_final"], base["reward_final"], reference[r["seed"]], base["reward_pre"], least
+          ),
+        }
+      )
+  return out
+
+
+def summarise(scored) -> dict:
+  """Per arm: seeds with a defined value, seeds without, IQM of normalised recovery with its
+  bootstrap interval.
+  """
+  out = {}
+  for arm in dict.fromkeys(r["arm"] for r in scored):
+    own = [r["normalised"] for r in scored if r["arm"] == arm]
+    values = [x for x in own if x is not None]
+    out[arm] = {
+      "seeds": len(values),
+      "undefined": len(own) - len(values),
+      "normalised": float(intervals.iqm(values)) if values else None,
+      "normalised_ci": intervals.interval(values) if values else None,
+    }
+  return out
+
+
+def difference(scored, method: str, other: str) -> dict:
+  """Paired difference of two arms, method - other: IQM over the seeds in which both are defined,
+  with its 95 % bootstrap interval over seeds.
+
+  Returns:
+    {seeds, difference, difference_ci, holds_zero}; holds_zero None without an interval.
+  """
+  of = lambda arm: {
+    r["seed"]: r["normalised"] for r in scored if r["arm"] == arm and r["normalised"] is not None
+  }
+  a, b = of(method), of(other)
+  values = [a[seed] - b[seed] for seed in a if seed in b]
+  ci = intervals.interval(values) if values else None
+  return {
+    "seeds": len(values),
+    "difference": float(intervals.iqm(values)) if values else None,
+    "difference_ci": ci,
+    "holds_zero": None if ci is None or None in ci else ci[0] <= 0 <= ci[1],
+  }
+
+
+def of_folders(folder, expert=None, least: float = LEAST) -> list[dict]:
+  """`rows` of a run folder, with the expert from another one (its first arm of true-onset trigger,
+  never parameters drawn anew).
+
+  Raises:
+    UserError where the two did not meet the same thing, or there is no such arm; FileError for a
+    folder that holds no finished run.
+  """
+  config, runs = _read(folder)
+  if expert is None:
+    return rows(runs, None, least)
+  theirs, others = _read(expert)
+  changed = [k for k in SAME if config.get(k) != theirs.get(k)]
+  if changed:
+    raise UserError(
+      f"{expert} met another {', '.join(changed)} than {folder}; an expert must meet the same"
+    )
+  arm = next((a for a in theirs["arms"] if ARMS[a].trigger is ONSET and not ARMS[a].fresh), None)
+  if arm is None:
+    raise UserError(f"{expert} holds no arm that starts at the true onset")
+  return rows(runs, [r for r in others if r["arm"] == arm], least)
+
+
+def _read(folder):
+  import pyarrow
+  import pyarrow.parquet
+
+  folder = pathlib.Path(folder)
+  try:
+    return json.loads((folder / "config.json").read_text()), pyarrow.parquet.read_table(
+      folder / "runs.parquet"
+    ).to_pylist()
+  except (OSError, ValueError, pyarrow.ArrowException) as e:
+    raise FileError(f"{folder} holds no finished run: {str(e).splitlines()[0]}") from None

@@ -1,0 +1,1 @@
+"""Agents: training them, demonstrators, evaluation, and those that ship."""

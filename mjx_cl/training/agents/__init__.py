@@ -1,0 +1,155 @@
+"""Trained agents: one folder each with `agent.npz` (arrays, never unpickled) and `card.json` (how
+it was made, what it scores).
+
+Names of the shipped ones are the folders beside this file; a path to any such folder works too.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import pathlib
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import ml_dtypes
+import numpy as np
+
+from mjx_cl import envs
+from mjx_cl.config import DreamerConfig
+from mjx_cl.dreamer.agent import Agent, TrainState
+from mjx_cl.errors import FileError, UserError
+
+HERE = pathlib.Path(__file__).parent
+_HALF = "|bfloat16"  # suffix of a moment that is stored as the upper half of its float32
+
+
+class Trained(NamedTuple):
+  """A loaded agent. `card` is its JSON card: env, preset, repeat, dreamer (config), command,
+  returns, ...
+  """
+
+  agent: Agent
+  train: TrainState
+  card: dict
+  path: str
+
+
+def shipped() -> list[str]:
+  """Names of the agents inside the package."""
+  return sorted(p.parent.name for p in HERE.glob("*/card.json"))
+
+
+def _flatten(train: TrainState) -> dict[str, jax.Array]:
+  return {
+    jax.tree_util.keystr(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(train)
+  }
+
+
+def save(folder, train: TrainState, card: dict) -> None:
+  """Writes an agent of one seed: parameters and counters in full, optimiser moments as bfloat16
+  (they only steer step sizes).
+  """
+  folder = pathlib.Path(folder)
+  folder.mkdir(parents=True, exist_ok=True)
+  arrays = {}
+  for name, leaf in _flatten(train).items():
+    leaf = np.asarray(leaf)
+    if name.startswith(".opt") and leaf.dtype == np.float32 and leaf.ndim:
+      arrays[name + _HALF] = leaf.astype(ml_dtypes.bfloat16).view(np.uint16)
+    else:
+      arrays[name] = leaf
+  tmp = folder / "agent.tmp.npz"
+  np.savez_compressed(tmp, **arrays)
+  os.replace(tmp, folder / "agent.npz")
+  tmp = folder / "card.json.tmp"
+  tmp.write_text(json.dumps(card, indent=1) + "\n")
+  os.replace(tmp, folder / "card.json")
+
+
+def of(env, path: str | None = None, **departures) -> Trained:
+  """`load` for the robot `env`, which is known by the name in its spec; its `agents_of` names
+  another whose agents it takes.
+  """
+  return load(
+    path,
+    env.spec.name,
+    len(env.spec.obs),
+    len(env.spec.act),
+    getattr(env, "agents_of", None),
+    **departures,
+  )
+
+
+def is_shipped(env) -> bool:
+  """Whether there is an agent for this robot without a path."""
+  return not {env.spec.name, getattr(env, "agents_of", None)}.isdisjoint(shipped())
+
+
+def load(
+  path: str | None,
+  env_name: str,
+  obs_size: int,
+  act_size: int,
+  agents_of: str | None = None,
+  **departures,
+) -> Trained:
+  """Loads an agent by shipped name or folder.
+
+  Args:
+    path: folder or shipped name; None: the shipped agent named as the environment, or as the one
+      whose agents it takes.
+    env_name: robot that it must fit. agents_of: robot with the same observation, action and reward,
+      whose agents fit too; None: that of the class registered under this name.
+    departures: fields of its DreamerConfig to go on with otherwise, e.g. lr; None: its own.
+
+  Raises:
+    UserError for an agent of another robot or an unknown name; FileError for a broken or foreign
+    file.
+  """
+  related = agents_of or getattr(envs.ENVS.data.get(env_name), "agents_of", None)
+  name = path or (related if related and env_name not in shipped() else env_name)
+  folder = pathlib.Path(name)
+  if not (folder / "card.json").exists():
+    folder = HERE / name
+  if not (folder / "card.json").exists():
+    raise UserError(
+      f"no agent {name!r}; shipped: {', '.join(shipped()) or 'none'}; or give a folder that "
+      "holds agent.npz and card.json"
+    )
+  try:
+    card = json.loads((folder / "card.json").read_text())
+    config = DreamerConfig(**card["dreamer"])
+  except (OSError, ValueError, KeyError, TypeError) as e:
+    raise FileError(f"{folder / 'card.json'} is not an agent's card: {e}") from None
+  if card.get("env") not in (env_name, related):
+    raise UserError(f"agent {name!r} was trained on {card.get('env')!r}, not on {env_name!r}")
+  config = dataclasses.replace(
+    config, warmup=0
+  )  # whatever goes on from here does so at full learning rate
+  config = dataclasses.replace(config, **{k: v for k, v in departures.items() if v is not None})
+  agent = Agent(config, obs_size, act_size)
+  like = jax.eval_shape(agent.init, jax.random.key(0))
+  try:
+    with np.load(folder / "agent.npz", allow_pickle=False) as z:
+      arrays = {k: z[k] for k in z.files}
+  except Exception as e:  # zipfile, zlib and numpy each raise their own kind for a truncated file
+    raise FileError(
+      f"cannot read {folder / 'agent.npz'}: "
+      f"{str(e).splitlines()[0] if str(e) else type(e).__name__}"
+    ) from None
+  leaves = []
+  for leaf_path, want in jax.tree_util.tree_leaves_with_path(like):
+    key = jax.tree_util.keystr(leaf_path)
+    value = arrays.get(key)
+    if value is None and key + _HALF in arrays:
+      value = arrays[key + _HALF].view(ml_dtypes.bfloat16).astype(np.float32)
+    if value is None or value.shape != want.shape:
+      raise FileError(
+        f"{folder / 'agent.npz'} does not fit size {config.size} with {obs_size} observations "
+        f"and {act_size} actions: {key}"
+      )
+    leaves.append(jnp.asarray(value, want.dtype))
+  return Trained(agent, jax.tree.unflatten(jax.tree.structure(like), leaves), card, str(folder))

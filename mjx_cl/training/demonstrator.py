@@ -1,0 +1,275 @@
+"""A model-free policy that shows the way: brax PPO on this package's environments.
+
+Used by the `cpu` preset alone (the agent's card names it); `paper` does without. The trained policy
+is kept as a plain .npz of its layers, so that using one needs no brax.
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import json
+import os
+import pathlib
+import sys
+import time
+import zipfile
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_cl.envs.adapters import brax, brax_env
+from mjx_cl.errors import FileError
+
+
+class Policy(NamedTuple):
+  """Deterministic tanh policy: observation normaliser and dense layers.
+
+  Attributes:
+    mean, std: float32 (obs,), running statistics of the observation.
+    layers: ((kernel (in, out), bias (out,)), ...); the last layer gives means and raw deviations,
+      (2 * act,).
+  """
+
+  mean: jax.Array
+  std: jax.Array
+  layers: tuple[tuple[jax.Array, jax.Array], ...]
+
+  def __call__(self, obs: jax.Array) -> jax.Array:
+    """Action in [-1, 1], float32 (..., act), for obs (..., obs): the mode of the squashed normal."""
+    x = (obs - self.mean) / self.std
+    for kernel, bias in self.layers[:-1]:
+      x = jax.nn.swish(x @ kernel + bias)
+    kernel, bias = self.layers[-1]
+    return jnp.tanh((x @ kernel + bias)[..., : kernel.shape[1] // 2])
+
+
+def save(path: str | os.PathLike, policy: Policy) -> None:
+  """Writes an .npz, to a temporary name first."""
+  path = pathlib.Path(path)
+  arrays = {"mean": policy.mean, "std": policy.std}
+  for i, (kernel, bias) in enumerate(policy.layers):
+    arrays |= {f"kernel{i}": kernel, f"bias{i}": bias}
+  tmp = path.with_suffix(".tmp.npz")
+  np.savez(tmp, **{k: np.asarray(v, np.float32) for k, v in arrays.items()})
+  os.replace(tmp, path)
+
+
+def load(path: str | os.PathLike) -> Policy:
+  """Reads what `save` wrote."""
+  try:
+    with np.load(path, allow_pickle=False) as z:
+      layers = tuple(
+        (jnp.asarray(z[f"kernel{i}"]), jnp.asarray(z[f"bias{i}"]))
+        for i in range(sum(k.startswith("kernel") for k in z))
+      )
+      return Policy(jnp.asarray(z["mean"]), jnp.asarray(z["std"]), layers)
+  except (OSError, KeyError, ValueError, zipfile.BadZipFile) as e:
+    raise FileError(f"cannot read demonstrator {path}: {e}") from None
+
+
+def _to_policy(params) -> Policy:
+  normalizer, network = params[0], params[1]
+  layers = network["params"]
+  names = sorted(layers, key=lambda n: int(n.rsplit("_", 1)[1]))
+  return Policy(
+    normalizer.mean, normalizer.std, tuple((layers[n]["kernel"], layers[n]["bias"]) for n in names)
+  )
+
+
+class Shaped:
+  """A robot with an easier reward for its demonstrator alone, who only has to show the way: terms
+  weighted otherwise, and a constant added.
+
+  Where penalties outweigh what a beginner earns, each step costs, and PPO learns to end its episode
+  by falling.
+
+  Args:
+    env: robot with `reward_terms`. weights: term -> factor on its weight. bonus: added to every
+      step's reward.
+  """
+
+  def __init__(self, env, weights: dict[str, float], bonus: float):
+    self.env, self.bonus = env, bonus
+    factors = jnp.asarray([weights.get(name, 1.0) for name in env.reward_terms], jnp.float32)
+    self.model = env.model._replace(
+      task=env.model.task | {"reward_weights": env.model.task["reward_weights"] * factors}
+    )
+
+  def __getattr__(self, name):
+    return getattr(self.env, name)
+
+  def step(self, model, state, action):
+    state, out = self.env.step(model, state, action)
+    return state, out._replace(reward=out.reward + self.bonus)
+
+
+PPO = {"discounting": 0.995, "entropy_cost": 1e-2, "reward_scaling": 10.0}
+
+
+SIZES = {
+  "num_envs": 256,
+  "unroll_length": 30,
+  "num_minibatches": 16,
+  "batch_size": 256,
+  "num_updates_per_batch": 6,
+  "learning_rate": 1e-3,
+  "normalize_observations": True,
+}
+HIDDEN = (128,) * 3  # policy and value
+
+
+def networks_of(env):
+  """Brax's networks, of the shapes that `train` trains for `env`."""
+  running_statistics, networks = (
+    brax("training.acme.running_statistics"),
+    brax("training.agents.ppo.networks"),
+  )
+  return networks.make_ppo_networks(
+    len(env.spec.obs),
+    len(env.spec.act),
+    running_statistics.normalize,
+    policy_hidden_layer_sizes=HIDDEN,
+    value_hidden_layer_sizes=HIDDEN,
+  )
+
+
+def _template(env):
+  """(normaliser, policy, value) of those networks: what `latest.msgpack` is read into."""
+  running_statistics, specs = brax("training.acme.running_statistics"), brax("training.acme.specs")
+  net, key = networks_of(env), jax.random.key(0)
+  return (
+    running_statistics.init_state(specs.Array((len(env.spec.obs),), jnp.float32)),
+    net.policy_network.init(key),
+    net.value_network.init(key),
+  )
+
+
+def latest(out: pathlib.Path, env) -> tuple[list[dict], tuple]:
+  """The curve and the networks that a run in `out` left behind."""
+  from flax import serialization
+
+  try:
+    rows = json.loads((out / "curve.json").read_text())
+    params = serialization.from_bytes(_template(env), (out / "latest.msgpack").read_bytes())
+    done = rows[-1]["step"]
+  except (OSError, ValueError, KeyError, IndexError) as e:
+    raise FileError(
+      f"{out} holds no demonstrator training that can go on ({e}); leave out --resume to start one"
+    ) from None
+  return [row for row in rows if row["step"] <= done], params
+
+
+def train(
+  env,
+  out: str | os.PathLike,
+  steps: int,
+  seed: int = 0,
+  evals: int = 12,
+  progress=lambda row: None,
+  resume: bool = False,
+  **settings,
+) -> list[dict]:
+  """Trains PPO and keeps one policy per evaluation as OUT/policy_NN.npz, with OUT/curve.json.
+
+  `resume` goes on from the last evaluation in `out` up to `steps` in all: networks and observation
+  statistics are those of then, the optimiser's moments and the environments start fresh (brax keeps
+  neither), so the result is not bit for bit that of one run.
+
+  Settings: 256 environments, unroll 30, 16 minibatches of 256 x 30, 6 epochs, lr 1e-3, observations
+  normalised, policy and value 3 x 128, and `PPO` unless the robot has its own in
+  `env.demonstration` (`ppo`, and `weights` and `bonus` of Shaped), or `settings` say otherwise
+  (arguments of brax's `ppo.train`).
+
+  Returns:
+    Rows {step, return, seconds}, return = mean over 128 episodes of the stochastic policy, of the
+    shaped reward where there is one.
+  """
+  own = getattr(env, "demonstration", {})
+  adapter = brax_env(Shaped(env, own["weights"], own["bonus"]) if "bonus" in own else env)
+  networks, ppo = brax("training.agents.ppo.networks"), brax("training.agents.ppo.train")
+  out = pathlib.Path(out)
+  out.mkdir(parents=True, exist_ok=True)
+  rows, params = latest(out, env) if resume else ([], None)
+  done, before = (rows[-1]["step"], rows[-1]["seconds"]) if rows else (0, 0.0)
+  if done >= steps:
+    return rows
+  start = time.monotonic() - before
+
+  def on_progress(step, metrics):
+    if done and not int(step):
+      return  # the evaluation that the earlier run ended with
+    rows.append(
+      {
+        "step": done + int(step),
+        "return": float(metrics["eval/episode_reward"]),
+        "seconds": round(time.monotonic() - start, 1),
+      }
+    )
+    tmp = out / "curve.json.tmp"
+    tmp.write_text(json.dumps(rows, indent=1))
+    os.replace(tmp, out / "curve.json")
+    progress(rows[-1])
+
+  def on_params(step, _, params):
+    from flax import serialization
+
+    save(out / f"policy_{done + int(step):09d}.npz", _to_policy(params))
+    tmp = out / "latest.msgpack.tmp"
+    tmp.write_bytes(serialization.to_bytes(jax.device_get(params)))
+    os.replace(tmp, out / "latest.msgpack")
+
+  ppo.train(
+    environment=adapter,
+    num_timesteps=steps - done,
+    episode_length=env.spec.episode_steps,
+    seed=seed + done,
+    num_evals=evals,
+    restore_params=params,
+    progress_fn=on_progress,
+    policy_params_fn=on_params,
+    max_devices_per_host=1
+    if jax.default_backend() == "cpu"
+    else None,  # several seeds: runtime.setup
+    network_factory=functools.partial(
+      networks.make_ppo_networks, policy_hidden_layer_sizes=HIDDEN, value_hidden_layer_sizes=HIDDEN
+    ),
+    **SIZES | PPO | own.get("ppo", {}) | settings,
+  )
+  return rows
+
+
+def main() -> None:
+  """Python -m mjx_cl.training.demonstrator ENV --out DIR --steps N --seed N --resume"""
+  from mjx_cl import envs
+  from mjx_cl.io import runtime
+
+  runtime.setup()
+  parser = argparse.ArgumentParser(
+    prog="python -m mjx_cl.training.demonstrator",
+    description="Train the demonstrator of the cpu preset with brax PPO.",
+  )
+  parser.add_argument("env", choices=sorted(envs.ENVS))
+  parser.add_argument("--out", required=True)
+  parser.add_argument("--steps", type=int, default=8_000_000)
+  parser.add_argument("--seed", type=int, default=0)
+  parser.add_argument("--evals", type=int, default=12, help="how often it is evaluated and kept")
+  parser.add_argument(
+    "--resume", action="store_true", help="go on from the last evaluation in --out"
+  )
+  args = parser.parse_args()
+  train(
+    envs.make(args.env),
+    args.out,
+    args.steps,
+    args.seed,
+    args.evals,
+    lambda row: print(json.dumps(row), file=sys.stderr, flush=True),
+    args.resume,
+  )
+
+
+if __name__ == "__main__":
+  main()

@@ -1,0 +1,594 @@
+"""The command line: what it prints where, exit codes, one line for every kind of bad input, and no
+earlier result lost.
+"""
+
+import dataclasses
+import errno
+import json
+import os
+import pathlib
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from test_run import saved  # noqa: F401  a fixture
+
+import mjx_cl
+from mjx_cl import detectors, envs, faults
+from mjx_cl.cli import app
+from mjx_cl.config import ARMS, PRESETS
+from mjx_cl.errors import FileError
+from mjx_cl.faults import presets
+from mjx_cl.io import tables as store
+from mjx_cl.runs import run
+from mjx_cl.sizes import SIZES
+from mjx_cl.training import agents
+
+
+@pytest.fixture
+def mjx(capsys):
+  """mjx(*argv): (exit code, standard output, standard error) of `mjx-cl` in this process."""
+  before = signal.getsignal(signal.SIGTERM)
+
+  def call(*argv):
+    capsys.readouterr()
+    try:
+      code = app.main([str(a) for a in argv])
+    except SystemExit as e:  # --help
+      code = e.code or 0
+    return code, *capsys.readouterr()
+
+  yield call
+  signal.signal(signal.SIGTERM, before)
+
+
+@pytest.fixture
+def refused(mjx):
+  """refused(code, *argv): the one line that a refused command prints."""
+
+  def call(code, *argv):
+    got, out, err = mjx(*argv)
+    assert (
+      (got, out) == (code, "")
+      and err.startswith("mjx-cl: ")
+      and err.count("\n") == 1
+      and err.endswith("\n")
+    ), (got, out, err)
+    return err
+
+  return call
+
+
+def content(folder):
+  """Every file below a folder."""
+  return {
+    str(p.relative_to(folder)): p.read_bytes()
+    for p in sorted(pathlib.Path(folder).rglob("*"))
+    if p.is_file()
+  }
+
+
+# ---- what it prints ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("argv", [["--help"], ["run", "--help"]])
+def test_help_imports_nothing_heavy(argv):
+  """Seconds depend on the machine; what makes them many is an import of JAX (2 s) or of what needs
+  it.
+  """
+  process = subprocess.run(
+    [sys.executable, "-X", "importtime", "-m", "mjx_cl", *argv],
+    capture_output=True,
+    text=True,
+    timeout=120,
+  )
+  imported = {
+    line.split("|")[-1].strip()
+    for line in process.stderr.splitlines()
+    if line.startswith("import time:")
+  }
+  assert process.returncode == 0 and "mjx-cl" in process.stdout and "mjx_cl.cli.app" in imported
+  assert not imported & {
+    "jax",
+    "jaxlib",
+    "flax",
+    "optax",
+    "mujoco",
+    "matplotlib",
+    "pyarrow",
+    "duckdb",
+    "scipy",
+  }
+
+
+def test_help_names_every_command(mjx):
+  code, out, err = mjx("--help")
+  assert (
+    code == 0
+    and err == ""
+    and all(name in out for name in ("run", "train", "eval", "plot", "query", "list", "doctor"))
+  )
+
+
+def test_version(capsys):
+  with pytest.raises(SystemExit) as end:
+    app.main(["--version"])
+  assert end.value.code == 0 and capsys.readouterr().out == f"mjx-cl {mjx_cl.__version__}\n"
+
+
+def test_list(mjx):
+  code, out, err = mjx("list", "--json")
+  assert code == 0 and err == "" and out.count("\n") == 1
+  tables = json.loads(out)
+  assert {k: set(v) for k, v in tables.items()} == {
+    "envs": set(envs.ENVS),
+    "faults": set(faults.FAULTS),
+    "detectors": set(detectors.DETECTORS),
+    "presets": set(PRESETS),
+    "agents": set(agents.shipped()),
+    "arms": set(ARMS),
+    "sizes": set(SIZES),
+    "suites": {"leaderboard", "leaderboard-100k"},
+    "benches": {"again", "arms", "full", "loop", "paper", "quick", "stop", "study"},
+    "fault-presets": set(presets.PRESETS),
+    "schedules": set(presets.SCHEDULES),
+  }
+  assert all(
+    text for table in tables.values() for text in table.values()
+  )  # each with a word about it
+  assert json.loads(mjx("list", "faults", "--json")[1]) == {"faults": tables["faults"]}
+  text = mjx("list")[1]
+  assert all(name in text for table in tables.values() for name in table)
+
+
+def test_doctor(mjx):
+  code, out, err = mjx("doctor", "--json")
+  rows = json.loads(out)
+  assert code == 0 and err == "" and out.count("\n") == 1
+  assert (
+    rows["versions"]["jax"]
+    and rows["devices"]
+    and rows["physics"] in ("native", "mjx")
+    and rows["free_memory_gib"] > 0
+  )
+  assert rows["compile_cache"] == os.environ["MJX_CL_CACHE"] and rows["matmul_gflop_s"] > 0
+  assert rows["physics"] == "mjx" or rows["walker_control_steps_s"] > 0
+
+
+def test_standard_output_is_clean_where_mjx_is_loaded():
+  """`from mujoco import mjx` says on standard output that warp is absent."""
+  code = (
+    "import mjx_cl.envs, json; env = mjx_cl.envs.make('walker', 'mjx'); "
+    "print(json.dumps(env.physics.name))"
+  )
+  process = subprocess.run(
+    [sys.executable, "-c", code], capture_output=True, text=True, timeout=300
+  )
+  assert process.returncode == 0 and process.stdout == '"mjx"\n', process.stderr
+
+
+def test_query(mjx, refused, tmp_path):
+  store.write_table(tmp_path / "runs.parquet", {"seed": [0, 1], "x": np.array([0.5, np.nan])})
+  code, out, err = mjx("query", tmp_path, "select * from runs order by seed", "--json")
+  assert (code, err) == (0, "") and json.loads(out) == [
+    {"seed": 0, "x": 0.5},
+    {"seed": 1, "x": None},
+  ]
+  code, out, err = mjx("query", tmp_path, "select count(*) as n from runs")
+  assert (code, err) == (0, "") and "n" in out and "2" in out
+  sql = (
+    "select 0.5 * count(*) as half, list(x order by seed) as xs, {'a': 'nan'::double} as s, map "
+    "{date '2026-01-02': [1.0 / 0]} as m, histogram(seed * 1.5) as h from runs"
+  )
+  code, out, err = mjx("query", tmp_path, sql, "--json")
+  assert (code, err) == (0, "") and json.loads(out) == [
+    {
+      "half": 1.0,
+      "xs": [0.5, None],
+      "s": {"a": None},
+      "m": {"2026-01-02": [None]},
+      "h": {"0.0": 1, "1.5": 1},
+    }
+  ]
+  assert "runs" in refused(2, "query", tmp_path, "select y from runs")
+  assert "no .parquet" in refused(2, "query", tmp_path / "none", "select 1")
+
+
+# ---- bad arguments -------------------------------------------------------------------------------
+
+RUN = {
+  "environment": (["run", "wlker"], ["wlker", "walker"]),
+  "fault": (["run", "walker", "--fault", "geer"], ["geer", "gear, joint_damping"]),
+  "target": (["run", "walker", "--target", "left_elbow"], ["left_elbow", "left_knee", "random"]),
+  "target of no fault": (
+    ["run", "walker", "--fault", "none", "--target", "left_knee"],
+    ["left_knee"],
+  ),
+  "detector": (
+    ["run", "walker", "--detector", "cusums"],
+    ["cusums", "cusum", "rolling_sigma, rolling_sigma_plain"],
+  ),
+  "detector setting": (["run", "walker", "--set", "windows=5"], ["windows"]),
+  "detector setting out of range": (["run", "walker", "--set", "window=1"], ["window"]),
+  "setting without a value": (["run", "walker", "--set", "window"], ["name=value"]),
+  "arm": (
+    ["run", "walker", "--arm", "detektor"],
+    ["detektor", "always, detector, no-fault, none, oracle"],
+  ),
+  "arm twice": (["run", "walker", "--arm", "none", "none"], ["once"]),
+  "physics": (["run", "walker", "--physics", "warp"], ["warp", "native"]),
+  "form": (["run", "walker", "--form", "papers"], ["papers", "streaming"]),
+  "actions": (["run", "walker", "--actions", "own"], ["own", "recorded"]),
+  "flag": (["run", "walker", "--sede", "3"], ["--sede"]),
+  "flag of another command": (["run", "walker", "--episodes", "3"], ["--episodes"]),
+  "word for a number": (["run", "walker", "--seeds", "many"], ["many"]),
+  "severity above 1": (["run", "walker", "--severity", "1.5"], ["severity", "1.5"]),
+  "severity below 0": (["run", "walker", "--severity", "-0.1"], ["severity", "-0.1"]),
+  "severity nan": (["run", "walker", "--severity", "nan"], ["severity", "nan"]),
+  "onset beyond the end": (
+    ["run", "walker", "--onset", "2000", "--steps", "1000"],
+    ["onset", "2000", "1000"],
+  ),
+  "onset below 0": (["run", "walker", "--onset", "-1"], ["onset"]),
+  "zero seeds": (["run", "walker", "--seeds", "0"], ["seeds", "0"]),
+  "seed below 0": (["run", "walker", "--first-seed", "-1"], ["first_seed"]),
+  "zero steps": (["run", "walker", "--steps", "0"], ["steps"]),
+  "zero duration": (["run", "walker", "--duration", "0"], ["duration"]),
+  "adaptation out of range": (["run", "walker", "--adapt.patience", "0"], ["patience"]),
+  "agent that is not there": (
+    ["run", "walker", "--agent", "wlaker"],
+    ["wlaker", "shipped: car, quadruped, quadruped-cloned, walker"],
+  ),
+}
+OTHER = {
+  "command": (["rnu"], ["rnu"]),
+  "no command": ([], ["run"]),
+  "train: environment": (["train", "wlker"], ["wlker", "walker"]),
+  "train: preset": (["train", "walker", "--preset", "huge"], ["huge", "cpu, paper, tiny"]),
+  "train: setting": (["train", "walker", "--set", "lerning=3"], ["lerning", "lr"]),
+  "train: setting out of range": (["train", "walker", "--set", "lr=-1"], ["lr", "-1"]),
+  "train: zero seeds": (["train", "walker", "--seeds", "0"], ["seeds"]),
+  "train: a word for a number": (
+    ["train", "walker", "--set", "updates=abc"],
+    ["updates takes int", "'abc'"],
+  ),
+  "train: a fraction for a count": (
+    ["train", "walker", "--set", "envs=2.5"],
+    ["envs takes int", "2.5"],
+  ),
+  "train: rises for ever": (["train", "walker", "--set", "lr_end=-1"], ["lr_end", "-1"]),
+  "train: never an update": (
+    ["train", "walker", "--preset", "tiny", "--set", "capacity=16"],
+    ["capacity=16", "capacity=128 would"],
+  ),
+  "detector: half a sample": (
+    ["run", "walker", "--set", "window=100.5"],
+    ["window takes int", "100.5"],
+  ),
+  "detector: half a patience": (["run", "walker", "--set", "patience=1.5"], ["patience takes int"]),
+  "detector: a flag for a number": (
+    ["run", "walker", "--detector", "cusum", "--set", "slack=true"],
+    ["slack takes float"],
+  ),
+  "detector: a number for a channel": (
+    ["run", "walker", "--detector", "cusum", "--set", "channel=5"],
+    ["5 is no channel", "opr"],
+  ),
+  "detector: no channel": (["run", "walker", "--detector", "cusum@"], ["no channel", "opr"]),
+  "detector: a threshold without end": (
+    ["run", "walker", "--detector", "cusum", "--set", "threshold=Infinity"],
+    ["threshold must be finite"],
+  ),
+  "adapt: acceptance": (
+    ["run", "walker", "--adapt.acceptance", "nan"],
+    ["acceptance must be finite"],
+  ),
+  "adapt: too long a reference": (
+    ["run", "walker", "--adapt.refit", "99999999"],
+    ["refit", "1,000,000"],
+  ),
+  "adapt: too much patience": (
+    ["run", "walker", "--adapt.patience", "999999999"],
+    ["patience", "100,000"],
+  ),
+  "adapt: too large a batch": (["run", "walker", "--adapt.batch", "1000000"], ["batch", "4,096"]),
+  "adapt: more than 31 bits": (
+    ["run", "walker", "--adapt.budget", "99999999999"],
+    ["budget", "2,147,483,646"],
+  ),
+  "run: a seed of more than 31 bits": (
+    ["run", "walker", "--first-seed", "2147483648"],
+    ["first_seed", "2,147,483,638"],
+  ),
+  "run: no agent": (["run", "walker", "--agent", ""], ["agent", "empty name"]),
+  "run: no out": (["run", "walker", "--out", ""], ["--out", "empty name"]),
+  "eval: a seed below 0": (["eval", "walker", "--seed", "-1"], ["seed", "-1"]),
+  "eval: a seed without end": (
+    ["eval", "walker", "--seed", "99999999999999999999"],
+    ["seed must lie in"],
+  ),
+  "eval: all episodes there are": (
+    ["eval", "walker", "--episodes", "100000000"],
+    ["episodes must lie in 1..10,000"],
+  ),
+  "train: a seed below 0": (["train", "walker", "--seed", "-1"], ["seed", "-1"]),
+  "train: never saved": (["train", "walker", "--save-every-s", "nan"], ["--save-every-s"]),
+  "train: updates without end": (
+    ["train", "walker", "--set", "updates=99999999999999999999"],
+    ["updates must be a whole number in"],
+  ),
+  "render: steps without end": (
+    ["render", "walker", "--steps", "99999999999"],
+    ["steps must lie in 1..100,000"],
+  ),
+  "bench: a shard in other digits": (["bench", "quick", "--shard", "²/3"], ["--shard takes K/N"]),
+  "list: all": (["list", "zz"], ["all", "envs"]),
+  "detector setting of another kind": (
+    ["run", "walker", "--detector", "multichart", "--set", "charts=5"],
+    ["charts", "commas", "5"],
+  ),
+  "adapting without a state behind": (
+    ["run", "walker", "--adapt.last-starts", "1"],
+    ["last_starts", "2 or more"],
+  ),
+  "train: no state behind": (
+    ["train", "walker", "--set", "last_starts=1"],
+    ["last_starts", "2..length"],
+  ),
+  "train: an agent that sees otherwise": (
+    ["train", "quadruped", "--agent", "quadruped"],
+    ["obs_scale spec", "--set obs_scale=spec"],
+  ),
+  "train: an agent of another size": (
+    ["train", "walker", "--preset", "tiny", "--agent", "walker"],
+    ["size size1m", "tiny"],
+  ),
+  "eval: environment": (["eval", "wlker"], ["wlker", "walker"]),
+  "eval: zero episodes": (["eval", "walker", "--episodes", "0"], ["episodes"]),
+  "eval: agent": (["eval", "walker", "--agent", "wlaker"], ["wlaker"]),
+  "list": (["list", "robots"], ["robots", "envs"]),
+  "plot": (["plot", "nowhere"], ["nowhere"]),
+}
+
+
+@pytest.mark.parametrize("case", RUN)
+def test_bad_argument_of_run_is_one_line(refused, tmp_path, case):
+  argv, words = RUN[case]
+  text = refused(2, *argv, "--out", tmp_path / "out")
+  assert all(word in text for word in words), text
+  assert content(tmp_path) == {}
+
+
+@pytest.mark.parametrize("case", OTHER)
+def test_bad_argument_is_one_line(refused, tmp_path, monkeypatch, case):
+  argv, words = OTHER[case]
+  monkeypatch.chdir(tmp_path)  # the default --out is relative
+  text = refused(2, *argv)
+  assert all(word in text for word in words), text
+  assert content(tmp_path) == {}
+
+
+# ---- bad agents ----------------------------------------------------------------------------------
+
+
+def tamper(folder, **changes):
+  card = json.loads((folder / "card.json").read_text())
+  (folder / "card.json").write_text(json.dumps(card | changes))
+
+
+def foreign(folder):
+  np.savez(folder / "agent.npz", w=np.zeros(3))
+
+
+def truncated(folder):
+  data = (folder / "agent.npz").read_bytes()
+  (folder / "agent.npz").write_bytes(data[: len(data) // 2])
+
+
+def other_size(folder):
+  tamper(folder, dreamer=dataclasses.asdict(PRESETS["cpu"].dreamer))
+
+
+AGENTS = {
+  "another robot": (lambda f: tamper(f, env="car"), 2, "car"),
+  "another size": (other_size, 1, "does not fit size size1m"),
+  "unknown size": (lambda f: tamper(f, dreamer={"size": "size3k"}), 2, "size1m"),
+  "truncated": (truncated, 1, "agent.npz"),
+  "empty": (lambda f: (f / "agent.npz").write_bytes(b""), 1, "agent.npz"),
+  "foreign": (foreign, 1, "does not fit"),
+  "no archive": (lambda f: (f / "agent.npz").write_text("weights"), 1, "agent.npz"),
+  "pickled": (lambda f: np.savez(f / "agent.npz", w=np.array([{}])), 1, "agent.npz"),
+  "without weights": (lambda f: (f / "agent.npz").unlink(), 1, "agent.npz"),
+  "card of something else": (
+    lambda f: (f / "card.json").write_text('{"name": "x"}'),
+    1,
+    "card.json",
+  ),
+  "card that is no object": (lambda f: (f / "card.json").write_text("[1]"), 1, "card.json"),
+  "card that is no JSON": (lambda f: (f / "card.json").write_text("{"), 1, "card.json"),
+}
+
+
+@pytest.mark.parametrize("command", ["run", "eval"])
+@pytest.mark.parametrize("case", AGENTS)
+def test_bad_agent_is_one_line(refused, saved, tmp_path, case, command):  # noqa: F811
+  spoil, code, word = AGENTS[case]
+  shutil.copytree(saved, tmp_path / "agent")
+  spoil(tmp_path / "agent")
+  before = content(tmp_path)
+  where = ["--out", tmp_path / "out"] if command == "run" else []
+  assert word in refused(code, command, "walker", "--agent", tmp_path / "agent", *where)
+  assert content(tmp_path) == before
+
+
+# ---- the output folder ---------------------------------------------------------------------------
+
+
+@pytest.fixture
+def begun(mjx, saved, tmp_path, monkeypatch):  # noqa: F811
+  """(arguments, folder) of a run that was cut off before its first chunk. The physics is never
+  stepped here: a chunk is a Ctrl-C.
+  """
+
+  def cut(self):
+    raise KeyboardInterrupt
+
+  monkeypatch.setattr(run.Runner, "step", cut)
+  argv = ["run", "walker", "--agent", saved, "--seeds", "1", "--out", tmp_path / "out"]
+  code, out, err = mjx(*argv)
+  assert (
+    (code, out) == (130, "") and err.count("mjx-cl: ") == 1 and "--resume" in err.splitlines()[-1]
+  )
+  return argv, tmp_path / "out"
+
+
+def test_another_run_is_refused_and_unchanged(refused, begun):
+  argv, out = begun
+  before = content(out)
+  assert json.loads(before["config.json"])["env"] == "walker"
+  text = refused(2, *argv)
+  assert all(word in text for word in (str(out), "--resume", "--overwrite"))
+  assert "exclude" in refused(2, *argv, "--resume", "--overwrite")
+  assert content(out) == before
+
+
+def test_resume_with_other_settings_is_refused(mjx, refused, begun):
+  argv, out = begun
+  before = content(out)
+  assert "severity" in refused(2, *argv, "--resume", "--severity", "0.25")
+  text = refused(2, *argv, "--resume", "--seeds", "2", "--set", "patience=9", "--adapt.ratio", "8")
+  assert all(word in text for word in ("seeds", "settings", "adapt")) and "severity" not in text
+  assert content(out) == before
+  assert mjx(*argv, "--resume")[0] == 130  # the same settings go on
+
+
+def test_resume_of_what_is_no_run(refused, begun):
+  argv, out = begun
+  (out / "config.json").write_text("{")
+  assert "config.json" in refused(1, *argv, "--resume")
+  (out / "config.json").write_text('{"command": "train", "env": "walker"}')
+  assert "command" in refused(2, *argv, "--resume")
+
+
+def test_overwrite_replaces_a_run_and_nothing_else(mjx, begun):
+  argv, out = begun
+  for name in ("trace.parquet", "summary.json", "figure.png", "notes.txt"):
+    (out / name).write_text("old")
+  assert mjx(*argv, "--overwrite", "--severity", "0.25")[0] == 130
+  assert json.loads((out / "config.json").read_text())["severity"] == 0.25
+  assert sorted(os.listdir(out)) == ["config.json", "notes.txt", "work"]
+
+
+@pytest.mark.parametrize(
+  "wrong",
+  [
+    ["--fault", "geer"],
+    ["--detector", "cusums"],
+    ["--target", "elbow"],
+    ["--agent", "wlaker"],
+    ["--severity", "2"],
+    ["--set", "a=1"],
+  ],
+)
+def test_a_mistake_beside_overwrite_loses_nothing(refused, begun, wrong):
+  argv, out = begun
+  (out / "trace.parquet").write_text("a night's work")
+  before = content(out)
+  refused(2, *argv, "--overwrite", *wrong)
+  assert content(out) == before
+
+
+def test_a_folder_of_something_else_is_refused(refused, saved, tmp_path):  # noqa: F811
+  (tmp_path / "thesis.tex").write_text("years")
+  assert "no run of mjx-cl" in refused(2, "run", "walker", "--agent", saved, "--out", tmp_path)
+  assert "is a file" in refused(
+    2, "run", "walker", "--agent", saved, "--out", tmp_path / "thesis.tex"
+  )
+  assert content(tmp_path) == {"thesis.tex": b"years"}
+
+
+# ---- a full disk ---------------------------------------------------------------------------------
+
+
+def full(*_, **__):
+  raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def test_a_full_disk_at_the_start_is_one_line(refused, saved, tmp_path, monkeypatch):  # noqa: F811
+  monkeypatch.setattr(store, "open", full, raising=False)
+  assert "No space left" in refused(
+    1, "run", "walker", "--agent", saved, "--seeds", "1", "--out", tmp_path / "out"
+  )
+  assert content(tmp_path / "out") == {}
+
+
+def test_a_full_disk_at_a_checkpoint_is_one_line(mjx, begun, monkeypatch):
+  """The chunk ends, its checkpoint does not fit: the run stops, what was there stays."""
+  argv, out = begun
+  before = content(out)
+
+  def step(self):
+    os.kill(os.getpid(), signal.SIGINT)
+    each = np.zeros(2, int)
+    return run.Progress(64, 25_000, 1.0, ["detector", "none"], [0, 0], each, each, each, each)
+
+  monkeypatch.setattr(run.Runner, "step", step)
+  monkeypatch.setattr(run.np, "savez", full)
+  code, _, err = mjx(*argv, "--resume")
+  *_, last = err.splitlines()
+  assert code == 1 and last.startswith("mjx-cl: ") and "No space left" in last and "intact" in last
+  assert content(out) == before
+
+
+def test_a_message_of_several_lines_becomes_one(refused, monkeypatch):
+  def fail(_):
+    raise FileError("first\n  second\tthird")
+
+  monkeypatch.setitem(app.DO, app.List, fail)
+  assert refused(1, "list") == "mjx-cl: first second third\n"
+
+
+def test_a_pipe_that_closes_is_no_error(mjx, monkeypatch):
+  def closed(_):
+    raise BrokenPipeError(errno.EPIPE, os.strerror(errno.EPIPE))
+
+  monkeypatch.setitem(app.DO, app.List, closed)
+  assert mjx("list") == (0, "", "")
+
+
+def test_a_second_interrupt_ends_the_process_without_its_threads(tmp_path):
+  """A thread that goes on after the interrupt must neither hold the process up nor write to the
+  terminal.
+  """
+  code = """
+import sys, threading, time, os, signal
+from mjx_cl.cli import app as cli, commands
+from mjx_cl.io.interrupt import Interruptible
+def slow():
+  time.sleep(30)
+  print("late")
+def do(args):
+  with Interruptible():
+    threading.Thread(target=slow).start()
+    for _ in range(2):
+      os.kill(os.getpid(), signal.SIGINT)
+    time.sleep(20)
+cli.DO[cli.Doctor] = do
+sys.argv = ["mjx-cl", "doctor"]
+sys.exit(cli.main())
+"""
+  # a shell ignores it for what it starts in the background
+  signal_off = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+  begin = time.monotonic()
+  out = subprocess.run(
+    [sys.executable, "-c", signal_off + code], capture_output=True, text=True, timeout=60
+  )
+  assert out.returncode == 130 and time.monotonic() - begin < 25  # the thread sleeps for 30 s
+  assert (
+    out.stderr.splitlines() == ["mjx-cl: stopping after this chunk, saving", "mjx-cl: interrupted"]
+    and "late" not in out.stdout
+  )

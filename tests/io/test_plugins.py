@@ -1,0 +1,673 @@
+"""Robots, faults and detectors of other packages: the class of docs/extending.md as a robot, one
+module with all three, and broken ones.
+"""
+
+import dataclasses
+import importlib.metadata
+import json
+import os
+import pathlib
+import re
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mjx_cl import detectors, envs, faults
+from mjx_cl.cli import app
+from mjx_cl.errors import PluginError, UserError
+from mjx_cl.io.plugins import Registry
+from mjx_cl.rollout.monitor import unknown
+
+ROOT = pathlib.Path(__file__).parents[2]
+EXTENDING = (ROOT / "docs/extending.md").read_text()
+REACH = re.search(r"class Reach:.*?\n\n\n", EXTENDING, re.S)[0]  # as a reader copies it
+PLUG = f'''import jax, jax.numpy as jnp
+from mjx_cl.detectors import Alarm, Detector, scalar
+from mjx_cl.faults.base import fault
+from mjx_cl.types import EnvState, Model, Spec, Step, Var
+
+{REACH}
+def sticky(env):
+  """The first command sticks at 0.
+
+  Severity: 1 holds it [1]. Target: the command. Owns `ctrl`. Source: made up.
+  """
+  return fault("sticky", env, ("ctrl",), ("all",), lambda hit, memory, severity, key, ports: (memory, {{"ctrl": ports.ctrl * (1.0 - severity)}}))
+
+@scalar
+def level(threshold: float = 3.0):
+  """A level."""
+  return Detector(lambda: (), lambda state, x: (state, Alarm(x > threshold, x)))
+
+def broken(env):
+  return 1 / 0
+'''
+
+
+@pytest.fixture
+def package(tmp_path):
+  """package(entries, code): environment variables in which a package `plug` with these entry points
+  is installed.
+  """
+
+  def make(entries: str, code: str = PLUG) -> dict:
+    (tmp_path / "plug.py").write_text(code)
+    info = tmp_path / "plug-1.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: plug\nVersion: 1\n")
+    (info / "entry_points.txt").write_text(entries)
+    return os.environ | {
+      "PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)]),
+      "JAX_PLATFORMS": "cpu",
+    }
+
+  return make
+
+
+def mjx(env, *argv):
+  return subprocess.run(
+    [sys.executable, "-m", "mjx_cl", *argv], env=env, capture_output=True, text=True, cwd=ROOT
+  )
+
+
+def test_one_module_brings_robot_fault_and_detector(package):
+  """It imports this package's modules while these look for it, in whatever order the tables are
+  used.
+  """
+  env = package(
+    "[mjx_cl.envs]\nreach = plug:Reach\n[mjx_cl.faults]\nsticky = "
+    "plug:sticky\n[mjx_cl.detectors]\nlevel = plug:level\n"
+  )
+  for what, name in (("envs", "reach"), ("faults", "sticky"), ("detectors", "level")):
+    out = mjx(env, "list", what, "--json")
+    assert out.returncode == 0 and name in json.loads(out.stdout)[what], out.stderr
+  code = """
+from mjx_cl import envs, faults, detectors
+env = envs.make("reach")
+print(type(env).__name__, faults.make("sticky", env).owns, faults.family("sticky"), "sticky" in faults.available(env), detectors.make("level", threshold=2.0) is not None)
+"""
+  out = subprocess.run(
+    [sys.executable, "-c", code], env=env, capture_output=True, text=True, cwd=ROOT
+  )
+  assert out.stdout.split("\n")[0] == "Reach ('ctrl',) plugin True True", out.stderr
+  out = mjx(env, "eval", "reach", "--physics", "mjx")
+  assert (
+    out.returncode == 2
+    and out.stderr.strip().count("\n") == 0
+    and "no physics backend" in out.stderr
+  )
+
+
+@pytest.mark.parametrize(
+  "entries, argv, words",
+  [
+    (
+      "[mjx_cl.envs]\nx = nowhere:Robot\n",
+      ("list", "envs"),
+      "environment 'x' of nowhere:Robot cannot be loaded: ModuleNotFoundError",
+    ),
+    (
+      "[mjx_cl.faults]\nboom = plug:broken\n",
+      ("run", "walker", "--fault", "boom", "--out", os.devnull + "/x"),
+      "fault 'boom' cannot be built for robot 'walker': ZeroDivisionError",
+    ),
+    (
+      "[mjx_cl.faults]\ngear = plug:sticky\n",
+      ("list", "faults"),
+      "fault 'gear' of plug:sticky is there already",
+    ),
+  ],
+)
+def test_a_broken_plug_in_is_one_line(package, tmp_path, entries, argv, words):
+  out = mjx(
+    package(entries), *[str(tmp_path / "out") if a.startswith(os.devnull) else a for a in argv]
+  )
+  assert (
+    out.returncode == 2
+    and words in out.stderr
+    and out.stderr.strip().count("\n") == 0
+    and not out.stdout
+  )
+
+
+def test_what_is_not_used_breaks_nothing(package):
+  assert mjx(package("[mjx_cl.envs]\nx = nowhere:Robot\n"), "list", "detectors").returncode == 0
+
+
+def test_the_readme_robot_is_built_with_and_without_physics(monkeypatch):
+  space = {}
+  exec(
+    "import jax, jax.numpy as jnp\nfrom mjx_cl.types import EnvState, Model, Spec, Step, Var\n"
+    + REACH,
+    space,
+  )
+
+  class Choosy(space["Reach"]):
+    def __init__(self, physics="auto"):
+      self.physics = physics
+
+  entry = lambda name, value: type(
+    "Entry", (), {"name": name, "value": f"mine:{name}", "load": staticmethod(lambda: value)}
+  )
+  monkeypatch.setattr(
+    importlib.metadata,
+    "entry_points",
+    lambda group: [
+      entry("reach", space["Reach"]),
+      entry("choosy", Choosy),
+      entry("bad", lambda: 1 / 0),
+    ],
+  )
+  monkeypatch.setattr(
+    envs,
+    "ENVS",
+    Registry(
+      "mjx_cl.envs", "environment", {name: envs.ENVS.members[name] for name in envs.ENVS.own}
+    ),
+  )
+  robot = envs.make("reach")
+  state, obs = robot.init(robot.model, jax.random.key(0))
+  assert robot.step(robot.model, state, jnp.ones(1))[1].obs.shape == obs.shape == (2,)
+  assert envs.make("choosy", "native").physics == "native" and envs.ENVS.plugged() == [
+    "reach",
+    "choosy",
+    "bad",
+  ]
+  with pytest.raises(UserError, match="no physics backend"):
+    envs.make("reach", "mjx")
+  with pytest.raises(PluginError, match="'bad' cannot be built: ZeroDivisionError"):
+    envs.make("bad")
+
+
+def test_a_registry_is_read_like_a_dict_and_filled_once(monkeypatch):
+  loads = []
+  entry = type(
+    "Entry",
+    (),
+    {
+      "name": "b",
+      "value": "mine:b",
+      "load": staticmethod(lambda: loads.append(len(table)) or (lambda: "b")),
+    },
+  )
+  monkeypatch.setattr(
+    importlib.metadata, "entry_points", lambda group: [entry] if group == "g" else []
+  )
+  table = Registry("g", "thing", {"a": print})
+  assert (
+    sorted({**table}) == ["a", "b"]
+    and len(table) == 2
+    and "b" in table
+    and table.get("c") is None
+    and [*table.items()][0] == ("a", print)
+  )
+  assert loads == [1]  # what looks into the table while it is filled sees what is there
+  assert set(detectors.DETECTORS.own) <= set(detectors.DETECTORS) and faults.FAULTS.plugged() == []
+
+
+def test_settings_of_a_wrong_kind_are_one_line(capsys, tmp_path):
+  for argv, words in (
+    ((), "rolling_sigma"),
+    (("--detector", "cusum"), "cusum"),
+    (("--detector", "ewma"), "ewma"),
+  ):
+    assert (
+      app.main(["run", "walker", "--set", "threshold=abc", "--out", str(tmp_path / "r"), *argv])
+      == 2
+    )
+    err = capsys.readouterr().err
+    assert (
+      f"detector '{words}': threshold takes float; got 'abc'" in err
+      and err.strip().count("\n") == 0
+    )
+  assert app.main(["run", "walker", "--set", "foo=3", "--out", str(tmp_path / "r")]) == 2
+  assert (
+    "window" in (err := capsys.readouterr().err)
+    and "threshold_rpr" in err
+    and not (tmp_path / "r").exists()
+  )
+
+
+def test_json_is_one_value_whatever_a_detector_prints(tmp_path, capsys):
+  """A user's class prints at every sample; standard output holds the JSON value alone, and is whole
+  again afterwards.
+  """
+  (tmp_path / "mine.py").write_text(
+    "class Prints:\n  def update(self, x):\n    print('seen', x)\n    return False\n"
+  )
+  rows = "\n".join(["a,b"] + [f"{k % 7},{k % 5}" for k in range(400)])
+  for name in ("log", "nominal"):
+    (tmp_path / f"{name}.csv").write_text(rows + "\n")
+  argv = [
+    "detect",
+    str(tmp_path / "log.csv"),
+    "--nominal",
+    str(tmp_path / "nominal.csv"),
+    "--detector",
+    f"{tmp_path}/mine.py:Prints",
+    "--out",
+    str(tmp_path / "out"),
+  ]
+  assert app.main([*argv, "--json"]) == 0
+  out, err = capsys.readouterr()
+  assert isinstance(json.loads(out), dict) and "seen 3.0" in err
+  assert (
+    app.main(["list", "arms", "--json"]) == 0
+    and "detector" in json.loads(capsys.readouterr().out)["arms"]
+  )
+
+
+def test_what_a_run_takes_with_a_doubt_and_what_it_refuses(capsys, tmp_path):
+  from mjx_cl.config import AdaptConfig, RunConfig, replace
+  from mjx_cl.runs import run
+
+  config = lambda **adapt: RunConfig(
+    "walker", onset=600, steps=1500, adapt=replace(AdaptConfig(), **adapt)
+  )
+  assert "onset 600 lies within adapt.warmup=1,000" in run.doubts(config())[0] and not run.doubts(
+    config(warmup=500)
+  )
+  assert "the run ends at step 1,500, within" in run.doubts(config(warmup=5000))[0]
+  assert not run.doubts(replace(config(), arms=("none",)))  # nobody listens
+  assert "before its fault at 1,500" in run.doubts(replace(config(), onset=1500))[
+    0
+  ] and not run.doubts(replace(config(), onset=1500, fault="none"))
+  assert (
+    "adapt.budget=3,000 ends every finetuning before"
+    in run.doubts(replace(config(warmup=500, budget=3000)))[0]
+  )
+  for argv, words in (
+    (("--adapt.warmup", "-1"), "warmup must be a whole number in 0"),
+    (("--fault", "gera"), "unknown fault"),
+  ):
+    assert app.main(["run", "walker", "--out", str(tmp_path / "r"), *argv]) == 2
+    assert (
+      words in capsys.readouterr().err and not (tmp_path / "r").exists()
+    )  # an empty folder is no run either
+
+
+def test_a_detector_in_the_loop_has_the_boards_threshold(tmp_path, monkeypatch):
+  """The one that is built, that config.json names and that the note tells are one; `--resume` and
+  `--merge` take no other.
+  """
+  from mjx_cl.config import RunConfig
+  from mjx_cl.detectors.base import Detector
+  from mjx_cl.runs import merge, run
+
+  built = []
+  monkeypatch.setattr(
+    detectors,
+    "make",
+    lambda name, **settings: (
+      built.append((name, settings)) or Detector(lambda: (), lambda state, x: (state, None))
+    ),
+  )
+  config = RunConfig(
+    "car",
+    fault="noise",
+    detector="cusum",
+    settings={"whiten": 8, "slack": 0.5},
+    seeds=1,
+    steps=64,
+    onset=10,
+  )
+  row = detectors.board()["car"]["cusum white"]
+  runner, told = run.Runner(config, tmp_path / "r"), []
+  assert built == [
+    ("cusum", {"robot": "car", "whiten": 8, "slack": 0.5, "threshold": row["threshold"]})
+  ]
+  value = runner.config_dict()
+  assert (
+    value["threshold"] == {"value": row["threshold"], "arl0": row["arl0"], "alarms": row["alarms"]}
+    and "threshold" not in value["settings"]
+  )
+  monkeypatch.setattr(run.Runner, "step", lambda self: 1 / 0)
+  with pytest.raises(ZeroDivisionError):
+    run.execute(config, tmp_path / "r", tell=told.append)
+  assert told[0] == (
+    "note: detector cusum at threshold "
+    + (
+      f"{row['threshold']:.6g}, at which the shipped car gave 33 false alarms in 3,384,480 "
+      "healthy control steps, one in 102,560 [73,029, 148,993]"
+    )
+  )
+  held = json.loads((tmp_path / "r" / "config.json").read_text())
+  for other in (
+    None,
+    held["threshold"] | {"value": 7.0},
+  ):  # of a version that had no such threshold, or another
+    (tmp_path / "r" / "config.json").write_text(
+      json.dumps(
+        {k: v for k, v in held.items() if k != "threshold"}
+        | ({"threshold": other} if other else {})
+      )
+    )
+    with pytest.raises(UserError, match="another default threshold than today; --overwrite"):
+      run.execute(config, tmp_path / "r", resume=True)
+    (tmp_path / "r" / "summary.json").write_text("{}")
+    with pytest.raises(UserError, match="another default threshold than today; --overwrite"):
+      merge.seeds_of(tmp_path / "r", config)
+    (tmp_path / "r" / "summary.json").unlink()
+  (tmp_path / "r" / "config.json").write_text(json.dumps(held))
+  with pytest.raises(UserError, match="another settings, threshold"):
+    run.execute(
+      dataclasses.replace(config, settings={"whiten": 8, "threshold": 3.0}),
+      tmp_path / "r",
+      resume=True,
+    )
+
+
+@pytest.mark.parametrize(
+  "robot, detector, change, text",
+  [
+    ("walker", "ewma", {}, "the shipped walker gave 33 false alarms"),
+    ("car_real", "ewma", {}, "148,993]; this run has another env"),
+    (
+      "walker",
+      "hotelling",
+      {"agent": "walker-plain", "form": "streaming"},
+      "another agent and form",
+    ),
+    (
+      "walker",
+      "cusum",
+      {"settings": {"whiten": 4}},
+      "its own default threshold, 8: none was found for walker",
+    ),
+    ("walker", "kswin", {}, "its own default threshold"),
+    ("car", "bfar", {"settings": {"rate": 0.5}}, "--set threshold=..."),
+    ("walker", "ewma", {"settings": {"threshold": 3.0}}, None),
+    ("walker", "ewma", {"arms": ("none", "oracle")}, None),
+    ("walker", "never", {}, None),
+    ("walker", "always", {}, None),
+    ("walker", "random", {}, None),
+    ("walker", "rolling_sigma", {}, None),
+    ("walker", "rolling_sigma_plain", {}, None),
+    ("walker", "rolling_sigma_FILE", {}, "its own default threshold, 4:"),
+  ],
+)
+def test_what_a_detector_runs_with_is_said(robot, detector, change, text, tmp_path):
+  from mjx_cl.config import RunConfig
+  from mjx_cl.runs import run
+
+  if detector.endswith("FILE"):
+    (tmp_path / "rolling_sigma_mine.py").write_text(
+      "from mjx_cl.detectors.cusum import cusum\ndef mine(threshold=4.0):\n  return "
+      "cusum(threshold=threshold)\n"
+    )
+    detector = f"{tmp_path}/rolling_sigma_mine.py:mine"
+  said = run.watching(RunConfig(robot, fault="noise", detector=detector, **change))
+  assert said is None if text is None else text in said
+
+
+def test_a_board_is_not_replaced_unasked(capsys, tmp_path):
+  (tmp_path / "board").mkdir()
+  (tmp_path / "board" / "leaderboard.json").write_text("{}")
+  assert (
+    app.main(["leaderboard", "--out", str(tmp_path / "board")]) == 2
+    and "--overwrite" in capsys.readouterr().err
+  )
+  (tmp_path / "file").write_text("")
+  assert (
+    app.main(["leaderboard", "--out", str(tmp_path / "file")]) == 2
+    and "is a file" in capsys.readouterr().err
+  )
+  assert (tmp_path / "board" / "leaderboard.json").read_text() == "{}"
+
+
+def test_an_agent_of_nan_has_no_return(capsys, tmp_path, monkeypatch):
+  from mjx_cl.training import evaluate
+
+  monkeypatch.setattr(
+    evaluate,
+    "evaluate",
+    lambda *a: {
+      "return_mean": float("nan"),
+      "return_iqm": float("nan"),
+      "return_ci": None,
+      "terminations": 0,
+    },
+  )
+  for more in ((), ("--json",)):
+    assert app.main(["eval", "walker", "--episodes", "1", *more]) == 1
+    out, err = capsys.readouterr()
+    assert not out and "no number" in err and err.strip().count("\n") == 0
+
+
+def test_what_does_not_fit_is_one_line(capsys, monkeypatch):
+  """XLA's own words for it; other errors of the run time stay what they are."""
+  from mjx_cl.cli import doctor
+
+  monkeypatch.setattr(
+    doctor,
+    "report",
+    lambda: (_ for _ in ()).throw(
+      RuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 8029696929576 bytes.")
+    ),
+  )
+  assert (
+    app.main(["doctor"]) == 1
+    and "out of memory" in (err := capsys.readouterr().err)
+    and err.strip().count("\n") == 0
+  )
+  monkeypatch.setattr(doctor, "report", lambda: (_ for _ in ()).throw(RuntimeError("a bug")))
+  with pytest.raises(RuntimeError, match="a bug"):
+    app.main(["doctor"])
+
+
+def test_a_pure_detector_of_a_file_is_made_and_a_plain_class_is_told_where_to_go(tmp_path, capsys):
+  (tmp_path / "mine.py").write_text(
+    PLUG + "\nclass Plain:\n  def update(self, x):\n    return x > 1\n"
+  )
+  detector = detectors.make(f"{tmp_path}/mine.py:level", channel="opr", log=False, threshold=2.0)
+  residual = unknown((), 4)._replace(valid=jnp.bool_(True))
+  (tmp_path / "a@b").mkdir()
+  (tmp_path / "a@b" / "mine.py").write_text(PLUG)
+  assert isinstance(detectors.make(f"{tmp_path}/a@b/mine.py:level@rpr"), detectors.Detector)
+  fired = [
+    bool(detector.update(detector.init(), residual._replace(opr=jnp.float32(x)))[1].fired)
+    for x in (1.0, 3.0)
+  ]
+  assert fired == [False, True]
+  for name, words in (
+    ("Plain", "leaderboard --add"),
+    ("Nobody", "nothing of the name 'Nobody'"),
+    ("level", "wrong_setting"),
+  ):
+    more = ("--set", "wrong_setting=1") if name == "level" else ()
+    assert (
+      app.main(
+        [
+          "run",
+          "walker",
+          "--detector",
+          f"{tmp_path}/mine.py:{name}",
+          "--out",
+          str(tmp_path / "r"),
+          *more,
+        ]
+      )
+      == 2
+    )
+    err = capsys.readouterr().err
+    assert words in err and err.strip().count("\n") == 0 and not (tmp_path / "r").exists()
+
+
+def test_robot_and_fault_of_a_file(tmp_path, capsys, tiny):
+  """As of a package: built, proven to act, trained agents fit by the robot's own name; the robot
+  names no physics.
+  """
+  import dataclasses
+
+  from mjx_cl.config import RunConfig, changes
+  from mjx_cl.io import tables
+  from mjx_cl.runs import certify, run
+  from mjx_cl.training import agents
+
+  (tmp_path / "mine.py").write_text(PLUG + "class Bare: pass\nrepr = repr\n")
+  robot, broken = (f"{tmp_path}/mine.py:{name}" for name in ("Reach", "sticky"))
+  env = envs.make(robot)
+  assert (
+    type(env) is type(envs.make(robot))
+    and type(env).__name__ == "Reach"
+    and robot in envs.ENVS
+    and robot not in [*envs.ENVS]
+  )
+  assert (
+    faults.make(broken, env).owns == ("ctrl",)
+    and faults.family(broken) == "plugin"
+    and faults.family("none") == "none"
+    and faults.family("gear") == "actuator"
+  )
+  assert "plugin: The first command sticks" in faults.about(broken)
+  rows = certify.certify(robot, episodes=0, only=(broken,))
+  acts = [r for r in rows if r["fault"] == broken and r["severity"] > 0]
+  assert (
+    acts
+    and all(not r["identical"] and r["first_step"] == 0 and r["physics"] == "jax" for r in acts)
+    and not certify.certificate.faulty(
+      [
+        certify.certificate.Certificate(*(r[k] for k in certify.certificate.Certificate._fields))
+        for r in rows
+      ]
+    )
+  )
+
+  config = RunConfig(
+    robot,
+    fault=broken,
+    steps=256,
+    onset=128,
+    seeds=1,
+    agent=str(tmp_path / "agent"),
+    detector=f"{tmp_path}/mine.py:level@rpr",
+  )
+  assert (
+    config.severity == 0.5 and changes(config)[0].fault == broken
+  )  # no preset, for all its slashes
+  agents.save(
+    tmp_path / "agent",
+    jax.jit(type(tiny)(tiny.config, 2, 1).init)(jax.random.key(0)),
+    {"env": "reach", "preset": "tiny", "repeat": 1, "dreamer": dataclasses.asdict(tiny.config)},
+  )
+  held = run.Runner(config, tmp_path / "run").config_dict()
+  assert (
+    held["physics"] == "jax"
+    and len(set(held["files"].values())) == 1
+    and set(held["files"]) == {robot, broken, config.detector}
+  )
+  (tmp_path / "run").mkdir(exist_ok=True)
+  tables.write_json(tmp_path / "run" / "config.json", held)
+  unresolved = lambda: {k: v for k, v in run.identity(config).items() if k != "physics"}
+  run.check_same(tmp_path / "run", unresolved())
+  (tmp_path / "mine.py").write_text(PLUG + "class Bare: pass\nrepr = repr  # another one\n")
+  with pytest.raises(
+    UserError, match="another files"
+  ):  # what the path holds now is not what the run began with
+    run.check_same(tmp_path / "run", unresolved())
+  assert "files" not in run.identity(RunConfig("walker"))
+
+  for argv, words in (
+    (("eval", f"{tmp_path}/mine.py:Nobody"), "nothing of the name 'Nobody'"),
+    (("eval", "nowhere.py:Robot"), "no file nowhere.py"),
+    (("eval", "no_such_module:Robot"), "no module 'no_such_module' is installed"),
+    (("eval", ":x"), "give module:Name or"),
+    (
+      ("run", "walker", "--fault", f"{tmp_path}/mine.py:broken", "--out", str(tmp_path / "r")),
+      "cannot be built for robot 'walker': ZeroDivisionError",
+    ),
+    (
+      ("run", "walker", "--fault", f"{tmp_path}/mine.py:repr", "--out", str(tmp_path / "r")),
+      "gives str in place of a Fault",
+    ),
+    (
+      ("run", "walker", "--fault", "~nobodyhere/mine.py:x", "--out", str(tmp_path / "r")),
+      "no file ~nobodyhere/mine.py",
+    ),
+    (
+      ("eval", f"{tmp_path}/mine.py:Bare"),
+      "gives Bare, which has no spec and no model and no init and no step",
+    ),
+  ):
+    code = app.main([*argv])
+    err = capsys.readouterr().err
+    assert (
+      code in (1, 2)
+      and words in err
+      and err.strip().count("\n") == 0
+      and not (tmp_path / "r").exists()
+    ), err
+
+
+def test_a_file_robot_that_is_a_shipped_one_by_another_path(tmp_path, capsys):
+  """A subclass goes by the name in its spec: it takes that robot's agent, or that of `agents_of`,
+  and cannot overwrite its costs unasked.
+  """
+  import types
+
+  from mjx_cl.io import tables
+  from mjx_cl.leaderboard import record
+  from mjx_cl.runs import certify
+  from mjx_cl.training import agents
+
+  (tmp_path / "mine.py").write_text(
+    "from mjx_cl.envs.walker import Walker\n\nclass Mine(Walker):\n  pass\n"
+  )
+  mine = envs.make(f"{tmp_path}/mine.py:Mine")
+  assert agents.is_shipped(mine) and agents.of(mine).card["env"] == "walker"
+  car = envs.make("car").spec
+  heir = types.SimpleNamespace(spec=car._replace(name="fast:car"), agents_of="car")
+  assert agents.is_shipped(heir) and agents.of(heir).card["env"] == "car"
+  heir.agents_of = None
+  assert not agents.is_shipped(heir)
+  with pytest.raises(UserError, match="no agent 'fast:car'"):
+    agents.of(heir)
+  tables.write_table(
+    tmp_path / "certificates.parquet",
+    {k: ["walker" if k == "robot" else 20 if k == "episodes" else None] for k in certify.COLUMNS},
+  )
+  for name in ("walker", f"{tmp_path}/mine.py:Mine"):
+    with pytest.raises(UserError, match="holds measured costs of walker"):
+      certify.guard(tmp_path, (name,), 0)
+    certify.guard(tmp_path, (name,), 20)
+  name = f"{tmp_path}/mine.py:Mine"
+  with pytest.raises(UserError, match="register it"):
+    record.prepare(types.SimpleNamespace(name="s", robots={name: {}}), (), "auto", None)
+
+
+def test_the_fault_of_the_docs(tmp_path):
+  """The example of docs/faults.md as a file of one's own, against a loop by hand: target hit alone,
+  band, an episode's start, severity 0.
+  """
+  text = (ROOT / "docs/faults.md").read_text()
+  (block,) = [
+    b for b in re.findall(r"^```python\n(.*?)^```", text, re.S | re.M) if "# mine.py" in b
+  ]
+  (tmp_path / "mine.py").write_text(block)
+  env = envs.make("walker")
+  fault = faults.make(f"{tmp_path / 'mine.py'}:sticky", env)
+  assert fault.targets[:2] == ("right_hip", "right_knee") and fault.owns == ("ctrl",)
+  commands = np.random.default_rng(0).uniform(-1, 1, (40, 6)).astype(np.float32)
+  step = jax.jit(
+    lambda state, severity, ctrl, first: fault.apply(
+      state, severity, jax.random.key(0), faults.Ports(env.model, ctrl=ctrl, first=first)
+    )
+  )
+  for severity in (0.0, 0.8):
+    state, held, differs = fault.init(jax.random.key(0), 1), np.zeros(6, np.float32), 0
+    for t, ctrl in enumerate(commands):
+      state, ports = step(state, jnp.float32(severity), ctrl, jnp.bool_(t in (0, 20)))
+      held = (
+        np.where(np.abs(ctrl - held) > np.float32(0.5) * np.float32(severity), ctrl, held)
+        if t not in (0, 20)
+        else ctrl
+      )
+      want = ctrl.copy()
+      want[1] = held[1]
+      np.testing.assert_array_equal(np.asarray(ports.ctrl), want)
+      differs += ports.ctrl[1] != ctrl[1]
+    assert (differs > 3) == (severity > 0)

@@ -1,0 +1,94 @@
+"""The set that ships: its documentation, who acted in it, how it reads."""
+
+import pathlib
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from mjx_cl import envs
+from mjx_cl.leaderboard import record, streams
+from mjx_cl.rollout.frozen import stream_keys
+from mjx_cl.training import agents
+
+ROOT = pathlib.Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def shipped():
+  return streams.StreamSet()
+
+
+def test_the_agents_that_ship_are_those_that_acted(shipped):
+  for robot in shipped.robots:
+    trained = agents.of(envs.make(robot))
+    assert shipped.config["agents"][robot]["crc32"] == record._digest(trained.train.params), robot
+
+
+def test_what_the_docs_say_of_it(shipped):
+  m, text = shipped.meta, (ROOT / "docs/detection.md").read_text()
+  hours = {
+    r: sum(
+      m["steps"][k] * m["control_s"][k]
+      for k in np.flatnonzero((m["robot"] == r) & (m["kind"] == "nominal"))
+    )
+    / 3600
+    for r in shipped.robots
+  }
+  said = re.search(r"walker (\d+\.\d) hours, car (\d+\.\d), quadruped (\d+\.\d)", text).groups()
+  assert [float(x) for x in said] == [
+    round(hours[r], 1) for r in ("walker", "car", "quadruped")
+  ] and sum(hours.values()) >= 10
+  assert {r: d["pasts_that_differ"] for r, d in shipped.config["details"].items()} == {
+    "walker": 0,
+    "car": 0,
+    "quadruped": 1,
+  }
+  files = sum(p.stat().st_size for p in shipped.folder.iterdir())
+  assert files <= 20e6
+
+
+def test_pandas_alone_joins_a_stream(shipped):
+  code = re.search(
+    r"```python\n(# join\.py.*?)```", (ROOT / "docs/detection.md").read_text(), re.DOTALL
+  ).group(1)
+  held = {}
+  exec(compile(code, "join.py", "exec"), held)
+  one, life = held["one"], held["life"]
+  want = shipped.get("walker", [one.stream])
+  assert life.step.tolist() == list(range(one.steps)) and want.onset[0] == one.onset
+  for name in ("opr", "rpr", "reward", "surprise"):
+    np.testing.assert_array_equal(
+      life[name].to_numpy(np.float32), getattr(want.residual, name)[:, 0]
+    )
+  np.testing.assert_array_equal(
+    life[[f"group_{k}" for k in range(8)]].to_numpy(np.float32), want.residual.groups[:, 0]
+  )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("robot", ["walker", "quadruped", "car"])
+def test_recorded_again_it_begins_alike(shipped, robot):
+  """40 steps of healthy robots by today's code and agent, within the rounding of the files; another
+  machine's last bits have not grown by then.
+  """
+  env = envs.make(robot)
+  seeds, each = shipped.suite.numbers("score")[:4], shipped.suite.nominal["score"]
+  keys = stream_keys(seeds, each + 1)[
+    np.flatnonzero(np.arange(len(seeds) * (each + 1)) % (each + 1))
+  ]
+  lanes = [record.Lane(seed) for seed in seeds for _ in range(each)]
+  got = record._record(
+    env, agents.of(env), lanes, keys, np.zeros(len(lanes), int), 64, 0, lambda *_: None
+  )
+  want = shipped.get(robot, shipped.find(robot, "nominal", "score")[: len(lanes)]).residual
+  grain = shipped.config["details"][robot]["rounding"]
+  ratio = np.abs(np.log(got["opr"][:40] / want.opr[:40]))
+  np.testing.assert_array_equal(np.isfinite(got["opr"][:40]), np.isfinite(want.opr[:40]))
+  assert (
+    np.nanmax(ratio) < grain["opr"]
+    and np.abs(got["reward"][:40] - want.reward[:40]).max() <= grain["reward"] / 2 + 0.01
+  )

@@ -1,0 +1,265 @@
+"""Several seeds in one program: as a loop over them, spread over devices, and one that fails alone."""
+
+import os
+import pathlib
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mjx_cl.config import PRESETS, TrainConfig, replace
+from mjx_cl.dreamer.agent import CAUSES, Weights, culprit
+from mjx_cl.errors import FileError, UserError
+from mjx_cl.io import runtime
+from mjx_cl.training import trainer as train
+
+DREAMER = replace(PRESETS["tiny"].dreamer, batch=4, length=8, imagine=4)
+CONFIG = TrainConfig(envs=4, updates=10_000, ratio=0.25, capacity=256)  # 2 updates a chunk
+SEEDS = 3
+_shared = {}
+
+
+def make_trainer(env, out):
+  trainer = train.Trainer(env, DREAMER, CONFIG, out, seeds=SEEDS)
+  trainer.collect, trainer.learn, trainer._add = _shared.setdefault(
+    id(env), (trainer.collect, trainer.learn, trainer._add)
+  )
+  return trainer
+
+
+def seed(tree, g):
+  return jax.tree.map(lambda x: x[g], tree)
+
+
+def test_seeds_in_one_program_are_a_loop_over_them(short_walker, tmp_path):
+  trainer = make_trainer(short_walker, tmp_path)
+  for _ in range(2):
+    trainer.step()
+  state, key = trainer.state, jax.random.key(5)
+  alone = train.make_learn(trainer.plain, DREAMER.batch, DREAMER.length)
+  copy = lambda tree: jax.tree.map(jnp.copy, tree)
+  one = [
+    alone(
+      *copy(jax.tree.map(lambda x: x[None], seed((state.train, state.replay), g))),
+      k,
+      Weights(),
+      np.ones(1, bool),
+      2,
+    )
+    for g, k in enumerate(jax.random.split(key, SEEDS))
+  ]
+  all_ = trainer.learn["pure"](
+    *copy((state.train, state.replay)), key, Weights(), np.ones(SEEDS, bool), 2
+  )
+  for g in range(SEEDS):
+    for (path, a), b in zip(jax.tree.leaves_with_path(one[g]), jax.tree.leaves(seed(all_, g))):
+      a, b = np.asarray(a[0], np.float64), np.asarray(b, np.float64)
+      # two programs of the same arithmetic; after 2 updates they differ by float32 rounding,
+      # latents by that of float16
+      np.testing.assert_allclose(
+        a, b, rtol=2e-3, atol=2e-4 * max(1.0, np.abs(a).max()), err_msg=jax.tree_util.keystr(path)
+      )
+  first = np.asarray(jax.tree.leaves(all_[0].params)[0])
+  assert np.abs(first[0] - first[1]).max() > 1e-3  # they are different seeds
+
+
+def poisoned(state, g, value):
+  """The state with one weight of seed g's reward head put to `value`: NaN gives a loss that is NaN,
+  1e8 one that is about 1e8.
+  """
+  params = state.train.params
+  bias = params["rew"]["out"]["bias"].at[g, 0].set(value)
+  params = {**params, "rew": {**params["rew"], "out": {**params["rew"]["out"], "bias": bias}}}
+  return state._replace(train=state.train._replace(params=params))
+
+
+def test_by_vmap_is_by_map(short_walker, tmp_path):
+  """Both ways over the seeds give the same weights, replay, metrics and culprits: one seed sound,
+  one that fails in its first update, one that is not active.
+  """
+  trainer = make_trainer(short_walker, tmp_path)
+  for _ in range(2):
+    trainer.step()
+  state, active = poisoned(trainer.state, 1, 1e8), np.array([True, True, False])
+  copy = lambda: jax.tree.map(jnp.copy, (state.train, state.replay))
+  assert runtime.seeds_by() == "map"  # on a CPU
+  by_map = trainer.learn["pure"](*copy(), jax.random.key(5), Weights(), active, 2)
+  by_vmap = train.make_learn(trainer.plain, DREAMER.batch, DREAMER.length, how="vmap")(
+    *copy(), jax.random.key(5), Weights(), active, 2
+  )
+  assert list(by_map[3]) == list(by_vmap[3]) == [-1, CAUSES.index("loss/rew"), -1]
+  assert [int(x) - int(y) for x, y in zip(by_vmap[0].updates, state.train.updates)] == [2, 0, 0]
+  moved = lambda out: np.abs(
+    np.asarray(jax.tree.leaves(out[0].params)[0])
+    - np.asarray(jax.tree.leaves(state.train.params)[0])
+  ).max(1)
+  assert moved(by_vmap)[0] > 0 and not moved(by_vmap)[1:].any()
+  assert jax.tree.structure(by_map) == jax.tree.structure(by_vmap)
+  for (path, a), b in zip(jax.tree.leaves_with_path(by_map), jax.tree.leaves(by_vmap)):
+    assert (a.shape, a.dtype) == (b.shape, b.dtype), jax.tree_util.keystr(path)
+    a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
+    # two programs of the same arithmetic; after 2 updates they differ by float32 rounding, latents
+    # by that of float16
+    np.testing.assert_allclose(
+      a, b, rtol=2e-3, atol=2e-4 * max(1.0, np.abs(a[0]).max()), err_msg=jax.tree_util.keystr(path)
+    )
+  with pytest.raises(UserError, match="unknown how 'pmap'; choose from: map, vmap"):
+    train.make_learn(trainer.plain, DREAMER.batch, DREAMER.length, how="pmap")
+
+
+@pytest.mark.parametrize(
+  "value, at_fault",
+  [(1e6, False), (1.01e6, True), (-1.01e6, True), (3e38, True), (np.inf, True), (np.nan, True)],
+)
+def test_a_loss_beyond_the_bound_is_at_fault(value, at_fault):
+  metrics = {k: jnp.float32(1.0) for k in CAUSES if k != "loss/anchor"}
+  assert int(culprit(metrics | {"loss/value": jnp.float32(value)})) == (
+    CAUSES.index("loss/value") if at_fault else -1
+  )
+  assert int(culprit(metrics | {"opt/grad_norm": jnp.float32(value)})) == (
+    -1 if np.isfinite(value) else CAUSES.index("opt/grad_norm")
+  )
+
+
+@pytest.mark.parametrize("value", [np.nan, 1e8], ids=["nan", "exploded"])
+def test_a_seed_that_fails_stops_alone_and_is_named(
+  short_walker, tmp_path, same, capfd, monkeypatch, value
+):
+  monkeypatch.chdir(tmp_path)  # MuJoCo logs actions that are not finite into the working folder
+  sound, hurt = (
+    make_trainer(short_walker, tmp_path / "sound"),
+    make_trainer(short_walker, tmp_path / "hurt"),
+  )
+  for trainer in (sound, hurt):
+    trainer.step()
+  hurt.state = poisoned(hurt.state, 1, value)
+  at = int(hurt.state.train.updates[1])
+  frozen = jax.tree.map(jnp.copy, seed(hurt.state.train, 1))
+  rows, learn, metrics = [], hurt.learn, []
+
+  def watched(*args):
+    out = learn["pure"](*args)
+    metrics.append(np.asarray(out[2]["loss/rew"]))
+    return out
+
+  hurt.learn = {"pure": watched}
+  rows = [hurt.step() for _ in range(2)]
+  hurt.learn = learn
+  assert np.isnan(metrics[0][1]) if np.isnan(value) else 1e6 < metrics[0][1] < np.inf
+  for _ in range(2):
+    sound.step()
+  assert (
+    list(hurt.failed) == [1]
+    and hurt.failed[1] == f"loss/rew is not finite, or above 1e+06, in update {at + 1}"
+  )
+  said = capfd.readouterr().err
+  assert said.count("numeric failure of seed 1") == 1
+  for g in (0, 2):
+    assert same(seed(hurt.state.train, g), seed(sound.state.train, g)) and same(
+      seed(hurt.state.replay, g), seed(sound.state.replay, g)
+    )
+  assert same(seed(hurt.state.train, 1), frozen)  # nothing of the update at fault remains
+  assert [r["failed_seeds"] for r in rows] == [1, 1] and all(
+    np.isfinite(r["opt/loss"]) for r in rows
+  )
+  assert hurt.updates == sound.updates
+  each = [
+    rows[-1][f"return/{g}"] for g in range(SEEDS)
+  ]  # returns are kept apart, and all robots have equally many episodes
+  np.testing.assert_allclose(np.mean(each), rows[-1]["return"], rtol=1e-6)
+  assert len(set(each)) == SEEDS
+  hurt.save()
+  again = make_trainer(short_walker, tmp_path / "hurt")
+  again.resume()
+  assert again.failed == hurt.failed
+  again.step()
+  assert same(seed(again.state.train, 1), frozen)
+
+
+def test_when_every_seed_fails_the_training_ends(short_walker, tmp_path, monkeypatch):
+  monkeypatch.chdir(tmp_path)
+  trainer = make_trainer(short_walker, tmp_path)
+  trainer.step()
+  trainer.state = trainer.state._replace(
+    train=trainer.state.train._replace(
+      params=jax.tree.map(lambda x: x * jnp.nan, trainer.state.train.params)
+    )
+  )
+  with pytest.raises(FileError, match="numeric failure of every seed") as e:
+    for _ in range(2):
+      trainer.step()
+  assert "\n" not in str(e.value)
+
+
+DEVICES = """
+import sys
+from mjx_cl.io import runtime; runtime.setup()
+import jax, numpy as np
+assert len(jax.devices()) == {devices}
+sys.path.insert(0, {tests!r})
+import test_seeds
+from mjx_cl import envs
+from mjx_cl.io import checkpoints as checkpoint
+from mjx_cl.training import trainer as train
+env = envs.make("walker", "native")
+env.spec = env.spec._replace(episode_steps=12)
+trainer = train.Trainer(env, test_seeds.DREAMER, test_seeds.CONFIG, {out!r}, seeds=2)
+assert (trainer.mesh is not None) == ({devices} > 1)
+while trainer.updates < 4:
+  trainer.step()
+if trainer.mesh is not None:
+  leaf = jax.tree.leaves(trainer.state.train.params)[0]
+  assert len(leaf.sharding.device_set) == 2 and leaf.addressable_shards[0].data.shape[0] == 1
+trainer.save()
+second = train.Trainer(env, test_seeds.DREAMER, test_seeds.CONFIG, {out!r}, seeds=2)
+second.resume()
+leaves = [np.asarray(x) for x in jax.tree.leaves(second.state.train)]
+np.savez({out!r} + "/state.npz", *leaves)
+bits = lambda t: [(jax.tree_util.keystr(p), np.asarray(x).tobytes()) for p, x in jax.tree.leaves_with_path(checkpoint.pack(t.state))]
+at = second.updates
+for _ in range(2):
+  trainer.step()
+  second.step()
+assert second.updates > at  # what was read meets what is spread over devices
+assert bits(second) == bits(trainer)  # N updates, save, load, M updates are N + M in one go
+second.state = second._place(test_seeds.poisoned(second.state, 1, 1e8))
+frozen = [np.asarray(x[1]) for x in jax.tree.leaves(second.state.train)]
+trainer.step()
+row = second.step()
+one = lambda t, g: [np.asarray(x[g]) for x in jax.tree.leaves(t.state.train)]
+assert list(second.failed) == [1] and second.failed[1].startswith("loss/rew is not finite, or above 1e+06") and row["failed_seeds"] == 1
+assert all(map(np.array_equal, frozen, one(second, 1))) and all(map(np.array_equal, one(trainer, 0), one(second, 0)))
+"""
+
+
+def test_two_devices_equal_one(tmp_path):
+  """The same training on one and on two host devices, through a checkpoint; the programs differ, so
+  bits may.
+
+  On either: going on from the checkpoint gives the bits of never having stopped, and a seed whose
+  loss explodes leaves the other's bits alone.
+  """
+  out = {}
+  for devices in (1, 2):
+    folder = tmp_path / str(devices)
+    # compiles sooner, see quick.py
+    flags = f"--xla_force_host_platform_device_count={devices} --xla_backend_optimization_level=0"
+    code = DEVICES.format(
+      devices=devices, tests=str(pathlib.Path(__file__).parent), out=str(folder)
+    )
+    done = subprocess.run(
+      [sys.executable, "-c", code],
+      env=os.environ | {"XLA_FLAGS": flags},
+      capture_output=True,
+      text=True,
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    with np.load(folder / "state.npz") as z:
+      out[devices] = [z[k] for k in z.files]
+  for a, b in zip(out[1], out[2]):
+    np.testing.assert_allclose(
+      a, b, rtol=1e-3, atol=1e-5 * max(1.0, float(np.abs(a).max()))
+    )  # 4 updates in float32, two programs
