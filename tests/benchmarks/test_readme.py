@@ -1,15 +1,20 @@
-"""What the README shows as Python runs as it stands there."""
+"""What README and docs/extending.md show as Python runs as it stands there; the README's figures
+are those of results/.
+"""
 
 import pathlib
 import re
+import statistics
 import subprocess
 import sys
 
 import numpy as np
+import pyarrow.parquet as parquet
 import pytest
 
-README = (pathlib.Path(__file__).parents[2] / "README.md").read_text()
-BLOCKS = re.findall(r"^```python\n(.*?)^```", README, re.S | re.M)
+ROOT = pathlib.Path(__file__).parents[2]
+README, OWN = ((ROOT / page).read_text() for page in ("README.md", "docs/extending.md"))
+BLOCKS = re.findall(r"^```python\n(.*?)^```", README + OWN, re.S | re.M)
 
 
 def run(code, cwd):
@@ -21,6 +26,93 @@ def run(code, cwd):
 @pytest.mark.parametrize("block", [b for b in BLOCKS if "Trainer" not in b])
 def test_short_examples_run(block, tmp_path):
   run(block, tmp_path)
+
+
+def test_the_first_screen_is_short_and_light():
+  assert len(README.split()) <= 1500
+  assert (ROOT / "docs/film.gif").stat().st_size <= 2e6 and "](docs/film.gif)" in README
+
+
+def test_results_are_light():
+  """As committed; what a run of one's own left there does not count."""
+  found = subprocess.run(
+    ["git", "ls-files", "-z", "results"], cwd=ROOT, capture_output=True, text=True
+  )
+  if found.returncode:
+    pytest.skip("no git checkout")
+  sizes = {
+    name: (ROOT / name).stat().st_size
+    for name in found.stdout.split("\0")
+    if name and (ROOT / name).exists()
+  }
+  assert sum(sizes.values()) <= 15e6 and max(sizes.values()) <= 6e6
+
+
+def counts(folder, change=0):
+  """Of the streams of a run: affected, noticed, median latency, back with adaptation, without."""
+  rows = [
+    r
+    for r in parquet.read_table(ROOT / "results" / folder / "runs.parquet").to_pylist()
+    if (r["change"] or 0) == change
+  ]
+  own = [r for r in rows if r["arm"] == "detector"]
+  back = {
+    arm: sum(r["affected"] and r["recovery_step"] is not None for r in rows if r["arm"] == arm)
+    for arm in ("detector", "none")
+  }
+  latency = statistics.median_low(
+    np.inf if r["latency_steps"] is None else r["latency_steps"] for r in own
+  )
+  return (
+    sum(r["affected"] for r in own),
+    sum(r["latency_steps"] is not None for r in own),
+    latency,
+    back["detector"],
+    back["none"],
+  )
+
+
+def test_the_table_of_four_rows_is_that_of_results():
+  rows = [
+    [cell.strip() for cell in line.strip("|").split("|")]
+    for line in README.splitlines()
+    if line.startswith("| ") and "10 seeds" in line
+  ]
+  walker, car, socks, quadruped = (
+    [
+      int(n)
+      for cell in row[1:4]
+      for n in re.findall(r"\d+", re.sub(r"\([^)]*\)", "", cell.replace(",000", "000")))
+    ]
+    for row in rows
+  )
+  runs = [
+    r
+    for r in parquet.read_table(ROOT / "results/walker_gear/runs.parquet").to_pylist()
+    if r["arm"] == "detector" and r["affected"]
+  ]
+  soon = sum(
+    r["recovery_step"] is not None and r["recovery_step"] - r["onset"] <= 10_000 for r in runs
+  )
+  assert all(r["latency_steps"] <= 500 for r in runs)
+  assert walker == [
+    len(runs),
+    len(runs),
+    500,
+    soon,
+    5,
+    3,
+    len(runs),
+    10000,
+    counts("walker_gear")[4],
+    len(runs),
+  ]  # two of three machines' runs are not kept
+  n, noticed, latency, back, without = counts("paper/car")
+  assert car == [noticed, 10, latency, back, n, without, n]
+  n, noticed, latency, back, _ = counts("paper/car", 1)
+  assert socks == [noticed, 10, latency, back, n]
+  n, noticed, _, back, without = counts("paper/quadruped")
+  assert quadruped == [noticed, 10, back, n, without, n]
 
 
 def test_the_learner_learns_the_environment_of_the_example(tmp_path):

@@ -1,5 +1,5 @@
-"""Robots, faults and detectors of other packages: the README's class as a robot, one module with
-all three, and broken ones.
+"""Robots, faults and detectors of other packages: the class of docs/extending.md as a robot, one
+module with all three, and broken ones.
 """
 
 import dataclasses
@@ -23,8 +23,8 @@ from mjx_cl.io.plugins import Registry
 from mjx_cl.rollout.monitor import unknown
 
 ROOT = pathlib.Path(__file__).parents[2]
-README = (ROOT / "README.md").read_text()
-REACH = re.search(r"class Reach:.*?\n\n", README, re.S)[0]  # as a reader copies it
+EXTENDING = (ROOT / "docs/extending.md").read_text()
+REACH = re.search(r"class Reach:.*?\n\n\n", EXTENDING, re.S)[0]  # as a reader copies it
 PLUG = f'''import jax, jax.numpy as jnp
 from mjx_cl.detectors import Alarm, Detector, scalar
 from mjx_cl.faults.base import fault

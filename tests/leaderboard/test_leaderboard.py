@@ -886,7 +886,7 @@ def test_what_is_no_detector_gets_one_line(refused, late, tmp_path, monkeypatch)
   "part, name, others",
   [("mine.py:Mine", "Mine", set()), ("river.drift:PageHinkley", "PageHinkley", {"cusum@opr"})],
 )
-def test_the_readmes_commands(late, tmp_path, monkeypatch, mjx, part, name, others):  # noqa: F811
+def test_the_commands_for_ones_own_detector(late, tmp_path, monkeypatch, mjx, part, name, others):  # noqa: F811
   """A class out of a file and a river detector, calibrated to the asked rate; both see the fault of
   four deviations.
   """
@@ -897,13 +897,13 @@ def test_the_readmes_commands(late, tmp_path, monkeypatch, mjx, part, name, othe
     b
     for b in re.findall(
       r"^```python\n(.*?)^```",
-      (pathlib.Path(__file__).parents[2] / "README.md").read_text(),
+      (pathlib.Path(__file__).parents[2] / "docs/extending.md").read_text(),
       re.S | re.M,
     )
     if "# mine.py" in b
   ]
   pathlib.Path("mine.py").write_text(block)
-  command, *more = shown("README.md", part)
+  command, *more = shown("docs/extending.md", part)
   code, out, err = mjx(command, late, *more, "--json")
   assert code == 0, err
   rows = json.loads(out)
