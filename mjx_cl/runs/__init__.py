@@ -1,0 +1,1 @@
+"""Runs of the whole loop and suites of them, with what they write down."""

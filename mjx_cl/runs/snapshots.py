@@ -1,0 +1,278 @@
+"""Snapshots of an adaptation that never stops by itself, and what each is worth on the broken
+robot: afterwards the best stop can be chosen.
+
+A snapshot is what the robot acts by (encoder, dynamics, policy: 1.6 MiB of size1m), float32, so
+that it is what acted to the last bit. It lies in OUT/work until the run is over. Its name holds its
+stream and step: a chunk that is lived again after a kill writes the same file again.
+"""
+
+from __future__ import annotations
+
+import os
+import pathlib
+import time
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_cl import faults as faults_lib
+from mjx_cl.adapt import phase as phase_lib
+from mjx_cl.adapt.arms import ARMS, never_stops
+from mjx_cl.errors import FileError, UserError
+from mjx_cl.io.interrupt import Interruptible
+from mjx_cl.rollout.scan import Rollout, nest, start
+
+ACTS = ("enc", "dyn", "pol")  # of the parameters: what Agent.act reads
+EPISODES = 5
+LIMIT_MIB = 2048  # of snapshots on the disk
+BATCH = 32  # snapshots evaluated side by side ...
+BATCH_MIB = 256  # ... unless their weights together are more
+LENGTH = 50  # decisions per call
+KEY = 9  # what a seed's key folds in for its episodes; a run folds in 7
+
+
+class Snapshot(NamedTuple):
+  """stream, since: control step at which its adaptation started, step: last control step before it
+  was taken.
+  """
+
+  stream: int
+  since: int
+  step: int
+
+
+def due(before, decision, since, now: int, length: int, every: int) -> np.ndarray:
+  """Streams of which a snapshot is taken after a chunk.
+
+    one of since, since + every, since + 2 every, ...  lies in now - length .. now - 1, and the
+    stream adapted in the chunk
+
+  Args:
+    before: int (groups,), phase before the chunk. decision, since: int (groups,), of its end, see
+      phase.PhaseState. now: control steps done after it.
+    length: control steps of a chunk. every: control steps between two snapshots.
+  Returns:
+    bool (groups,). The first one, at since itself, holds the weights that adaptation began with.
+  """
+  before, decision, age = np.asarray(before), np.asarray(decision), now - 1 - np.asarray(since)
+  adapted = (before == phase_lib.ADAPTING) | (decision == phase_lib.START)
+  return adapted & (age >= 0) & (age // every != (age - length) // every)
+
+
+class Snapshots:
+  """Snapshots of one run: taken chunk by chunk, evaluated when it is over.
+
+  Args:
+    config: RunConfig. env, agent, faults, changes: the robot as it is once it has changed, and what
+      happens to it.
+    repeat: control steps per decision. labels: (arm, seed) of each stream. params: of the agent,
+      for their shapes.
+    folder: where they lie; made when the first is taken.
+  Raises:
+    UserError where the run would take more than LIMIT_MIB of them.
+  """
+
+  def __init__(self, config, env, agent, faults, changes, repeat: int, labels, params, folder):
+    self.config, self.env, self.agent, self.faults, self.changes, self.repeat = (
+      config,
+      env,
+      agent,
+      faults,
+      changes,
+      repeat,
+    )
+    self.labels, self.folder = labels, pathlib.Path(folder)
+    self.kept = np.array([never_stops(ARMS[arm]) for arm, _ in labels])
+    self.like = jax.tree.map(
+      lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), {k: params[k] for k in ACTS}
+    )
+    self.bytes = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(self.like))
+    streams, span = int(self.kept.sum()), max(0, config.steps - config.onset)
+    need = streams * (span // config.snapshots + 1 + len(changes)) * self.bytes
+    if need > LIMIT_MIB * 2**20:
+      fit = (
+        LIMIT_MIB * 2**20 // (self.bytes * streams) - 1 - len(changes)
+      )  # of one stream, besides the first of each adaptation
+      more = f"snapshots={span // (fit + 1) + 1} would fit" if fit >= 0 else "take fewer seeds"
+      raise UserError(
+        f"snapshots={config.snapshots} would take up to {need / 2**20:,.0f} MiB on the disk, "
+        f"{LIMIT_MIB} may be used; {more}"
+      )
+
+  # ---- while the run lives -----------------------------------------------------------------------
+
+  def take(self, acting, place, before, digest, now: int, length: int) -> None:
+    """Writes the snapshots that are due. acting: parameters, those of stream g at place[g]; digest:
+    loop.Digest; the rest as in `due`.
+    """
+    wanted = np.flatnonzero(
+      due(before, digest.decision, digest.since, now, length, self.config.snapshots) & self.kept
+    )
+    if not len(wanted):
+      return
+    arrays = {name: np.asarray(leaf) for name, leaf in _named({k: acting[k] for k in ACTS})}
+    for g in wanted:
+      self._write(
+        self._path(Snapshot(int(g), int(digest.since[g]), min(now, self.config.steps) - 1)),
+        {name: x[place[g]] for name, x in arrays.items()},
+      )
+
+  def _path(self, s: Snapshot) -> pathlib.Path:
+    return self.folder / f"{s.stream:04d}-{s.step:09d}.npz"
+
+  def _write(self, path, arrays) -> None:
+    tmp = path.with_name(path.stem + ".tmp.npz")
+    try:
+      self.folder.mkdir(parents=True, exist_ok=True)
+      np.savez(tmp, **arrays)
+      os.replace(tmp, path)
+    except OSError as e:
+      tmp.unlink(missing_ok=True)
+      raise FileError(
+        f"cannot write in {self.folder}: {e.strerror or e}; the last checkpoint is intact"
+      ) from None
+
+  def _read(self, s: Snapshot):
+    path = self._path(s)
+    try:
+      with np.load(path, allow_pickle=False) as z:
+        arrays = [z[name] for name, _ in _named(self.like)]
+    except (OSError, ValueError, KeyError) as e:
+      raise FileError(f"cannot read snapshot {path}: {e}") from None
+    if [x.shape for x in arrays] != [x.shape for x in jax.tree.leaves(self.like)]:
+      raise FileError(f"snapshot {path} belongs to another size or robot")
+    return jax.tree.unflatten(jax.tree.structure(self.like), arrays)
+
+  def taken(self, trace, length: int) -> list[Snapshot]:
+    """All snapshots of a run, from its trace: `phase` (steps, groups), `decision`, `since` (chunks,
+    groups); no other file counts.
+    """
+    out = []
+    for c, (decision, since) in enumerate(zip(trace["decision"], trace["since"])):
+      hit = (
+        due(
+          trace["phase"][c * length],
+          decision,
+          since,
+          (c + 1) * length,
+          length,
+          self.config.snapshots,
+        )
+        & self.kept
+      )
+      out += [
+        Snapshot(int(g), int(since[g]), min((c + 1) * length, self.config.steps) - 1)
+        for g in np.flatnonzero(hit)
+      ]
+    return sorted(out)
+
+  # ---- when it is over ---------------------------------------------------------------------------
+
+  def severities(self, since: int) -> list[float]:
+    """Of each fault: its full severity where it is there in control step `since`, else 0."""
+    begins = [self.config.onset + c.after for c in self.changes]
+    return [
+      c.severity if begin <= since and (not c.duration or since < begin + c.duration) else 0.0
+      for c, begin in zip(self.changes, begins)
+    ]
+
+  def evaluate(
+    self, wanted: list[Snapshot], targets, tell=lambda text: None
+  ) -> tuple[dict[str, np.ndarray], float]:
+    """Lives EPISODES episodes with each snapshot: weights frozen, the stream's own fault in full
+    force from step 0, whatever its schedule.
+
+    All snapshots of a seed meet the same keys: the same starts, the same noise. Up to BATCH of them
+    share one program, their weights and faults along a leading axis; each batch leaves its scores
+    beside the snapshots, so that what was cut off goes on with the next one.
+
+    Args:
+      targets: int (groups, F), of each stream's faults.
+      tell: called with a line after each batch.
+    Returns:
+      (columns of snapshots.parquet, seconds that it took).
+    """
+    size = max(1, min(BATCH, len(wanted), BATCH_MIB * 2**20 // self.bytes))
+    parts, program = [], None
+    with Interruptible() as interrupt:
+      for first in range(0, len(wanted), size):
+        batch = wanted[first : first + size]
+        path, part = self.folder / f"scores-{first:06d}.npz", None
+        if path.exists():
+          with np.load(path, allow_pickle=False) as z:
+            part = {k: z[k] for k in z.files}
+        if part is None or part["of"].tolist() != [list(s) for s in batch]:
+          begin = time.perf_counter()
+          program = program or self._program()
+          returns, steps = self._live(
+            program, batch + batch[:1] * (size - len(batch)), np.asarray(targets), interrupt
+          )
+          part = {
+            "of": np.array(batch),
+            "returns": returns[: len(batch)],
+            "steps": steps[: len(batch)],
+            "seconds": np.array(time.perf_counter() - begin),
+          }
+          self._write(path, part)
+          interrupt.check()
+        parts.append(part)
+        tell(f"snapshots evaluated: {min(first + size, len(wanted))} of {len(wanted)}")
+    returns, steps = (np.concatenate([p[k] for p in parts]) for k in ("returns", "steps"))
+    return self._columns(wanted, returns, steps), float(sum(p["seconds"] for p in parts))
+
+  def _columns(self, wanted, returns, steps) -> dict[str, np.ndarray]:
+    stream, since, step = np.array(wanted).T
+    return {
+      "stream": stream.astype(np.int32),
+      "arm": np.array([self.labels[g][0] for g in stream]),
+      "seed": np.array([self.labels[g][1] for g in stream], np.int32),
+      "step": step.astype(np.int32),
+      "since_start": (step + 1 - since).astype(np.int32),
+      "reward_mean": returns.sum(1) / steps.sum(1),
+      "steps": steps.sum(1).astype(np.int32),
+      **{f"return_{i}": returns[:, i] for i in range(EPISODES)},
+    }
+
+  def _program(self):
+    begin = lambda key, target, severity: start(
+      self.env, self.agent, self.faults, key, target=target, plan=faults_lib.plan(severity)
+    )
+    return jax.jit(nest(begin, (0, 0, 0), (0, None, None))), Rollout(
+      self.env, self.agent, self.faults, self.repeat, self.config.deterministic
+    )
+
+  def _live(self, program, batch, targets, interrupt):
+    """Returns and control steps of one episode per key, float64 and int (snapshots, EPISODES)."""
+    begin, rollout = program
+    params = jax.tree.map(lambda *x: jnp.stack(x), *map(self._read, batch))
+    keys = jnp.stack(
+      [
+        jax.random.split(
+          jax.random.fold_in(jax.random.key(self.labels[s.stream][1]), KEY), EPISODES
+        )
+        for s in batch
+      ]
+    )
+    severity = jnp.asarray([self.severities(s.since) for s in batch], jnp.float32)
+    streams = begin(keys, jnp.asarray(targets[[s.stream for s in batch]], jnp.int32), severity)
+    total, steps = np.zeros((len(batch), EPISODES)), np.zeros((len(batch), EPISODES), int)
+    alive = np.ones((len(batch), EPISODES), bool)
+    while alive.any():
+      streams, rows = rollout.chunk(params, streams, LENGTH)
+      done = np.asarray(rows.terminated | rows.truncated)
+      before = np.concatenate([~alive[None], done[:-1]])
+      counts = ~np.logical_or.accumulate(before, 0)  # up to the decision that ends the episode
+      total += (np.asarray(rows.reward, np.float64) * counts).sum(0)
+      steps += counts.sum(0) * self.repeat
+      alive &= ~done.any(0)
+      interrupt.check()
+    return total, steps
+
+
+def _named(tree):
+  """(name, leaf) of every leaf."""
+  return [
+    (jax.tree_util.keystr(path), leaf) for path, leaf in jax.tree_util.tree_leaves_with_path(tree)
+  ]

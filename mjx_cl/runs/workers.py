@@ -1,0 +1,191 @@
+"""Parts of a suite side by side, each in a process of its own on a share of the cores.
+
+One run does not keep several cores busy all the time: its programs are compiled on one core, and
+acting is one program for all streams. The parent starts `python -m mjx_cl.runs.workers OUT PART CORES`
+for each part; OUT/suite.json says what the part is. A worker saves and ends when its standard input
+closes, so that none outlives its parent.
+"""
+
+from __future__ import annotations
+
+import os
+import pathlib
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+
+from mjx_cl.io import tables
+from mjx_cl.errors import FileError, UserError
+from mjx_cl.io.interrupt import Interruptible
+from mjx_cl.io.runtime import cores
+
+
+def number(asked: int | None, needs: list[int], space: int) -> int:
+  """How many parts run side by side: at most one per core, and no more than the largest of `needs`
+  [bytes] that fit into `space` together.
+
+  Args:
+    asked: the user's number, None: as many as that.
+  Raises:
+    UserError where the user's number is below 1, above the cores, or does not fit. On an
+    accelerator, which each process would take whole, it is 1.
+  """
+  import jax
+
+  limit, fits = len(cores()) if jax.default_backend() == "cpu" else 1, 0
+  for need in sorted(needs, reverse=True):
+    space -= need
+    fits += space >= 0
+  if asked is None:
+    return max(1, min(limit, fits))
+  if not 1 <= asked <= limit:
+    raise UserError(f"--jobs must lie in 1..{limit} on this machine; got {asked}")
+  if min(asked, len(needs)) > max(1, fits):
+    raise UserError(
+      f"{asked} parts side by side do not fit into memory, {max(1, fits)} would; give --jobs "
+      f"{max(1, fits)} or fewer --seeds"
+    )
+  return asked
+
+
+class Worker:
+  """A running part. Attributes: name: of the part. share: its place among the shares of the cores.
+  last: line that it said last.
+  """
+
+  def __init__(
+    self, out: pathlib.Path, name: str, share: int, own: list[int], tell: Callable[[str], None]
+  ):
+    self.name, self.share, self.last = name, share, ""
+    command = [sys.executable, "-m", "mjx_cl.runs.workers", str(out), name, ",".join(map(str, own))]
+    # a session of its own: Ctrl-C reaches the parent alone, which then closes the input
+    self.process = subprocess.Popen(
+      command,
+      stdin=subprocess.PIPE,
+      stdout=subprocess.DEVNULL,
+      stderr=subprocess.PIPE,
+      text=True,
+      errors="replace",
+      start_new_session=True,
+    )
+
+    def listen():
+      for line in self.process.stderr:
+        if line.strip():
+          self.last = line.strip()
+          try:
+            tell(f"{name}: {self.last}")
+          except OSError:  # nobody listens any more; a full pipe would stop the worker
+            pass
+
+    self.listener = threading.Thread(target=listen, daemon=True)
+    self.listener.start()
+
+  def check(self) -> bool:
+    """Whether the part is finished.
+
+    Raises:
+      UserError, FileError with what the worker said last, where it failed.
+    """
+    code = self.process.poll()
+    if code is None:
+      return False
+    self.listener.join()
+    self.process.stdin.close()
+    if code < 0:
+      raise FileError(
+        f"part {self.name} was ended by signal {-code}; where memory ran out, --jobs 1 needs "
+        "least; the same command goes on"
+      )
+    if code:
+      kind = UserError if code == 2 else FileError
+      raise kind(
+        f"part {self.name}: "
+        f"{self.last.removeprefix('mjx-cl: ') or f'ended with exit status {code}'}"
+      )
+    return True
+
+
+def together(
+  out,
+  names: list[str],
+  jobs: int,
+  finished: Callable[[str], None],
+  tell: Callable[[str], None] = lambda text: None,
+) -> None:
+  """Runs the parts `names` of OUT/suite.json, `jobs` at a time, in their order.
+
+  Args:
+    finished: called with the name of each part as it ends.
+  Raises:
+    UserError, FileError as soon as one fails; KeyboardInterrupt on a signal. Before either is
+    raised the others have saved what they had lived and ended.
+  """
+  out, waiting, running = pathlib.Path(out), list(names), []
+  all_cores = cores()
+  free = list(range(jobs))
+  try:
+    with Interruptible() as stop:
+      while waiting or running:
+        over = [worker for worker in running if worker.check()]
+        running = [worker for worker in running if worker not in over]
+        free += [worker.share for worker in over]
+        while waiting and free:
+          share = free.pop(0)
+          running.append(Worker(out, waiting.pop(0), share, all_cores[share::jobs], tell))
+        for worker in over:
+          finished(worker.name)
+        stop.check()
+        time.sleep(0.1)
+  finally:
+    running = [worker for worker in running if worker.process.poll() is None]
+    for worker in running:  # all at once, then wait for all
+      worker.process.stdin.close()
+    for worker in running:
+      worker.process.wait()
+
+
+def main(arguments: list[str]) -> int:
+  """One part: OUT PART CORES (comma-separated); exit status 0, 1 (files), 2 (settings), 130
+  (stopped, saved).
+  """
+  out, name, own = arguments
+  if own and hasattr(os, "sched_setaffinity"):
+    os.sched_setaffinity(0, {int(core) for core in own.split(",")})  # before JAX counts its threads
+
+  def orphan():
+    import signal
+
+    os.read(0, 1)  # not sys.stdin, whose lock would still be held as the interpreter ends
+    os.dup2(
+      os.open(os.devnull, os.O_WRONLY),
+      2,
+      # where the parent died, nobody reads what is said, and saying it would be an error before the
+      # state is saved
+    )
+    os.kill(os.getpid(), signal.SIGTERM)
+
+  threading.Thread(target=orphan, daemon=True).start()
+  from mjx_cl.runs import suite, run
+  from mjx_cl.cli import app, display
+  from mjx_cl.io import runtime
+
+  def do():
+    runtime.setup()
+    folder = pathlib.Path(out)
+    values = tables.read_json(folder / "suite.json")["parts"][name]
+    with display.RunDisplay() as shown:
+      run.execute(
+        suite.config(name, values),
+        folder / name,
+        resume=(folder / name / "config.json").exists(),
+        progress=shown,
+      )
+
+  return app.attempt(do)
+
+
+if __name__ == "__main__":
+  sys.exit(main(sys.argv[1:]))
