@@ -79,7 +79,7 @@ def said(name: str) -> Said:
     word: re.search(rf"\b{word}:? (.*?)\.(?: [A-Z]|$)", last)
     for word in ("Severity", "Target", "Owns")
   }
-  return Said(text.split("\n")[0], *(hit[1] if hit else "" for hit in found.values()))
+  return Said(" ".join(text.split("\n\n")[0].split()), *(hit[1] if hit else "" for hit in found.values()))
 
 
 def about(name: str) -> str:
