@@ -1,5 +1,32 @@
-"""mjx_cl: a vectorised benchmark for robots that notice a fault, adapt to it and know when they are
+"""mjx_cl: a vectorised benchmark of robots that notice a fault, adapt to it and know when they are
 done.
+
+The names of `__all__` are the library's face; each is loaded at its first use, so `import mjx_cl`
+alone starts no JAX. Call `setup` first. Other modules are private unless the documentation names
+them.
 """
 
+import importlib
+
 __version__ = "0.1.0"
+__all__ = [
+  "load_agent",
+  "make_detector",
+  "make_env",
+  "make_fault",
+  "run",
+  "score",
+  "setup",
+]
+
+
+def __getattr__(name: str):
+  if name not in __all__:
+    raise AttributeError(f"module 'mjx_cl' has no attribute {name!r}; it has: {', '.join(__all__)}")
+  # `setup` comes before the first use of JAX, all else brings JAX with it
+  room = "mjx_cl.io.runtime" if name == "setup" else "mjx_cl.library"
+  return getattr(importlib.import_module(room), name)
+
+
+def __dir__() -> list[str]:
+  return sorted([*globals(), *__all__])

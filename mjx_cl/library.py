@@ -1,0 +1,101 @@
+"""What `import mjx_cl` offers beside `setup`: robots, faults, detectors and agents by name, one run of
+the whole loop, a detector's score on the recorded streams.
+"""
+
+from __future__ import annotations
+
+import pathlib
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from mjx_cl import envs
+from mjx_cl.config import AdaptConfig, RunConfig, replace
+from mjx_cl.detectors import make as make_detector
+from mjx_cl.detectors.python_class import HostDetector
+from mjx_cl.envs import make as make_env
+from mjx_cl.errors import UserError
+from mjx_cl.faults import make as make_fault
+from mjx_cl.leaderboard import score as board
+from mjx_cl.leaderboard import submissions
+from mjx_cl.leaderboard.streams import StreamSet
+from mjx_cl.runs.run import execute
+from mjx_cl.training import agents
+
+__all__ = ["load_agent", "make_detector", "make_env", "make_fault", "run", "score"]
+
+
+def load_agent(env: str, path: str | None = None) -> agents.Trained:
+  """A trained agent: its `agent` (pure functions), weights and card.
+
+  Args:
+    env: robot that it must fit.
+    path: shipped name or folder; None: the robot's shipped agent.
+
+  Raises:
+    UserError for an unknown robot or agent, FileError for a broken file.
+  """
+  return agents.of(envs.make(env), path)
+
+
+def run(
+  env: str,
+  out: str | pathlib.Path,
+  *,
+  adapt: dict[str, Any] | None = None,
+  resume: bool = False,
+  overwrite: bool = False,
+  **settings: Any,
+) -> dict[str, Any]:
+  """Lives the whole loop, as `mjx-cl run` does: fault, alarm, finetuning, stop; arms x seeds streams.
+
+  Args:
+    env: robot.
+    out: folder for the tables, summary.json and figure.png.
+    adapt: fields of AdaptConfig.
+    resume: go on with a run that was cut off.
+    overwrite: replace an earlier run in `out`.
+    **settings: fields of RunConfig, such as fault="gear", seeds=10, steps=25_000,
+      arms=("detector", "none").
+
+  Returns:
+    What summary.json holds.
+
+  Raises:
+    UserError for a wrong name or range, FileError where files cannot be read or written.
+  """
+  config = replace(RunConfig(env), **settings, adapt=replace(AdaptConfig(), **(adapt or {})))
+  return execute(config, out, resume, overwrite)
+
+
+def score(
+  detector: str | Callable[[], Any],
+  robots: Sequence[str] = (),
+  streams: str | pathlib.Path | None = None,
+  channel: str = "opr",
+) -> list[dict[str, Any]]:
+  """Scores one detector on recorded streams, at the leaderboard's rate of false alarms.
+
+  Args:
+    detector: name on the board, NAME@CHANNEL, "path/to/file.py:factory", or a class whose objects
+      have update(x) -> bool; the latter runs as it is, at a rate of false alarms of its own.
+    robots: of the set; all where empty.
+    streams: folder of `mjx-cl record`; None: the set that ships.
+    channel: what a class watches.
+
+  Returns:
+    Rows of the leaderboard, one for each robot, fault and severity.
+
+  Raises:
+    UserError for an unknown detector, robot or channel.
+  """
+  held = StreamSet(streams)
+  chosen = held.choose(tuple(robots))
+  if isinstance(detector, str):
+    entries, extra = board.chosen((detector,), chosen[0]), []
+  elif callable(detector):
+    name = getattr(detector, "__name__", type(detector).__name__)
+    host = HostDetector(detector, name, channel)
+    entries, extra = [], [(name, submissions.from_host(host, None))]
+  else:
+    raise UserError(f"detector is a name or a class with update(x); got {type(detector).__name__}")
+  return [row for row in board.score(held, entries, chosen, extra).rows]
