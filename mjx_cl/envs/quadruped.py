@@ -549,7 +549,8 @@ class Quadruped:
       inner, qpos, qvel, out["ctrl"], action, draw, command, air, error, fallen, before.key
     )
     obs = self._sense(key_noise, observe(qpos, qvel, gravity, command, action))
-    return EnvState(after, step), Step(obs, reward, fallen, step >= self.spec.episode_steps, obs)
+    truncated = ~fallen & (step >= self.spec.episode_steps)
+    return EnvState(after, step), Step(obs, reward, fallen, truncated, obs)
 
   # how PPO learns to show the way (demonstrator.py): at first every step costs, and it would learn
   # to fall
