@@ -461,6 +461,7 @@ class Quadruped:
         "dof_frictionloss",
         "jnt_range",
         "gravity",
+        backend=self.physics,
       ),
       task={
         "strength": jnp.ones(12),

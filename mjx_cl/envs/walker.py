@@ -190,6 +190,7 @@ class Walker:
         "dof_frictionloss",
         "jnt_range",
         "gravity",
+        backend=self.physics,
       ),
       task={
         "reward_weights": jnp.asarray(list(REWARD_TERMS.values()), jnp.float32),
