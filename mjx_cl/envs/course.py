@@ -15,6 +15,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 from mjx_cl.errors import FileError, UserError, choose
 
@@ -150,54 +151,23 @@ class Place(NamedTuple):
 # ---- tracks, in NumPy ----------------------------------------------------------------------------
 
 
-def _spline(points: np.ndarray):
-  """Closed cubic spline through points (K, 2) with parameter u = chord length: (total u, function u
-  (N,), derivative -> (N, 2)).
-
-  Second derivatives M of a periodic cubic spline: h_{i-1} M_{i-1} + 2 (h_{i-1} + h_i) M_i + h_i
-  M_{i+1} = 6 (b_i - b_{i-1}), b = slope of chord i.
-  """
-  h = np.linalg.norm(np.roll(points, -1, 0) - points, axis=1)
-  slope = (np.roll(points, -1, 0) - points) / h[:, None]
-  i = np.arange(len(points))
-  before, after = (i - 1) % len(points), (i + 1) % len(points)
-  matrix = np.zeros((len(points),) * 2)
-  matrix[i, before] += h[before]
-  matrix[i, i] += 2 * (h[before] + h)
-  matrix[i, after] += h
-  bend = np.linalg.solve(matrix, 6 * (slope - slope[before]))
-  knots = np.concatenate([[0.0], np.cumsum(h)])
-
-  def evaluate(u, derivative=0):
-    k = np.clip(np.searchsorted(knots, u, side="right") - 1, 0, len(points) - 1)
-    v = (u - knots[k])[:, None]
-    c3 = (bend[after[k]] - bend[k]) / (6 * h[k])[:, None]
-    c2, c1 = bend[k] / 2, slope[k] - h[k][:, None] * (2 * bend[k] + bend[after[k]]) / 6
-    return (
-      points[k] + v * (c1 + v * (c2 + v * c3)),
-      c1 + v * (2 * c2 + v * 3 * c3),
-      2 * c2 + v * 6 * c3,
-    )[derivative]
-
-  return knots[-1], evaluate
-
-
-def build(name: str, points: np.ndarray, right, left) -> Track:
-  """Track along the closed spline through points (K, 2) [m], with half widths right, left (K,) or
-  () [m], linear in between.
+def build(
+  name: str, points: np.ndarray, right: np.ndarray | float, left: np.ndarray | float
+) -> Track:
+  """Track along the closed cubic spline through points (K, 2) [m], with half widths right, left (K,)
+  or () [m], linear in between; the parameter is the length of the chords.
   """
   points = np.asarray(points, float)
-  total, evaluate = _spline(points)
-  fine = np.linspace(0, total, 20 * len(points) + 2000)
+  around = np.concatenate([points, points[:1]])
+  knots = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(around, axis=0), axis=1)))
+  evaluate = CubicSpline(knots, around, bc_type="periodic")
+  fine = np.linspace(0, knots[-1], 20 * len(points) + 2000)
   arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(evaluate(fine), axis=0), axis=1))])
   num = max(8, int(np.ceil(arc[-1] / SPACING)))
   u = np.interp(np.arange(num) * arc[-1] / num, arc, fine)
   centre, d1, d2 = (evaluate(u, k) for k in range(3))
   heading = np.unwrap(np.arctan2(d1[:, 1], d1[:, 0]))
   curvature = (d1[:, 0] * d2[:, 1] - d1[:, 1] * d2[:, 0]) / np.linalg.norm(d1, axis=1) ** 3
-  knots = np.concatenate(
-    [[0.0], np.cumsum(np.linalg.norm(np.roll(points, -1, 0) - points, axis=1))]
-  )
   normal = np.stack([-np.sin(heading), np.cos(heading)], 1)
   left, right = (
     np.interp(u, knots, np.append(w, w[0]))[:, None]
