@@ -63,7 +63,8 @@ class Track(NamedTuple):
     centre: (P, 2) [m], evenly spaced along the line.
     heading: (P,) direction of driving [rad], unwrapped.
     curvature: (P,) signed [1/m], positive where the track turns left.
-    left, right: (P, 2) [m], wall points on the normal of each centre point.
+    left: (P, 2) [m], wall points on the normal of each centre point.
+    right: (P, 2) [m], the same on the other side.
     length: of the centre line [m].
   """
 

@@ -20,10 +20,12 @@ class Frame(NamedTuple):
   """One decision: the robot as it decides, and what arriving from there brings.
 
   Attributes:
-    state: EnvState in NumPy. obs: float32 (O,), as the robot senses it, its sensors' faults
-      included.
-    step: control step. episode: 0, 1, ... reward: of arriving. severity: true severity in force; 0
-      is healthy.
+    state: EnvState in NumPy.
+    obs: float32 (O,), as the robot senses it, its sensors' faults included.
+    step: control step.
+    episode: 0, 1, ...
+    reward: of arriving.
+    severity: true severity in force; 0 is healthy.
   """
 
   state: EnvState
