@@ -126,8 +126,8 @@ def push(env) -> Fault:
       the robot can move there)
 
   Severity: 1 changes the speed by 1.5 per blow [m/s] (Isaac Lab trains with 0.5, severity 1/3).
-  Target: trunk, the only one. Owns `force` (nv,). Memory: the direction of the latest blow. Source:
-  pushes of Isaac Lab.
+  Target: trunk, the only one. Owns `force` (nv,). Memory: the direction of the latest blow.
+  Source: pushes of Isaac Lab.
   """
   _, directions = heading_targets(env, ("forward", "backward", "left", "right"))
   blows = (

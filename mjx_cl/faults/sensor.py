@@ -82,8 +82,8 @@ def noise(env) -> Fault:
   """Gaussian noise on a reading.   x_i' = x_i + n,  n ~ N(0, (severity scale_i)^2)
 
   Severity: standard deviation [typical deviations]; realworldrl_suite's levels are 0.1, 0.3, 1.0 in
-  raw units. Target: a group of channels (drawn), all, or one channel. Owns `obs`. Source:
-  realworldrl_suite.
+  raw units. Target: a group of channels (drawn), all, or one channel. Owns `obs`.
+  Source: realworldrl_suite.
   """
   return _sensor(
     "noise",
