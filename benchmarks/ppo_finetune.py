@@ -45,7 +45,7 @@ from mjx_cl import envs, faults
 from mjx_cl.cli import app
 from mjx_cl.config import RunConfig, becomes, changes  # noqa: E402
 from mjx_cl.dreamer.agent import Carry  # noqa: E402
-from mjx_cl.envs.adapters import brax  # noqa: E402
+from mjx_cl.envs.adapters import brax_module  # noqa: E402
 from mjx_cl.errors import FileError, UserError  # noqa: E402
 from mjx_cl.io import tables  # noqa: E402
 from mjx_cl.rollout.scan import Rollout, nest, start  # noqa: E402
@@ -88,7 +88,7 @@ def transitions(net, params, rows):
   The action before tanh is recovered from the one taken: float32 atanh is good to 1e-3 as far out
   as |a| = 1 - 1e-4; it is cut off at 1 - 1e-6.
   """
-  brax_types = brax("training.types")
+  brax_types = brax_module("training.types")
   dist = net.parametric_action_distribution
   raw = jnp.arctanh(jnp.clip(rows.action, -1 + 1e-6, 1 - 1e-6))
   logits = net.policy_network.apply(params["normaliser"], params["policy"], rows.obs)
@@ -113,7 +113,7 @@ def make_update(net, settings: dict, lr: float, epochs: int, minibatches: int):
   """(params, opt, data (B, T, ...), key) -> (params, opt): `epochs` passes over B stretches of T
   steps, each in so many minibatches.
   """
-  losses = brax("training.agents.ppo.losses")
+  losses = brax_module("training.agents.ppo.losses")
   optimiser = optax.adam(lr)
   loss = functools.partial(
     losses.compute_ppo_loss,

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 from mjx_cl.errors import FileError, UserError, choose
 
@@ -29,85 +30,29 @@ GAP = 4.0  # a closing gap above this many median spacings leaves the line open
 # right.
 SHAPES = {
   "oval": (
-    (0, 0),
-    (4.5, -0.2),
-    (9.1, -0.2),
-    (11.3, 2.8),
-    (8.9, 5.6),
-    (4.5, 5.7),
-    (0, 5.7),
-    (-2.2, 3.1),
+    (0, 0), (4.5, -0.2), (9.1, -0.2), (11.3, 2.8), (8.9, 5.6), (4.5, 5.7), (0, 5.7), (-2.2, 3.1),
   ),
   "kidney": (
-    (0, 0),
-    (-3.3, 3.1),
-    (-2.2, 7.5),
-    (1.7, 8.6),
-    (5.6, 6.7),
-    (9.4, 8.6),
-    (13.5, 7.5),
-    (14.5, 2.7),
-    (11.2, 0),
-    (5.6, -0.7),
+    (0, 0), (-3.3, 3.1), (-2.2, 7.5), (1.7, 8.6), (5.6, 6.7), (9.4, 8.6), (13.5, 7.5), (14.5, 2.7),
+    (11.2, 0), (5.6, -0.7),
   ),
   "chicane": (
-    (0, 0),
-    (4.5, 0),
-    (7.8, 1.8),
-    (11.4, 0.3),
-    (15.4, 0),
-    (18.1, 2.9),
-    (16.1, 6),
-    (12.3, 6.1),
-    (8.9, 8),
-    (4.9, 6.9),
-    (-0.1, 6.1),
-    (-2.5, 3.1),
+    (0, 0), (4.5, 0), (7.8, 1.8), (11.4, 0.3), (15.4, 0), (18.1, 2.9), (16.1, 6), (12.3, 6.1),
+    (8.9, 8), (4.9, 6.9), (-0.1, 6.1), (-2.5, 3.1),
   ),
   "hairpin": (
-    (0, 0),
-    (-1.4, 2.2),
-    (0.5, 4.8),
-    (4.5, 4.5),
-    (6.3, 6.7),
-    (4.1, 9.4),
-    (0.3, 9),
-    (-1.4, 11.2),
-    (0.1, 13.7),
-    (7.4, 13.2),
-    (11.4, 10.9),
-    (11.8, 5.7),
-    (9.5, 0.5),
-    (5.3, 0),
+    (0, 0), (-1.4, 2.2), (0.5, 4.8), (4.5, 4.5), (6.3, 6.7), (4.1, 9.4), (0.3, 9), (-1.4, 11.2),
+    (0.1, 13.7), (7.4, 13.2), (11.4, 10.9), (11.8, 5.7), (9.5, 0.5), (5.3, 0),
   ),
   "bean": (
-    (0, 0),
-    (3.7, -1.4),
-    (7.4, -0.4),
-    (8.9, 2.9),
-    (7, 5.8),
-    (6.4, 9.1),
-    (3.5, 10.9),
-    (-0.2, 9.7),
-    (-1, 6.1),
-    (-2.3, 2.8),
+    (0, 0), (3.7, -1.4), (7.4, -0.4), (8.9, 2.9), (7, 5.8), (6.4, 9.1), (3.5, 10.9), (-0.2, 9.7),
+    (-1, 6.1), (-2.3, 2.8),
   ),
   "hook": (
-    (0, 0),
-    (-3.1, 2.3),
-    (-2.1, 5.8),
-    (1.5, 7.7),
-    (3, 11.4),
-    (5.8, 12.7),
-    (9, 10.8),
-    (9.7, 8.1),
-    (13.1, 6.4),
-    (16.8, 5.7),
-    (17.4, 1.9),
-    (15, -0.3),
-    (6.6, -0.3),
+    (0, 0), (-3.1, 2.3), (-2.1, 5.8), (1.5, 7.7), (3, 11.4), (5.8, 12.7), (9, 10.8), (9.7, 8.1),
+    (13.1, 6.4), (16.8, 5.7), (17.4, 1.9), (15, -0.3), (6.6, -0.3),
   ),
-}
+}  # fmt: skip
 
 
 class Track(NamedTuple):
@@ -118,7 +63,8 @@ class Track(NamedTuple):
     centre: (P, 2) [m], evenly spaced along the line.
     heading: (P,) direction of driving [rad], unwrapped.
     curvature: (P,) signed [1/m], positive where the track turns left.
-    left, right: (P, 2) [m], wall points on the normal of each centre point.
+    left: (P, 2) [m], wall points on the normal of each centre point.
+    right: (P, 2) [m], the same on the other side.
     length: of the centre line [m].
   """
 
@@ -150,54 +96,23 @@ class Place(NamedTuple):
 # ---- tracks, in NumPy ----------------------------------------------------------------------------
 
 
-def _spline(points: np.ndarray):
-  """Closed cubic spline through points (K, 2) with parameter u = chord length: (total u, function u
-  (N,), derivative -> (N, 2)).
-
-  Second derivatives M of a periodic cubic spline: h_{i-1} M_{i-1} + 2 (h_{i-1} + h_i) M_i + h_i
-  M_{i+1} = 6 (b_i - b_{i-1}), b = slope of chord i.
-  """
-  h = np.linalg.norm(np.roll(points, -1, 0) - points, axis=1)
-  slope = (np.roll(points, -1, 0) - points) / h[:, None]
-  i = np.arange(len(points))
-  before, after = (i - 1) % len(points), (i + 1) % len(points)
-  matrix = np.zeros((len(points),) * 2)
-  matrix[i, before] += h[before]
-  matrix[i, i] += 2 * (h[before] + h)
-  matrix[i, after] += h
-  bend = np.linalg.solve(matrix, 6 * (slope - slope[before]))
-  knots = np.concatenate([[0.0], np.cumsum(h)])
-
-  def evaluate(u, derivative=0):
-    k = np.clip(np.searchsorted(knots, u, side="right") - 1, 0, len(points) - 1)
-    v = (u - knots[k])[:, None]
-    c3 = (bend[after[k]] - bend[k]) / (6 * h[k])[:, None]
-    c2, c1 = bend[k] / 2, slope[k] - h[k][:, None] * (2 * bend[k] + bend[after[k]]) / 6
-    return (
-      points[k] + v * (c1 + v * (c2 + v * c3)),
-      c1 + v * (2 * c2 + v * 3 * c3),
-      2 * c2 + v * 6 * c3,
-    )[derivative]
-
-  return knots[-1], evaluate
-
-
-def build(name: str, points: np.ndarray, right, left) -> Track:
-  """Track along the closed spline through points (K, 2) [m], with half widths right, left (K,) or
-  () [m], linear in between.
+def build(
+  name: str, points: np.ndarray, right: np.ndarray | float, left: np.ndarray | float
+) -> Track:
+  """Track along the closed cubic spline through points (K, 2) [m], with half widths right, left (K,)
+  or () [m], linear in between; the parameter is the length of the chords.
   """
   points = np.asarray(points, float)
-  total, evaluate = _spline(points)
-  fine = np.linspace(0, total, 20 * len(points) + 2000)
+  around = np.concatenate([points, points[:1]])
+  knots = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(around, axis=0), axis=1)))
+  evaluate = CubicSpline(knots, around, bc_type="periodic")
+  fine = np.linspace(0, knots[-1], 20 * len(points) + 2000)
   arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(evaluate(fine), axis=0), axis=1))])
   num = max(8, int(np.ceil(arc[-1] / SPACING)))
   u = np.interp(np.arange(num) * arc[-1] / num, arc, fine)
   centre, d1, d2 = (evaluate(u, k) for k in range(3))
   heading = np.unwrap(np.arctan2(d1[:, 1], d1[:, 0]))
   curvature = (d1[:, 0] * d2[:, 1] - d1[:, 1] * d2[:, 0]) / np.linalg.norm(d1, axis=1) ** 3
-  knots = np.concatenate(
-    [[0.0], np.cumsum(np.linalg.norm(np.roll(points, -1, 0) - points, axis=1))]
-  )
   normal = np.stack([-np.sin(heading), np.cos(heading)], 1)
   left, right = (
     np.interp(u, knots, np.append(w, w[0]))[:, None]

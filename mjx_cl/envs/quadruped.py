@@ -51,13 +51,9 @@ JOINTS = tuple(f"{leg}_{joint}" for leg in LEGS for joint in ("HAA", "HFE", "KFE
 DEFAULT = np.array([0, 0.4, -0.8] * 2 + [0, -0.4, 0.8] * 2, np.float32)  # stance [rad]
 ACTION_SCALE, ISAAC_SCALE = 1.0, 0.5  # [rad] of an action of 1, here and in Isaac Lab
 STIFFNESS, DAMPING = 80.0, 5.0  # [N m/rad], [N m s/rad]
-SATURATION, EFFORT, VELOCITY = (
-  120.0,
-  80.0,
-  7.5,
-  # torque at standstill that the voltage would allow, limit of torque [N m]; no torque beyond
-  # [rad/s]
-)
+SATURATION = 120.0  # torque at standstill that the voltage would allow [N m]
+EFFORT = 80.0  # limit of torque [N m]
+VELOCITY = 7.5  # no torque beyond [rad/s]
 ARMATURE = 0.1  # inertia of a motor, seen at the joint; as in quadruped.xml [kg m2]
 CONTROL_S, PHYSICS_S, SUBSTEPS = 0.02, 0.005, 4
 EPISODE_STEPS, RESAMPLE_STEPS = 1000, 500  # 20 s; a new command every 10 s
@@ -144,7 +140,8 @@ class QuadrupedState(NamedTuple):
 
   Attributes:
     backend: state of the physics backend, opaque.
-    qpos, qvel: float32 (19,), (18,), at the end of the control step.
+    qpos: float32 (19,), at the end of the control step.
+    qvel: float32 (18,), at the end of the control step.
     torque: float32 (12,), of the last physics step [N m].
     action: float32 (12,), the last one.
     draw: Command in force.
@@ -348,7 +345,13 @@ def reward_terms(
 
   Args:
     before: state that was left; its `command` is what the agent saw.
-    acceleration, torque: (12,) [rad/s2], [N m]. soft_range: (2, 12) [rad].
+    action: (12,), of this step.
+    qpos: (19,), on arriving.
+    qvel: (18,), on arriving.
+    gravity: (3,) [m/s2].
+    acceleration: (12,) [rad/s2].
+    torque: (12,) [N m].
+    soft_range: (2, 12) [rad].
 
   Returns:
     (terms (11,) in the order of REWARDS, air' (4,) [s], |v_xy - command| () [m/s]).
@@ -461,6 +464,7 @@ class Quadruped:
         "dof_frictionloss",
         "jnt_range",
         "gravity",
+        backend=self.physics,
       ),
       task={
         "strength": jnp.ones(12),
@@ -549,7 +553,8 @@ class Quadruped:
       inner, qpos, qvel, out["ctrl"], action, draw, command, air, error, fallen, before.key
     )
     obs = self._sense(key_noise, observe(qpos, qvel, gravity, command, action))
-    return EnvState(after, step), Step(obs, reward, fallen, step >= self.spec.episode_steps, obs)
+    truncated = ~fallen & (step >= self.spec.episode_steps)
+    return EnvState(after, step), Step(obs, reward, fallen, truncated, obs)
 
   # how PPO learns to show the way (demonstrator.py): at first every step costs, and it would learn
   # to fall

@@ -20,31 +20,9 @@ WALK_SPEED = 1.0  # [m/s]
 BODIES = ("torso", "right_thigh", "right_leg", "right_foot", "left_thigh", "left_leg", "left_foot")
 # deviation of each channel over 64 robots and 900 steps of the shipped agent
 SCALES = (
-  0.027,
-  0.14,
-  0.46,
-  0.34,
-  0.22,
-  0.46,
-  0.52,
-  0.67,
-  0.045,
-  0.14,
-  0.2,
-  0.21,
-  0.1,
-  0.28,
-  0.067,
-  0.67,
-  0.55,
-  2.2,
-  10.0,
-  16.0,
-  15.0,
-  3.0,
-  5.7,
-  7.4,
-)
+  0.027, 0.14, 0.46, 0.34, 0.22, 0.46, 0.52, 0.67, 0.045, 0.14, 0.2, 0.21, 0.1, 0.28, 0.067, 0.67,
+  0.55, 2.2, 10.0, 16.0, 15.0, 3.0, 5.7, 7.4,
+)  # fmt: skip
 JOINTS = ("right_hip", "right_knee", "right_ankle", "left_hip", "left_knee", "left_ankle")
 
 
@@ -190,6 +168,7 @@ class Walker:
         "dof_frictionloss",
         "jnt_range",
         "gravity",
+        backend=self.physics,
       ),
       task={
         "reward_weights": jnp.asarray(list(REWARD_TERMS.values()), jnp.float32),

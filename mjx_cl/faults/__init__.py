@@ -1,5 +1,5 @@
 """What can break (one function per fault), and when (`schedule.py`); named settings are in
-../fault_presets.py. `FAULTS` is the one table.
+presets.py. `FAULTS` is the one table.
 
 A robot may have several faults in one compiled program, at once or one after the other: wherever a
 Fault is taken, a tuple of them is too. Their severities, onsets, schedules and targets are arrays,
@@ -61,8 +61,13 @@ def family(name: str) -> str:
 
 
 class Said(NamedTuple):
-  """What the docstring of a fault says of it. Attributes: what: happens, its first line. severity,
-  target, owns: in words, "" where it does not say.
+  """What the docstring of a fault says of it, "" where it does not say.
+
+  Attributes:
+    what: what happens, its first paragraph.
+    severity: what it means.
+    target: what a target is.
+    owns: the leaves that it writes.
   """
 
   what: str
@@ -79,7 +84,9 @@ def said(name: str) -> Said:
     word: re.search(rf"\b{word}:? (.*?)\.(?: [A-Z]|$)", last)
     for word in ("Severity", "Target", "Owns")
   }
-  return Said(" ".join(text.split("\n\n")[0].split()), *(hit[1] if hit else "" for hit in found.values()))
+  return Said(
+    " ".join(text.split("\n\n")[0].split()), *(hit[1] if hit else "" for hit in found.values())
+  )
 
 
 def about(name: str) -> str:

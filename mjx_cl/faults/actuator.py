@@ -56,7 +56,8 @@ def torque_loss(env) -> Fault:
 
   Severity: lost share [1], 0 to 1 (no torque). Target: a joint (drawn), a leg or all. Owns
   `task.strength` [1], (A,), or `mj.actuator_gear` where the motor has no law of its own (the
-  walker). Source: torque factors 0.9 to 1.1 in training and 0 for a crippled leg, facts 4.2.
+  walker). Source: torque factors 0.9 to 1.1 in training (Walk These Ways), 0 for a crippled leg
+  (Nagabandi et al. 2019).
   """
   names, mask, single = actuator_targets(env)
   leaf = "task.strength" if "strength" in env.model.task else "mj.actuator_gear"
@@ -108,8 +109,8 @@ def joint_lock(env) -> Fault:
   and creeps at 0.1 rad/s under 100 N m; 0.5 is a quarter of that. Target: a joint (drawn), a leg or
   all. Owns `mj.dof_armature`, `mj.dof_damping`, (nv,). Damping alone would do in the air, but
   MuJoCo's contact solver does not know of implicit damping: beyond hD = M (h the physics step) a
-  leg on the ground gains speed from it; with the armature hD / M stays at 0.5. Source: locked and
-  crippled joints, facts 4.2.
+  leg on the ground gains speed from it; with the armature hD / M stays at 0.5. Source: crippled
+  joints of Nagabandi et al. 2019, which are limp; that one is held is this project's own choice.
   """
   names, mask, single = actuator_targets(env)
   hits = mask.astype(jnp.float32) @ dofs(env, "joint_lock")
@@ -147,8 +148,8 @@ def stuck(env) -> Fault:
 
   Severity: share of the held value [1]; 1 is stuck altogether. Target: an actuator (drawn), a group
   or all. Owns `ctrl`. Memory: the held command; an episode that starts later holds its own first
-  command. Not visible to: a constant command. Source: stuck actions of realworldrl_suite, peers A2,
-  which stick now and then for some steps; here for good.
+  command. Not visible to: a constant command. Source: stuck actions of realworldrl_suite, which
+  stick now and then for some steps; here for good.
   """
 
   def change(hit, held, severity, key, ports):
@@ -164,7 +165,8 @@ def offset(env) -> Fault:
     u_j' = clip(u_j + 0.5 severity, -1, 1)
 
   Severity: 1 adds half of the half-range [half-ranges]. Target: an actuator (drawn), a group or
-  all. Owns `ctrl`. Not visible to: a command at its upper bound. Source: motor offsets, facts 4.2.
+  all. Owns `ctrl`. Not visible to: a command at its upper bound. Source: motor offsets of Walk
+  These Ways; the range is this project's own choice.
   """
   return _command(
     "offset",
@@ -194,8 +196,7 @@ def command_dropout(env) -> Fault:
     P(u_j' = 0) = 0.5 severity, each actuator and step alone
 
   Severity: 1 loses every other command [probability]. Target: an actuator (drawn), a group or all.
-  Owns `ctrl`. Source: dropped commands; realworldrl_suite drops observations with 0.01 to 0.1,
-  facts 4.5.
+  Owns `ctrl`. Source: dropped commands; realworldrl_suite drops observations with 0.01 to 0.1.
   """
 
   def change(hit, m, severity, key, ports):
@@ -211,7 +212,7 @@ def command_delay(env) -> Fault:
 
   Severity: 1/3, 2/3, 1 are delays of 3, 6, 9 [control steps], realworldrl_suite's easy, medium,
   hard. Target: an actuator (drawn), a group or all. Owns `ctrl`. Memory: the last 9 commands; an
-  episode's start fills it with its first command. Source: facts 4.5.
+  episode's start fills it with its first command. Source: realworldrl_suite.
   """
 
   def change(hit, line, severity, key, ports):
@@ -237,7 +238,7 @@ def command_noise(env) -> Fault:
     u_j' = clip(u_j + n, -1, 1),   n ~ N(0, severity^2)
 
   Severity: standard deviation [half-ranges]; 0.1, 0.3, 1.0 are realworldrl_suite's levels. Target:
-  an actuator (drawn), a group or all. Owns `ctrl`. Source: facts 4.5.
+  an actuator (drawn), a group or all. Owns `ctrl`. Source: realworldrl_suite.
   """
 
   def change(hit, m, severity, key, ports):

@@ -53,16 +53,19 @@ class State(NamedTuple):
 
 
 class Fault(NamedTuple):
-  """Attributes:
-  name: registry name.
-  owns: leaves it may write: "mj.actuator_gear", "task.strength", "force", "ctrl" or "obs"; severity
-  0 leaves them bit-identical. targets: names that a target index stands for.
-  drawn: a target that is not named is drawn from the first so many.
-  init: (key, target int32 () or -1 to draw it) -> State.
-  apply: (State, severity float32 (), key, Ports) -> (State, Ports).
-  senses: it acts where the sensors are read; the others act where the robot is driven.
-  not_monotone: why a greater severity need not make a greater difference at first, "" where it
-  must.
+  """One thing that can break, on one robot.
+
+  Attributes:
+    name: registry name.
+    owns: leaves it may write: "mj.actuator_gear", "task.strength", "force", "ctrl" or "obs";
+      severity 0 leaves them bit-identical.
+    targets: names that a target index stands for.
+    drawn: a target that is not named is drawn from the first so many.
+    init: (key, target int32 () or -1 to draw it) -> State.
+    apply: (State, severity float32 (), key, Ports) -> (State, Ports).
+    senses: it acts where the sensors are read; the others act where the robot is driven.
+    not_monotone: why a greater severity need not make a greater difference at first, "" where it
+      must.
   """
 
   name: str

@@ -33,8 +33,8 @@ def payload(env) -> Fault:
 
   Severity: 1 is a load of 40 % of the whole robot [kg]: quadruped 20.9 kg (Isaac Lab randomises by
   +-5 kg, severity 0.24), walker 11.4, car 1.5. Target: trunk, the only one. Owns `mj.body_mass`,
-  `mj.body_inertia`, or `task.mass`, `task.inertia` where there is no MuJoCo model. Source:
-  payloads, facts 4.2.
+  `mj.body_inertia`, or `task.mass`, `task.inertia` where there is no MuJoCo model. Source: payloads
+  of Isaac Lab (ANYmal-C, +-5 kg) and Walk These Ways.
   """
   if "mass" in env.model.task:
 
@@ -66,10 +66,10 @@ def com(env) -> Fault:
 
     r' = r + 0.5 severity g e,   g = sqrt(trace(I) / (2 m)) radius of gyration, e the direction
 
-  Severity: 1 moves it by half the radius of gyration [m]: quadruped 0.13 (VCMS trains with 0.1),
-  walker 0.10. Target: a direction (drawn), forward, backward, left, right, up, down as far as the
-  robot can move there. Owns `mj.body_ipos`. Source: shifts of the trunk's centre of mass, facts
-  4.2.
+  Severity: 1 moves it by half the radius of gyration [m]: quadruped 0.13 (Loquercio et al. 2022
+  train with 0.1), walker 0.10. Target: a direction (drawn), forward, backward, left, right, up,
+  down as far as the robot can move there. Owns `mj.body_ipos`. Source: shifts of the trunk's centre
+  of mass in Isaac Lab and Loquercio et al. 2022.
   """
   _bodies(env, "com")
   model, trunk = env.mj_model, int(env.spec.bodies[0][1][0])
@@ -90,7 +90,7 @@ def limb_mass(env) -> Fault:
   """A limb grows heavier (mud, ice), its inertia with it.   m_b' = m_b (1 + 2 severity)
 
   Severity: 1 triples the mass [kg], the upper end of Nagabandi et al.'s arm. Target: a body other
-  than the trunk (drawn). Owns `mj.body_mass`, `mj.body_inertia`. Source: limb masses, facts 4.2.
+  than the trunk (drawn). Owns `mj.body_mass`, `mj.body_inertia`. Source: Nagabandi et al. 2019.
   """
   names, mask = _bodies(env, "limb_mass")
   names, mask = names[1:], mask[1:]
@@ -109,7 +109,7 @@ def joint_damping(env) -> Fault:
   """A joint grows stiff in motion.   damping_j' = damping_j + 10 severity [N m s/rad]
 
   Severity: 1 adds 10 [N m s/rad], the upper end of realworldrl_suite's walker (nominal 0.1).
-  Target: a joint (drawn), a leg or all. Owns `mj.dof_damping`. Source: facts 4.5.
+  Target: a joint (drawn), a leg or all. Owns `mj.dof_damping`. Source: realworldrl_suite.
   """
   names, mask, single = actuator_targets(env)
   hits = mask.astype(jnp.float32) @ dofs(env, "joint_damping")
@@ -126,7 +126,7 @@ def joint_friction(env) -> Fault:
   Severity: 1 adds a quarter of the motor's greatest torque tau_j [N m]. Target: a joint (drawn), a
   leg or all. Owns `mj.dof_frictionloss`. MJX builds no friction constraint for a model that has
   none and refuses it there; C MuJoCo (physics native) does. Source: MuJoCo Playground varies the
-  Go1's by a tenth, facts 1.7; the range is this project's own choice.
+  Go1's by a tenth; the range is this project's own choice.
   """
   names, mask, single = actuator_targets(env)
   which = dofs(env, "joint_friction")

@@ -22,7 +22,8 @@ def friction(env) -> Fault:
   Severity: 1 leaves 5 % of the friction coefficient [1]. Target: all, or a foot, wheel or axle (any
   of them drawn). Owns `mj.geom_friction` (n, 3) of the touching geoms, or `task.friction`, one per
   axle. The geoms must have priority over the floor: MuJoCo takes the greater of two equal ones
-  otherwise, and the fault would do nothing. Source: friction figures, facts 4.3 and 4.5.
+  otherwise, and the fault would do nothing. Source: friction of realworldrl_suite, MuJoCo
+  Playground and f1tenth_gym.
   """
   feet = list(env.spec.feet)
   if not feet:
@@ -76,8 +77,7 @@ def slope(env) -> Fault:
 
   Severity: 1 is a slope of 20 [degrees]. Target: where downhill is (drawn), forward, backward,
   left, right as far as the robot can move there. Owns `mj.gravity` (3,) [m/s^2], or `task.gravity`.
-  Source: slopes of Nagabandi et al. (learning_to_adapt), peers E; the range is this project's own
-  choice.
+  Source: slopes of Nagabandi et al. (learning_to_adapt); the range is this project's own choice.
   """
   names, directions = heading_targets(env, ("forward", "backward", "left", "right"))
   leaf = "task.gravity" if "gravity" in env.model.task else "mj.gravity"
@@ -107,8 +107,8 @@ def wind(env) -> Fault:
 
   Severity: 1 is 30 % of the weight [N]. Target: the direction of the wind in the world (drawn),
   forward (+x), backward, left, right as far as the robot can move there. Owns `force` (nv,).
-  Source: force faults of PEDM, Haider et al. 2023, peers B3; direction and range are this project's
-  own choice.
+  Source: force faults of PEDM, Haider et al. 2023; direction and range are this project's own
+  choice.
   """
   names, directions = heading_targets(env, ("forward", "backward", "left", "right"))
   blows = 0.3 * 9.81 * whole_mass(env) * directions @ force_map(env)
@@ -126,8 +126,8 @@ def push(env) -> Fault:
       the robot can move there)
 
   Severity: 1 changes the speed by 1.5 per blow [m/s] (Isaac Lab trains with 0.5, severity 1/3).
-  Target: trunk, the only one. Owns `force` (nv,). Memory: the direction of the latest blow. Source:
-  pushes, facts 1.6 and 4.2.
+  Target: trunk, the only one. Owns `force` (nv,). Memory: the direction of the latest blow.
+  Source: pushes of Isaac Lab.
   """
   _, directions = heading_targets(env, ("forward", "backward", "left", "right"))
   blows = (

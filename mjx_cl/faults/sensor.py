@@ -42,8 +42,8 @@ def bias(env) -> Fault:
   """A constant is added to a reading.   x_i' = x_i + 2 severity scale_i
 
   Severity: 1 is two typical deviations [unit of the channel]. Target: a group of channels (drawn),
-  all, or one channel. Owns `obs`. Source: bias drift, which isaac-sim/IsaacLab#7451 asks for, peers
-  0, here as a step; the range is this project's own choice.
+  all, or one channel. Owns `obs`. Source: bias drift, which isaac-sim/IsaacLab#7451 asks for, here
+  as a step; the range is this project's own choice.
   """
   return _sensor(
     "bias", env, lambda m, severity, key, ports, scale: (m, ports.obs + 2.0 * severity * scale)
@@ -56,7 +56,7 @@ def drift(env) -> Fault:
 
   Severity: 1 ends two typical deviations off [unit of the channel], 2,000 control steps after the
   onset. Target: a group of channels (drawn), all, or one channel. Owns `obs`. Source: sensor drift
-  of Danesh and Fern 2021, peers B3; the range is this project's own choice.
+  of Danesh and Fern 2021; the range is this project's own choice.
   """
 
   def change(m, severity, key, ports, scale):
@@ -71,7 +71,7 @@ def scale(env) -> Fault:
 
   Severity: 1 leaves a tenth of the gain [1]. Target: a group of channels (drawn), all, or one
   channel. Owns `obs`. Not visible to: a channel that reads 0. Source: calibration faults (a reading
-  times a constant) of Danesh and Fern 2021, peers B3; the range is this project's own choice.
+  times a constant) of Danesh and Fern 2021; the range is this project's own choice.
   """
   return _sensor(
     "scale", env, lambda m, severity, key, ports, _: (m, ports.obs * (1.0 - 0.9 * severity))
@@ -82,8 +82,8 @@ def noise(env) -> Fault:
   """Gaussian noise on a reading.   x_i' = x_i + n,  n ~ N(0, (severity scale_i)^2)
 
   Severity: standard deviation [typical deviations]; realworldrl_suite's levels are 0.1, 0.3, 1.0 in
-  raw units. Target: a group of channels (drawn), all, or one channel. Owns `obs`. Source: facts
-  4.5.
+  raw units. Target: a group of channels (drawn), all, or one channel. Owns `obs`.
+  Source: realworldrl_suite.
   """
   return _sensor(
     "noise",
@@ -103,7 +103,7 @@ def dropout(env) -> Fault:
 
   Severity: 1 loses every other reading [probability]; realworldrl_suite has 0.01, 0.05, 0.1.
   Target: a group of channels (drawn), all, or one channel. Owns `obs`. Not visible to: a channel
-  that reads 0. Source: dropped observations of realworldrl_suite, facts 4.5.
+  that reads 0. Source: dropped observations of realworldrl_suite.
   """
   return _sensor(
     "dropout",
@@ -125,7 +125,7 @@ def freeze(env) -> Fault:
   Severity: how likely a reading is held for another step [probability]; 1 holds it for ever.
   Target: a group of channels (drawn), all, or one channel. Owns `obs`. Memory: the last reading; an
   episode's start renews it. Not visible to: a channel that does not change. Source: stuck sensors
-  of realworldrl_suite, facts 4.5.
+  of realworldrl_suite.
   """
 
   def change(held, severity, key, ports, _):
@@ -155,7 +155,7 @@ def dropout_burst(env) -> Fault:
   Severity: 0.1, 0.5, 1 are realworldrl_suite's easy, medium and hard: probability 0.01, 0.05, 0.1
   [1], length 1, 5, 10 [control steps]. Target: a group of channels (drawn), all, or one channel.
   Owns `obs`. Memory: how long a burst still lasts; an episode's start ends it. Not visible to: a
-  channel that reads 0. Source: dropped observations of realworldrl_suite, facts 4.5.
+  channel that reads 0. Source: dropped observations of realworldrl_suite.
   """
 
   def change(left, severity, key, ports, _):
@@ -172,8 +172,7 @@ def freeze_burst(env) -> Fault:
   Severity: 0.1, 0.5, 1 are realworldrl_suite's easy, medium and hard: probability 0.01, 0.05, 0.1
   [1], length 1, 5, 10 [control steps]. Target: a group of channels (drawn), all, or one channel.
   Owns `obs`. Memory: the last reading and how long it is still held; an episode's start renews it.
-  Not visible to: a channel that does not change. Source: stuck sensors of realworldrl_suite, facts
-  4.5.
+  Not visible to: a channel that does not change. Source: stuck sensors of realworldrl_suite.
   """
 
   def change(memory, severity, key, ports, _):
@@ -195,7 +194,7 @@ def delay(env) -> Fault:
 
   Severity: 1/3, 2/3, 1 are delays of 3, 6, 9 [control steps], realworldrl_suite's easy, medium,
   hard. Target: a group of channels (drawn), all, or one channel. Owns `obs`. Memory: the last 9
-  readings; an episode's start fills it with its first reading. Source: facts 4.5.
+  readings; an episode's start fills it with its first reading. Source: realworldrl_suite.
   """
 
   def change(line, severity, key, ports, _):

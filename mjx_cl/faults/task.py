@@ -14,7 +14,7 @@ def reward_weight(env) -> Fault:
 
   Severity: lost share [1]. Target: a term of the reward that counts (drawn; env.reward_terms). Owns
   `task.reward_weights`. Not visible to: the observation. Source: Greenberg and Mannor 2021 change
-  the cost of actions, peers B3; that a term fades, and the range, are this project's own choice.
+  the cost of actions; that a term fades, and the range, are this project's own choice.
   """
   terms = getattr(env, "reward_terms", ())
   weights = np.asarray(env.model.task.get("reward_weights", ()))

@@ -38,9 +38,13 @@ def make(name: str, mj_model, substeps: int, outputs: tuple[str, ...] = ("qpos",
   raise UserError(f"unknown physics {name!r}; choose from: auto, native, mjx")
 
 
-def leaves(mj_model, *names: str) -> dict:
-  """Nominal values of model fields as float32 arrays, for types.Model.mj; `gravity` is mjOption's."""
+def leaves(mj_model, *names: str, backend=None) -> dict:
+  """Nominal values of model fields as float32 arrays, for types.Model.mj; `gravity` is mjOption's.
+
+  Fields that `backend` names as `inert`, because they do nothing there, are left out.
+  """
   import jax.numpy as jnp
 
   value = lambda name: mj_model.opt.gravity if name == "gravity" else getattr(mj_model, name)
-  return {name: jnp.asarray(value(name), jnp.float32) for name in names}
+  inert = getattr(backend, "inert", ())
+  return {name: jnp.asarray(value(name), jnp.float32) for name in names if name not in inert}

@@ -34,6 +34,8 @@ class Mjx:
     law=None,
   ):
     self.mj_model, self.substeps, self.outputs, self.law = mj_model, substeps, tuple(outputs), law
+    # MJX decides at compile time which constraints exist
+    self.inert = () if (mj_model.dof_frictionloss > 0).any() else ("dof_frictionloss",)
     self._forward = any(o not in ("qpos", "qvel") for o in outputs)
     self._model = _anywhere(mjx.put_model(mj_model, impl="jax"))
     self._data = _anywhere(mjx.make_data(mj_model, impl="jax"))
@@ -48,10 +50,9 @@ class Mjx:
     """The mjx.Model with `fields` in place of its own, and the constants that follow from them.
 
     Raises:
-      UserError for a field without effect here: MJX decides at compile time which constraints
-        exist.
+      UserError for a field without effect here (`inert`).
     """
-    if "dof_frictionloss" in fields and not (self.mj_model.dof_frictionloss > 0).any():
+    if any(name in fields for name in self.inert):
       raise UserError(
         "dof_frictionloss: MJX builds no friction constraint for a model whose joints have "
         "none, so it would do nothing; choose physics native"

@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_cl.envs.adapters import brax, brax_env
+from mjx_cl.envs.adapters import brax_env, brax_module
 from mjx_cl.errors import FileError
 
 
@@ -124,8 +124,8 @@ HIDDEN = (128,) * 3  # policy and value
 def networks_of(env):
   """Brax's networks, of the shapes that `train` trains for `env`."""
   running_statistics, networks = (
-    brax("training.acme.running_statistics"),
-    brax("training.agents.ppo.networks"),
+    brax_module("training.acme.running_statistics"),
+    brax_module("training.agents.ppo.networks"),
   )
   return networks.make_ppo_networks(
     len(env.spec.obs),
@@ -138,7 +138,10 @@ def networks_of(env):
 
 def _template(env):
   """(normaliser, policy, value) of those networks: what `latest.msgpack` is read into."""
-  running_statistics, specs = brax("training.acme.running_statistics"), brax("training.acme.specs")
+  running_statistics, specs = (
+    brax_module("training.acme.running_statistics"),
+    brax_module("training.acme.specs"),
+  )
   net, key = networks_of(env), jax.random.key(0)
   return (
     running_statistics.init_state(specs.Array((len(env.spec.obs),), jnp.float32)),
@@ -189,7 +192,10 @@ def train(
   """
   own = getattr(env, "demonstration", {})
   adapter = brax_env(Shaped(env, own["weights"], own["bonus"]) if "bonus" in own else env)
-  networks, ppo = brax("training.agents.ppo.networks"), brax("training.agents.ppo.train")
+  networks, ppo = (
+    brax_module("training.agents.ppo.networks"),
+    brax_module("training.agents.ppo.train"),
+  )
   out = pathlib.Path(out)
   out.mkdir(parents=True, exist_ok=True)
   rows, params = latest(out, env) if resume else ([], None)

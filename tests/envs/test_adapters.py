@@ -3,6 +3,7 @@ as oracles of the vector one.
 """
 
 import copy
+import pickle
 import sys
 import warnings
 
@@ -226,6 +227,19 @@ def test_the_first_reset_takes_the_seed_of_the_maker(vector, life):
   np.testing.assert_array_equal(fresh.reset()[0], life[0])
 
 
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
+def test_a_copy_goes_on_as_the_robots_would(copied, same):
+  env = adapters.gymnasium_env("walker", physics="native", **FAULT | {"onset": 1})
+  env.reset(seed=SEED)
+  actions = actions_of(4)[:, 0]
+  env.step(actions[0])
+  again = copied(env)
+  assert again.robots is not env.robots
+  there, here = ([e.step(a) for a in actions[1:]] for e in (again, env))
+  assert same([x[:4] for x in there], [x[:4] for x in here])
+  assert [x[4]["t"] for x in there] == [x[4]["t"] for x in here] == [1, 2, 3]
+
+
 # ---- brax ----------------------------------------------------------------------------------------
 
 
@@ -307,6 +321,8 @@ def test_wrong_calls_are_refused(short_walker, vector):
     vector.reset(seed=[1, 2])
   with pytest.raises(UserError, match="options"):
     vector.reset(options={"height": 2})
+  with pytest.raises(UserError, match="options.*height"):
+    adapters.gymnasium_env(short_walker).reset(options={"height": 2})
 
 
 @pytest.mark.parametrize(

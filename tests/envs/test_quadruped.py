@@ -697,6 +697,10 @@ def test_ends(native):
   np.testing.assert_array_equal(np.flatnonzero(out.truncated), [6])
   figures = jax.vmap(native.env.measure)(after)
   np.testing.assert_array_equal(after.physics.fallen, out.terminated)
+  late = state._replace(step=jnp.full(NUM, 999))  # a fall in the last step is a fall alone
+  _, last = native.step(native.models, late, np.zeros((NUM, 12), np.float32))
+  np.testing.assert_array_equal(last.terminated, out.terminated)
+  np.testing.assert_array_equal(last.truncated, ~out.terminated)
   assert set(figures) == {"velocity_error_m_s"} and figures["velocity_error_m_s"].shape == (NUM,)
 
 

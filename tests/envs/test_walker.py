@@ -266,3 +266,6 @@ def test_mjx_gives_the_same_environment():
     np.asarray(a.physics).view(np.float64)[at : at + 9].astype(np.float32), b.physics.qpos
   )
   assert native.spec == mjx.spec
+  _, out = jax.eval_shape(mjx.step, mjx.model, b, jnp.zeros(6))  # it takes its own model
+  assert out.obs.shape == (24,)
+  assert set(native.model.mj) - set(mjx.model.mj) == {"dof_frictionloss"}

@@ -167,7 +167,7 @@ def test_a_robot_of_ones_own_takes_presets_of_shipped_ones():
 )
 @pytest.mark.parametrize("kind, fault", [("dropout", "dropout_burst"), ("stuck", "freeze_burst")])
 def test_lost_and_stuck_readings_are_those_of_realworldrl_suite(kind, fault, level, chance, steps):
-  """Probability and length of the suite's levels (facts 4.5), against a loop by hand with the same
+  """Probability and length of the suite's levels, against a loop by hand with the same
   draws: 500 steps of a walker's 24 readings, an episode's start among them.
   """
   import jax

@@ -20,7 +20,9 @@ from mjx_cl.cli import app, commands
 from mjx_cl.envs import adapters
 from mjx_cl.envs.course import Course
 from mjx_cl.errors import FileError, UserError
+from mjx_cl.render import files, offscreen, outlines
 from mjx_cl.render import pictures as render
+from mjx_cl.render import scene as scenes
 from mjx_cl.types import EnvState
 
 STEPS, ONSET, EVERY = 30, 12, 2  # walker: 0.025 s a step, 20 pictures a second
@@ -61,7 +63,7 @@ def film(short_walker, frames, monkeypatch):
 def still(model, qpos=None, obs=None):
   """A Frame of a robot at qpos, and an environment that has no more than its model."""
   qpos = np.array(mujoco.MjData(model).qpos if qpos is None else qpos)
-  return types.SimpleNamespace(mj_model=model), render.Frame(
+  return types.SimpleNamespace(mj_model=model), scenes.Frame(
     EnvState(types.SimpleNamespace(qpos=qpos), 0), obs, 0, 0, 0.0, 0.0
   )
 
@@ -78,7 +80,7 @@ def pictures(path):
 def marked(picture):
   """Whether all of the outermost pixels have the mark's colour."""
   edge = np.concatenate([picture[0], picture[-1], picture[:, 0], picture[:, -1]]).astype(int)
-  return bool((np.abs(edge - render.MARK).max(-1) < 24).all())  # a GIF has 128 colours
+  return bool((np.abs(edge - files.MARK).max(-1) < 24).all())  # a GIF has 128 colours
 
 
 # ---- acting --------------------------------------------------------------------------------------
@@ -90,12 +92,12 @@ def test_frames_are_those_of_the_environment(frames, short_walker):
   ]
   assert [f.severity for f in frames] == [float(k >= ONSET) for k in range(STEPS)]
   for f in frames:
-    qpos = render.qpos_of(short_walker, f.state)
+    qpos = scenes.qpos_of(short_walker, f.state)
     assert qpos.dtype == np.float64 and f.obs[14] == pytest.approx(
       1.3 + qpos[0], abs=1e-6
     )  # the height it senses is the one drawn
   np.testing.assert_array_equal(
-    [render.qpos_of(short_walker, f.state)[1] for f in (frames[0], frames[12], frames[24])], 0
+    [scenes.qpos_of(short_walker, f.state)[1] for f in (frames[0], frames[12], frames[24])], 0
   )  # resets
   assert (
     np.ptp([f.reward for f in frames]) > 0
@@ -107,11 +109,11 @@ def test_position_of_the_other_backend_and_of_a_task_that_keeps_a_state_of_its_o
   short_walker, frames
 ):
   row = frames[5].state
-  want = render.qpos_of(short_walker, row)
+  want = scenes.qpos_of(short_walker, row)
   kept = EnvState((row.physics, "something else"), 5)
-  np.testing.assert_array_equal(render.qpos_of(short_walker, kept), want)
+  np.testing.assert_array_equal(scenes.qpos_of(short_walker, kept), want)
   mjx_data = EnvState(types.SimpleNamespace(qpos=want.astype(np.float32)), 5)
-  np.testing.assert_array_equal(render.qpos_of(short_walker, mjx_data), want.astype(np.float32))
+  np.testing.assert_array_equal(scenes.qpos_of(short_walker, mjx_data), want.astype(np.float32))
 
 
 # ---- outlines ------------------------------------------------------------------------------------
@@ -131,8 +133,8 @@ def test_outline_of_each_geom_has_its_size(kind):
   model = mujoco.MjModel.from_xml_string(
     f"<mujoco><worldbody><body><geom type='{kind}' size='{size}'/></body></worldbody></mujoco>"
   )
-  points, radius = render.solid(model, 0)
-  shape = render.outline(points[:, [0, 2]], radius)
+  points, radius = outlines.solid(model, 0)
+  shape = outlines.outline(points[:, [0, 2]], radius)
   np.testing.assert_allclose(
     np.abs(shape).max(0), [half_width, half_height], rtol=0.01
   )  # 48 directions; a ring of 48 points
@@ -146,10 +148,10 @@ def test_a_plane_is_no_solid_and_a_mesh_is():
     "size='1 1 1'/>"
     "<body><freejoint/><geom type='mesh' mesh='m'/></body></worldbody></mujoco>"
   )
-  assert render.solid(model, 0) is None
-  points, radius = render.solid(model, 1)
+  assert outlines.solid(model, 0) is None
+  points, radius = outlines.solid(model, 1)
   assert points.shape == (4, 3) and radius == 0
-  assert not render.planar(model) and render.floor_of(model, mujoco.MjData(model)) == 0
+  assert not scenes.planar(model) and scenes.floor_of(model, mujoco.MjData(model)) == 0
 
 
 def test_sketch_draws_the_body_where_it_is(walker):
@@ -166,7 +168,7 @@ def test_sketch_draws_the_body_where_it_is(walker):
 
   def red(x, z):
     env, frame = still(model, [x, z])
-    picture = render.Sketch(env, 100, 100).picture(frame).astype(int)
+    picture = outlines.Sketch(env, 100, 100).picture(frame).astype(int)
     rows, columns = np.nonzero((picture[..., 0] > 150) & (picture[..., 1:].max(-1) < 80))
     return rows.mean(), columns.mean(), np.ptp(columns) + 1
 
@@ -176,7 +178,7 @@ def test_sketch_draws_the_body_where_it_is(walker):
   assert low[1] == pytest.approx(49.5, abs=1) == far[1]  # the camera follows
   assert low[2] == pytest.approx(0.4 * scale, abs=4)
   env, frame = still(walker)
-  assert len(np.unique(render.Sketch(env, 100, 100).picture(frame).reshape(-1, 3), axis=0)) > 5
+  assert len(np.unique(outlines.Sketch(env, 100, 100).picture(frame).reshape(-1, 3), axis=0)) > 5
 
 
 def test_a_nearer_body_hides_a_farther_one():
@@ -189,7 +191,7 @@ def test_a_nearer_body_hides_a_farther_one():
     f"<mujoco><worldbody>{ball(1, '1 0 0')}{ball(-1, '0 1 0')}</worldbody></mujoco>"
   )
   env, frame = still(model)
-  picture = render.Sketch(env, 200, 200).picture(frame).astype(int)
+  picture = outlines.Sketch(env, 200, 200).picture(frame).astype(int)
   greenish, reddish = (
     picture[..., 1] > picture[..., 0] + 100,
     picture[..., 0] > picture[..., 1] + 100,
@@ -221,7 +223,7 @@ def test_a_car_is_drawn_on_its_track_with_its_lidar():
 
   def picture(obs):
     return scene.picture(
-      render.Frame(None, np.concatenate([obs, np.zeros(3)]), 0, 0, 0.0, 0.0)
+      scenes.Frame(None, np.concatenate([obs, np.zeros(3)]), 0, 0, 0.0, 0.0)
     ).astype(int)
 
   seen, blind = picture(ranges), picture(np.zeros(env.course.beams))
@@ -242,7 +244,7 @@ def test_an_environment_may_draw_itself():
       return (1.0, 0.5), 1.0
 
   scene, _ = render.painter(Own(), 128, 64)
-  picture = scene.picture(render.Frame(None, None, 0, 0, 0.0, 0.0))
+  picture = scene.picture(scenes.Frame(None, None, 0, 0, 0.0, 0.0))
   np.testing.assert_array_equal(picture[2:-2, 2:-2], np.broadcast_to([0, 0, 255], (60, 124, 3)))
   blank = types.SimpleNamespace(spec=types.SimpleNamespace(name="blank"))
   with pytest.raises(UserError, match="no view from above"):
@@ -254,11 +256,11 @@ def test_an_environment_may_draw_itself():
 
 def test_without_a_gl_library_one_line_says_so_and_outlines_are_drawn(short_walker, monkeypatch):
   monkeypatch.setattr(
-    render.subprocess, "run", lambda *_, **__: subprocess.CompletedProcess((), 1)
+    offscreen.subprocess, "run", lambda *_, **__: subprocess.CompletedProcess((), 1)
   )  # neither binding works
   said = []
   scene, by = render.painter(short_walker, WIDTH, HEIGHT, say=said.append)
-  assert isinstance(scene, render.Sketch) and by == "matplotlib"
+  assert isinstance(scene, outlines.Sketch) and by == "matplotlib"
   assert len(said) == 1 and "GL" in said[0] and "matplotlib" in said[0] and "\n" not in said[0]
 
 
@@ -273,7 +275,7 @@ def test_without_a_gl_library_one_line_says_so_and_outlines_are_drawn(short_walk
   ],
 )
 def test_choice_of_the_gl_library(monkeypatch, works, asked, want):
-  monkeypatch.setattr(render.sys, "platform", "linux")
+  monkeypatch.setattr(offscreen.sys, "platform", "linux")
   monkeypatch.setenv("MUJOCO_GL", asked)
   monkeypatch.setenv("PYOPENGL_PLATFORM", "glx")
 
@@ -283,7 +285,7 @@ def test_choice_of_the_gl_library(monkeypatch, works, asked, want):
     )  # what another binding left behind
     return subprocess.CompletedProcess(command, int(command[-1] not in works))
 
-  monkeypatch.setattr(render.subprocess, "run", run)
+  monkeypatch.setattr(offscreen.subprocess, "run", run)
   assert render.gl_library() == want
 
 
@@ -292,16 +294,16 @@ def test_mujocos_own_renderer_where_there_is_a_gl_library(walker):
   if library is None:
     pytest.skip("no GL library here: MuJoCo cannot draw")
   env, frame = still(walker)
-  scene = render.Offscreen(env, 96, 64, library)
+  scene = offscreen.Offscreen(env, 96, 64, library)
   upright = scene.picture(frame)
   turned = scene.picture(still(walker, [-0.5, 3.3, 1.5, 0, 0, 0, 0, 0, 0])[1])
   scene.close()
   assert upright.shape == (64, 96, 3) and upright.dtype == np.uint8
   np.testing.assert_array_equal(
-    upright[0], np.broadcast_to(render.sky(64)[0], (96, 3))
+    upright[0], np.broadcast_to(scenes.sky(64)[0], (96, 3))
   )  # nothing but sky above
   assert (upright != turned).any(-1).mean() > 0.02 and (
-    upright[:, 48] != render.sky(64)
+    upright[:, 48] != scenes.sky(64)
   ).any()  # the robot in the middle
 
 
@@ -323,7 +325,7 @@ def test_gif(film, tmp_path):
     k * EVERY >= ONSET for k in range(STEPS // EVERY)
   ]  # from the onset on
   badge = shown[:, HEIGHT - 16 :, WIDTH // 2 :].astype(int)
-  red = (np.abs(badge - render.MARK).max(-1) < 24).mean((1, 2))
+  red = (np.abs(badge - files.MARK).max(-1) < 24).mean((1, 2))
   assert (red[ONSET // EVERY :] > 0.3).all() and (red[: ONSET // EVERY] == 0).all()
   assert os.listdir(tmp_path) == ["a.gif"]
 
@@ -348,8 +350,8 @@ def test_mp4(film, tmp_path):
 
 
 def test_an_mp4_without_ffmpeg_says_what_to_install(film, tmp_path, monkeypatch):
-  monkeypatch.setattr(render.shutil, "which", lambda _: None)
-  monkeypatch.setitem(render.sys.modules, "imageio_ffmpeg", None)
+  monkeypatch.setattr(files.shutil, "which", lambda _: None)
+  monkeypatch.setitem(offscreen.sys.modules, "imageio_ffmpeg", None)
   with pytest.raises(UserError, match=r"pip install 'mjx-cl\[video\]'"):
     film(tmp_path / "a.mp4")
   assert os.listdir(tmp_path) == []
@@ -359,7 +361,7 @@ def test_an_ffmpeg_that_fails_is_one_error_and_leaves_nothing(film, tmp_path, mo
   broken = tmp_path / "ffmpeg"
   broken.write_text("#!/bin/sh\necho 'Unknown encoder' >&2\nexit 1\n")
   broken.chmod(0o755)
-  monkeypatch.setattr(render, "ffmpeg", lambda: str(broken))
+  monkeypatch.setattr(files, "ffmpeg", lambda: str(broken))
   with pytest.raises(FileError, match="Unknown encoder"):
     film(tmp_path / "a.mp4")
   assert os.listdir(tmp_path) == ["ffmpeg"]
@@ -379,12 +381,12 @@ def test_a_failure_on_the_way_keeps_the_earlier_file(film, tmp_path, monkeypatch
 
 def test_caption_and_badge_stay_inside_the_picture():
   image = np.full((64, 64, 3), 255, np.uint8)
-  out = render.framed(image, "a caption that is longer than the picture is wide", "FAULT gear 1.00")
+  out = files.framed(image, "a caption that is longer than the picture is wide", "FAULT gear 1.00")
   assert (
     out.shape == image.shape
     and marked(out)
     and (out[4:16] < 100).any()
-    and not marked(render.framed(image, "x"))
+    and not marked(files.framed(image, "x"))
   )
 
 
@@ -533,5 +535,5 @@ def test_an_unwritable_place_is_one_line(refused, tmp_path):  # noqa: F811
 
 def test_gif_of_one_picture_is_a_gif():
   out = io.BytesIO()
-  render.write_gif(out, [np.zeros((64, 64, 3), np.uint8)], 20)
+  files.write_gif(out, [np.zeros((64, 64, 3), np.uint8)], 20)
   assert out.getvalue()[:6] in (b"GIF87a", b"GIF89a")
