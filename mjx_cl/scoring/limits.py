@@ -22,10 +22,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from scipy import special
 
 from mjx_cl.errors import UserError
 from mjx_cl.scoring import intervals as bootstrap
-from mjx_cl.scoring import special
 
 # 2 x 0.583: mean overshoot at both ends of a Gaussian random walk, Siegmund 1985, Sequential
 # Analysis
@@ -350,7 +350,7 @@ def ljung_box(e, lags: int = 20, fitted: int = 0) -> tuple[float, float]:
     np.sum(e * e, 0), 1e-300
   )
   q = float(np.sum(n * (n + 2) * r**2 / (n - np.arange(1, lags + 1)[:, None])))
-  return q, special.chi_square_tail(q, e.shape[1] * lags - fitted)
+  return q, float(special.chdtrc(e.shape[1] * lags - fitted, q))
 
 
 def closed_form(nominal, faulty, arl0: float, order: int = 8, lags: int = 20) -> dict:

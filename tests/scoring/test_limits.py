@@ -16,7 +16,7 @@ import scipy.stats
 from mjx_cl.detectors.likelihood_ratio import likelihood_ratio
 from mjx_cl.errors import UserError
 from mjx_cl.rollout.monitor import unknown
-from mjx_cl.scoring import limits, special
+from mjx_cl.scoring import limits
 
 
 def residual(x, reward=None):
@@ -460,26 +460,3 @@ def test_efficiency_draws_seeds_in_pairs():
   """
   got = limits.efficiency([1, 3, 7, 15, 31], [3, 7, 15, 31, 63], horizon=1000)
   assert got["efficiency"] == 0.5 and got["efficiency_ci"] == pytest.approx([0.5, 0.5])
-
-
-# ---- distribution functions ----------------------------------------------------------------------
-
-
-def test_distribution_functions_equal_scipy():
-  for a in (0.5, 1, 7, 300, 1e5):
-    for share in (0.01, 0.5, 0.99, 1.0, 1.02, 3.0):
-      assert special.gamma_cdf(a, a * share) == pytest.approx(
-        scipy.stats.gamma.cdf(a * share, a), abs=1e-9
-      )
-  for freedom, x in ((1, 0.1), (20, 35.0), (500, 420.0)):
-    assert special.chi_square_tail(x, freedom) == pytest.approx(
-      scipy.stats.chi2.sf(x, freedom), abs=1e-9
-    )
-  for p in (1e-6, 0.025, 0.5, 0.999):
-    assert special.normal_quantile(p) == pytest.approx(scipy.stats.norm.ppf(p), abs=1e-9)
-  for a, p in ((0.5, 0.01), (1, 0.975), (40, 0.5), (1e5, 0.025)):
-    assert special.gamma_quantile(a, p) == pytest.approx(scipy.stats.gamma.ppf(p, a), rel=1e-9)
-  for k in (2, 10, 30):
-    assert special.studentised_range(k) == pytest.approx(
-      scipy.stats.studentized_range.ppf(0.95, k, math.inf), abs=1e-6
-    )
