@@ -13,8 +13,8 @@ import jax.numpy as jnp
 
 from mjx_cl.detectors.base import Alarm, Detector, Warm, cold, demand, standardise
 from mjx_cl.errors import UserError
+from mjx_cl.rollout.monitor import CHANNELS, Residual
 
-CHANNELS = ("opr", "rpr", "reward", "surprise") + tuple(f"group_{k}" for k in range(8))
 NAMES = f"{', '.join(CHANNELS)}, variable_0 and so on"
 
 
@@ -23,13 +23,13 @@ def is_channel(name: str) -> bool:
   return name in CHANNELS or name.startswith("variable_") and name[9:].isdigit()
 
 
-def read(channel: str, residual) -> jax.Array:
-  """One number of a monitor.Residual: `opr`, `rpr`, `reward`, `surprise`, `group_0` .. `group_7`,
+def read(channel: str, residual: Residual) -> jax.Array:
+  """One number of a monitor.Residual, or of rows of them with leading axes: `opr`, `rpr`, `reward`, `surprise`, `group_0` .. `group_7`,
   or `variable_0` and so on, the residual of a single observation variable. Unknown values are nan.
   UserError for a variable that the residual does not hold.
   """
   if channel.startswith("group_"):
-    return residual.groups[int(channel[6:])]
+    return residual.groups[..., int(channel[6:])]
   if channel.startswith("variable_"):
     index, size = int(channel[9:]), residual.variables.shape[-1]
     if index >= size:
@@ -37,7 +37,7 @@ def read(channel: str, residual) -> jax.Array:
         f"no channel {channel}: the residual holds {size} variables"
         + ("" if size else ", since recorded streams keep groups of them alone")
       )
-    return residual.variables[index]
+    return residual.variables[..., index]
   return getattr(residual, channel)
 
 

@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mjx_cl.config import CHUNK
+from mjx_cl.detectors.combine import read
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.io import tables as store
 from mjx_cl.leaderboard.streams import COLUMNS, LATENT, META, SCHEMA, VERSION, Suite
@@ -168,10 +169,8 @@ def _record(
         [x, np.full((CHUNK, len(lanes_) - healthy) + x.shape[2:], np.nan, np.float32)], 1
       )
     )
-    for k, name in enumerate(COLUMNS):
-      out[name].append(
-        wide(seen.groups[..., k - 4] if name.startswith("group_") else getattr(seen, name))
-      )
+    for name in COLUMNS:
+      out[name].append(wide(read(name, seen)))
     out["latent"].append(wide(seen.latent).astype(np.float16))
     out["episode"].append(np.asarray(rows.episode)[:, 0].astype(np.int16))
     out["terminated"].append(np.asarray(rows.terminated)[:, 0])

@@ -22,6 +22,7 @@ from mjx_cl.errors import FileError, UserError, choose
 from mjx_cl.leaderboard import oracle as oracles
 from mjx_cl.leaderboard import sweep
 from mjx_cl.leaderboard.streams import Streams, StreamSet
+from mjx_cl.rollout.monitor import CHANNELS
 from mjx_cl.scoring import limits, metrics, thresholds
 
 ORACLES = (
@@ -112,8 +113,9 @@ def variants() -> dict[str, dict]:
     if scalar(name):
       own[f"{name} white"] = {"use": name, "whiten": oracles.ORDER}
   if scalar("cusum"):
-    own |= {f"cusum@{c}": {"use": f"cusum@{c}"} for c in ("opr", "rpr", "reward", "surprise")}
-    own["cusum@groups"] = {"use": "cusum@" + "+".join(f"group_{k}" for k in range(8))}
+    groups = [c for c in CHANNELS if c.startswith("group_")]
+    own |= {f"cusum@{c}": {"use": f"cusum@{c}"} for c in CHANNELS if c not in groups}
+    own["cusum@groups"] = {"use": f"cusum@{'+'.join(groups)}"}
   return own
 
 
@@ -595,7 +597,9 @@ def _pages(data: Data, oracle: dict, alarms: dict) -> list[dict]:
       points, digits = (150, ".3g") if lives else (300, ".4g")
       thin = max(1, (window.stop - window.start) // points)
       channels = {
-        c: getattr(data.fault.residual, c)[window, k] for c in ("opr", "rpr", "reward", "surprise")
+        c: getattr(data.fault.residual, c)[window, k]
+        for c in CHANNELS
+        if not c.startswith("group_")
       }
       values = {
         c: [None if not math.isfinite(v) else float(format(v, digits)) for v in x[::thin]]

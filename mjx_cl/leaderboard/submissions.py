@@ -11,6 +11,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from mjx_cl.detectors.combine import read
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.io import tables
 from mjx_cl.leaderboard.score import CURVE, Data, Found, curve, found
@@ -289,10 +290,7 @@ def export(streams: StreamSet, folder, robots=(), overwrite: bool = False) -> li
         "step": np.arange(steps, dtype=np.int32),
         "episode": one.episode[:, 0],
         "terminated": r.terminated[:, 0],
-        **{
-          c: (r.groups[:, 0, int(c[6:])] if c.startswith("group_") else getattr(r, c)[:, 0])
-          for c in COLUMNS
-        },
+        **{c: read(c, r)[:, 0] for c in COLUMNS},
       }
       for k, v in values.items():
         table[k].append(v)
