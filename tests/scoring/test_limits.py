@@ -108,25 +108,6 @@ def test_brownian_refuses_what_has_no_limit():
       limits.brownian(arl0, shift)
 
 
-@pytest.mark.parametrize("false_alarm, miss, nats", [(0.01, 0.1, 3.82), (0.001, 0.05, 6.36)])
-def test_bound(false_alarm, miss, nats):
-  assert limits.bound(false_alarm, miss, 1.0) == pytest.approx(nats, abs=0.005)
-  assert limits.bound(false_alarm, miss, 0.125) == pytest.approx(
-    8 * limits.bound(false_alarm, miss, 1.0)
-  )
-  entropies = scipy.stats.entropy(
-    [1 - miss, miss], [false_alarm, 1 - false_alarm]
-  )  # KL of the two Bernoulli distributions
-  assert limits.bound(false_alarm, miss, 1.0) == pytest.approx(entropies)
-
-
-def test_bound_at_its_edges():
-  assert limits.bound(0.01, 0.1, 0.0) is None and limits.bound(0.01, 0.1, -1e-3) is None
-  assert limits.bound(0.9, 0.1, 0.5) == 0.0
-  with pytest.raises(UserError):
-    limits.bound(0.0, 0.1, 1.0)
-
-
 # ---- the oracle ----------------------------------------------------------------------------------
 
 
