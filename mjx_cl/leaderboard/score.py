@@ -9,18 +9,23 @@ once. A detector is one jitted program over all streams and several thresholds s
 from __future__ import annotations
 
 import collections
+import concurrent.futures
 import inspect
 import math
+import os
+import pathlib
 import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from mjx_cl import detectors as detectors_lib
 from mjx_cl.errors import FileError, UserError, choose
+from mjx_cl.io import tables
 from mjx_cl.leaderboard import oracle as oracles
-from mjx_cl.leaderboard import sweep
+from mjx_cl.leaderboard import page, sweep
 from mjx_cl.leaderboard.streams import Streams, StreamSet
 from mjx_cl.rollout.monitor import CHANNELS
 from mjx_cl.scoring import limits, metrics, thresholds
@@ -194,8 +199,6 @@ def load(streams: StreamSet, robot: str) -> Data:
 
 def joined(a, b):
   """Two residuals side by side, cut to the shorter."""
-  import jax
-
   steps = min(len(a.opr), len(b.opr))
   return jax.tree.map(lambda x, y: np.concatenate([x[:steps], y[:steps]], 1), a, b)
 
@@ -546,13 +549,10 @@ def score(
   )
 
 
-def _workers():
+def _workers() -> concurrent.futures.ThreadPoolExecutor:
   """A thread per core, eight at the most: the program of a detector runs on one core, and several
   run side by side.
   """
-  import concurrent.futures
-  import os
-
   return concurrent.futures.ThreadPoolExecutor(min(8, os.cpu_count() or 1), "detector")
 
 
@@ -643,11 +643,6 @@ def write(board: Board, out, meta: dict) -> list[str]:
   """leaderboard.parquet (x_ci as x_low, x_high), leaderboard_overall.parquet and leaderboard.html
   in the folder `out`.
   """
-  import pathlib
-
-  from mjx_cl.io import tables
-  from mjx_cl.leaderboard import page
-
   out = pathlib.Path(out)
   out.mkdir(parents=True, exist_ok=True)
   for name, rows in (("leaderboard", board.rows), ("leaderboard_overall", board.overall.rows)):
