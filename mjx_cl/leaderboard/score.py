@@ -565,7 +565,6 @@ def _one_line(one: Entry, run: Callable[[], Any]):
   """run(); whatever goes wrong inside a detector, which may be anybody's, becomes one line that
   names it.
   """
-  import jax
 
   try:
     return run()
