@@ -18,7 +18,7 @@ from mjx_cl.detectors.adwin import adwin
 from mjx_cl.detectors.base import Alarm, Detector, scalar
 from mjx_cl.detectors.bfar import bfar
 from mjx_cl.detectors.bocpd import bocpd
-from mjx_cl.detectors.combine import all_of, any_of, cool_down, on, patience, standardised, whitened
+from mjx_cl.detectors.combine import any_of, cool_down, on, patience, whitened
 from mjx_cl.detectors.conformal import conformal
 from mjx_cl.detectors.cusum import cusum
 from mjx_cl.detectors.e_detector import e_detector

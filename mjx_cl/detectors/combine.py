@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from mjx_cl.detectors.base import Alarm, Detector, Warm, cold, demand, standardise
+from mjx_cl.detectors.base import Alarm, Detector, demand
 from mjx_cl.errors import UserError
+from mjx_cl.rollout.monitor import CHANNELS, Residual
 
-CHANNELS = ("opr", "rpr", "reward", "surprise") + tuple(f"group_{k}" for k in range(8))
 NAMES = f"{', '.join(CHANNELS)}, variable_0 and so on"
 
 
@@ -23,13 +23,13 @@ def is_channel(name: str) -> bool:
   return name in CHANNELS or name.startswith("variable_") and name[9:].isdigit()
 
 
-def read(channel: str, residual) -> jax.Array:
-  """One number of a monitor.Residual: `opr`, `rpr`, `reward`, `surprise`, `group_0` .. `group_7`,
+def read(channel: str, residual: Residual) -> jax.Array:
+  """One number of a monitor.Residual, or of rows of them with leading axes: `opr`, `rpr`, `reward`, `surprise`, `group_0` .. `group_7`,
   or `variable_0` and so on, the residual of a single observation variable. Unknown values are nan.
   UserError for a variable that the residual does not hold.
   """
   if channel.startswith("group_"):
-    return residual.groups[int(channel[6:])]
+    return residual.groups[..., int(channel[6:])]
   if channel.startswith("variable_"):
     index, size = int(channel[9:]), residual.variables.shape[-1]
     if index >= size:
@@ -37,7 +37,7 @@ def read(channel: str, residual) -> jax.Array:
         f"no channel {channel}: the residual holds {size} variables"
         + ("" if size else ", since recorded streams keep groups of them alone")
       )
-    return residual.variables[index]
+    return residual.variables[..., index]
   return getattr(residual, channel)
 
 
@@ -80,45 +80,6 @@ def any_of(*detectors: Detector) -> Detector:
     detectors  # for passes.updates: the largest score hides what the other members do
   )
   return Detector(lambda: tuple(d.init() for d in detectors), update)
-
-
-class AllOfState(NamedTuple):
-  """Attributes:
-  members: their states. age: int32 (members,), samples since each one's last alarm that still
-  counts; `within` where there is none.
-  """
-
-  members: tuple
-  age: jax.Array
-
-
-def all_of(*detectors: Detector, within: int = 1) -> Detector:
-  """Fires when every member has fired among the last `within` samples; the alarms are spent then,
-  and each member must fire anew.
-
-  A member starts its evidence afresh at its own alarm, so alarms for the same change seldom fall on
-  one sample: give detectors that gather evidence a `within` of about the spread of their delays.
-  Score = the smallest of the members' scores, nan unless all are known; fired does not follow from
-  it where within > 1. A row in which no member has a score does not count as a sample.
-  """
-  demand("all_of", within=(within, within >= 1, "at least 1"))
-
-  def update(state, x):
-    out = [d.update(s, x) for d, s in zip(detectors, state.members)]
-    scores = jnp.stack([alarm.score for _, alarm in out])
-    older = jnp.where(jnp.all(jnp.isnan(scores)), state.age, jnp.minimum(state.age + 1, within))
-    age = jnp.where(jnp.stack([alarm.fired for _, alarm in out]), 0, older)
-    fired = jnp.all(age < within) & jnp.any(age == 0)  # never at a row that no member counts
-    return AllOfState(tuple(s for s, _ in out), jnp.where(fired, within, age)), Alarm(
-      fired, jnp.min(scores)
-    )
-
-  return Detector(
-    lambda: AllOfState(
-      tuple(d.init() for d in detectors), jnp.full(len(detectors), within, jnp.int32)
-    ),
-    update,
-  )
 
 
 class RunState(NamedTuple):
@@ -187,29 +148,6 @@ def _handed_on(ready: jax.Array, detector: Detector, inner, x: jax.Array):
   return jax.tree.map(lambda a, b: jnp.where(ready, a, b), new, inner), Alarm(
     alarm.fired & ready, jnp.where(ready, alarm.score, jnp.nan)
   )
-
-
-class StandardisedState(NamedTuple):
-  """Attributes:
-  warm: reference. inner: state of the detector.
-  """
-
-  warm: Warm
-  inner: Any
-
-
-def standardised(detector: Detector, warmup: int = 1000) -> Detector:
-  """Hands z = (x - mean) / max(std, 1e-6) to a detector of one number; mean, std of the first
-  `warmup` samples, which it does not see.
-  """
-  demand("standardised", warmup=(warmup, warmup >= 2, "at least 2"))
-
-  def update(state, x):
-    warm, z, ready = standardise(state.warm, jnp.asarray(x, jnp.float32), warmup)
-    inner, alarm = _handed_on(ready, detector, state.inner, z)
-    return StandardisedState(warm, inner), alarm
-
-  return Detector(lambda: StandardisedState(cold(), detector.init()), update)
 
 
 class WhitenedState(NamedTuple):

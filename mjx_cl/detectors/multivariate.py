@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from mjx_cl.detectors.base import Warm, standardise
 from mjx_cl.detectors.combine import NAMES, is_channel, read
 from mjx_cl.errors import UserError
-from mjx_cl.rollout.monitor import GROUPS
+from mjx_cl.rollout.monitor import CHANNELS
 
 ALONE = ("reward", "surprise")  # known where the residuals are not
 
@@ -26,7 +26,7 @@ def split(name: str, channels: str | tuple[str, ...]) -> tuple[str, ...]:
   channels = tuple(
     c
     for group in channels
-    for c in ([f"group_{k}" for k in range(GROUPS)] if group == "groups" else [group])
+    for c in ([c for c in CHANNELS if c.startswith("group_")] if group == "groups" else [group])
   )
   if not channels or len(set(channels)) < len(channels) or not all(map(is_channel, channels)):
     raise UserError(

@@ -181,10 +181,3 @@ def samples(host: HostDetector, residual) -> np.ndarray:
   echo = Detector(lambda: (), lambda state, x: (state, Alarm(jnp.bool_(False), x)))
   look = lambda row: on(host.channel, echo, host.log).update((), row)[1].score
   return np.asarray(jax.jit(jax.vmap(jax.vmap(look)))(residual))
-
-
-def watch(host: HostDetector, residual) -> tuple[np.ndarray, np.ndarray]:
-  """(fired bool (T, S), score float64 (T, S)) of a host detector over a recorded monitor.Residual
-  with leading (T, S).
-  """
-  return run_host(host.factory, samples(host, residual), host.host_name)

@@ -10,15 +10,26 @@ import json
 import os
 import pathlib
 import shutil
+import time
 import zlib
 from typing import NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
+from mjx_cl import envs
+from mjx_cl import faults as faults_lib
 from mjx_cl.config import CHUNK
+from mjx_cl.detectors.combine import read
 from mjx_cl.errors import FileError, UserError
+from mjx_cl.io import runtime
 from mjx_cl.io import tables as store
 from mjx_cl.leaderboard.streams import COLUMNS, LATENT, META, SCHEMA, VERSION, Suite
+from mjx_cl.rollout.frozen import stream_keys
+from mjx_cl.rollout.monitor import Monitor, watched
+from mjx_cl.rollout.scan import Rollout, nest, start
+from mjx_cl.training import agents
 
 TILE = 16  # lanes are filled up to a multiple of it
 MADE = (
@@ -102,12 +113,6 @@ def _record(
     COLUMNS float32 (steps, S), nan where unknown; episode int16, terminated bool (steps, S); latent
     float16 (steps, S, 16); target (S,) names.
   """
-  import jax
-  import jax.numpy as jnp
-
-  from mjx_cl import faults as faults_lib
-  from mjx_cl.rollout.monitor import Monitor
-  from mjx_cl.rollout.scan import Rollout, nest, start
 
   names = list(dict.fromkeys(lane.fault for lane in lanes_ if lane.fault))
   faults = tuple(faults_lib.make(n, env) for n in names) or (faults_lib.none(env),)
@@ -168,10 +173,8 @@ def _record(
         [x, np.full((CHUNK, len(lanes_) - healthy) + x.shape[2:], np.nan, np.float32)], 1
       )
     )
-    for k, name in enumerate(COLUMNS):
-      out[name].append(
-        wide(seen.groups[..., k - 4] if name.startswith("group_") else getattr(seen, name))
-      )
+    for name in COLUMNS:
+      out[name].append(wide(read(name, seen)))
     out["latent"].append(wide(seen.latent).astype(np.float16))
     out["episode"].append(np.asarray(rows.episode)[:, 0].astype(np.int16))
     out["terminated"].append(np.asarray(rows.terminated)[:, 0])
@@ -323,9 +326,6 @@ def prepare(suite_: Suite, robots, physics: str, agent: str | None) -> dict[str,
     UserError, before hours are spent: an unknown robot, fault, target or agent, or an agent that
       does not act in every control step.
   """
-  from mjx_cl import envs
-  from mjx_cl import faults as faults_lib
-  from mjx_cl.training import agents
 
   out = {}
   for robot in robots or suite_.robots:
@@ -370,13 +370,6 @@ def record(
   Returns:
     {robot: stream-steps per second of its parts}, plus the size of the files.
   """
-  import time
-
-  import jax
-
-  from mjx_cl.io import runtime
-  from mjx_cl.rollout.frozen import stream_keys
-  from mjx_cl.rollout.monitor import watched
 
   out = pathlib.Path(out)
   work, staged = out / "work", out / "work" / "set"
@@ -529,7 +522,6 @@ def _digest(params) -> int:
   """CRC-32 of an agent's weights, which tells agents apart; config.json of a set holds it for each
   robot's.
   """
-  import jax
 
   return zlib.crc32(b"".join(np.asarray(x).tobytes() for x in jax.tree.leaves(params)))
 

@@ -9,19 +9,25 @@ once. A detector is one jitted program over all streams and several thresholds s
 from __future__ import annotations
 
 import collections
+import concurrent.futures
 import inspect
 import math
+import os
+import pathlib
 import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from mjx_cl import detectors as detectors_lib
 from mjx_cl.errors import FileError, UserError, choose
+from mjx_cl.io import tables
 from mjx_cl.leaderboard import oracle as oracles
-from mjx_cl.leaderboard import sweep
+from mjx_cl.leaderboard import page, sweep
 from mjx_cl.leaderboard.streams import Streams, StreamSet
+from mjx_cl.rollout.monitor import CHANNELS
 from mjx_cl.scoring import limits, metrics, thresholds
 
 ORACLES = (
@@ -112,8 +118,9 @@ def variants() -> dict[str, dict]:
     if scalar(name):
       own[f"{name} white"] = {"use": name, "whiten": oracles.ORDER}
   if scalar("cusum"):
-    own |= {f"cusum@{c}": {"use": f"cusum@{c}"} for c in ("opr", "rpr", "reward", "surprise")}
-    own["cusum@groups"] = {"use": "cusum@" + "+".join(f"group_{k}" for k in range(8))}
+    groups = [c for c in CHANNELS if c.startswith("group_")]
+    own |= {f"cusum@{c}": {"use": f"cusum@{c}"} for c in CHANNELS if c not in groups}
+    own["cusum@groups"] = {"use": f"cusum@{'+'.join(groups)}"}
   return own
 
 
@@ -192,8 +199,6 @@ def load(streams: StreamSet, robot: str) -> Data:
 
 def joined(a, b):
   """Two residuals side by side, cut to the shorter."""
-  import jax
-
   steps = min(len(a.opr), len(b.opr))
   return jax.tree.map(lambda x, y: np.concatenate([x[:steps], y[:steps]], 1), a, b)
 
@@ -544,13 +549,10 @@ def score(
   )
 
 
-def _workers():
+def _workers() -> concurrent.futures.ThreadPoolExecutor:
   """A thread per core, eight at the most: the program of a detector runs on one core, and several
   run side by side.
   """
-  import concurrent.futures
-  import os
-
   return concurrent.futures.ThreadPoolExecutor(min(8, os.cpu_count() or 1), "detector")
 
 
@@ -563,7 +565,6 @@ def _one_line(one: Entry, run: Callable[[], Any]):
   """run(); whatever goes wrong inside a detector, which may be anybody's, becomes one line that
   names it.
   """
-  import jax
 
   try:
     return run()
@@ -595,7 +596,9 @@ def _pages(data: Data, oracle: dict, alarms: dict) -> list[dict]:
       points, digits = (150, ".3g") if lives else (300, ".4g")
       thin = max(1, (window.stop - window.start) // points)
       channels = {
-        c: getattr(data.fault.residual, c)[window, k] for c in ("opr", "rpr", "reward", "surprise")
+        c: getattr(data.fault.residual, c)[window, k]
+        for c in CHANNELS
+        if not c.startswith("group_")
       }
       values = {
         c: [None if not math.isfinite(v) else float(format(v, digits)) for v in x[::thin]]
@@ -639,11 +642,6 @@ def write(board: Board, out, meta: dict) -> list[str]:
   """leaderboard.parquet (x_ci as x_low, x_high), leaderboard_overall.parquet and leaderboard.html
   in the folder `out`.
   """
-  import pathlib
-
-  from mjx_cl.io import tables
-  from mjx_cl.leaderboard import page
-
   out = pathlib.Path(out)
   out.mkdir(parents=True, exist_ok=True)
   for name, rows in (("leaderboard", board.rows), ("leaderboard_overall", board.overall.rows)):

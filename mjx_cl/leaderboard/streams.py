@@ -24,27 +24,21 @@ import numpy as np
 
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.io import tables
+from mjx_cl.rollout.monitor import CHANNELS, LATENT, Residual
 
 VERSION = 1
 HERE = pathlib.Path(__file__).parent
 SUITES, RECORDINGS = HERE / "suites", HERE / "recordings"
-GROUPS, LATENT = 8, 16
-COLUMNS = ("opr", "rpr", "reward", "surprise") + tuple(f"group_{k}" for k in range(GROUPS))
+COLUMNS = tuple(CHANNELS)
 SCHEMA = {
   "stream": "int32, number of the stream",
   "step": "int32, control step since the stream began",
   "episode": "int16, episode of the stream",
   "terminated": "bool, the episode ended in this step",
-  "opr": "float32, observation residual, null where its window was cut",
-  "rpr": "float32, reward residual, as opr",
-  "reward": "float32, of arriving",
-  "surprise": "float32, KL(posterior || prior) [nats]",
   **{
-    f"group_{k}": (
-      "float32, mean residual of a part of the observation, in typical deviations; its name is "
-      "in streams.parquet, `groups`"
-    )
-    for k in range(GROUPS)
+    name: f"float32, {what}"
+    + ("; its name is in streams.parquet, `groups`" if name.startswith("group_") else "")
+    for name, what in CHANNELS.items()
   },
 }
 META = {
@@ -240,7 +234,7 @@ class Streams(NamedTuple):
       severity: float (S,). control_s: [s].
   """
 
-  residual: object
+  residual: Residual
   episode: np.ndarray
   stream: np.ndarray
   seed: np.ndarray
@@ -393,8 +387,6 @@ class StreamSet:
 
   def get(self, robot: str, numbers) -> Streams:
     """Streams of one robot, the shorter ones filled up with unknown values to the longest."""
-    from mjx_cl.rollout.monitor import Residual
-
     m = self.meta
     at = [int(np.flatnonzero(m["stream"] == n)[0]) for n in numbers]
     if not at:
@@ -410,7 +402,7 @@ class StreamSet:
     z = np.full(shape + (LATENT,), np.nan, np.float32)
     for column, number in enumerate(numbers):
       self._fill(robot, int(number), int(m["steps"][at[column]]), out, z, column)
-    groups = np.stack([out[f"group_{k}"] for k in range(GROUPS)], -1)
+    groups = np.stack([x for name, x in out.items() if name.startswith("group_")], -1)
     valid = np.isfinite(out["opr"])
     none = np.zeros(shape + (0,), np.float32)
     residual = Residual(

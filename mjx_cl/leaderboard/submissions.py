@@ -10,7 +10,11 @@ import time
 from collections.abc import Callable
 
 import numpy as np
+import pyarrow.compute
+import pyarrow.parquet
 
+from mjx_cl.detectors import python_class as host_lib
+from mjx_cl.detectors.combine import read
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.io import tables
 from mjx_cl.leaderboard.score import CURVE, Data, Found, curve, found
@@ -96,9 +100,6 @@ def read_submission(path, streams: StreamSet, robots=()) -> dict[int, np.ndarray
       and their scores must be those of the whole
     stream up to there.
   """
-  import pyarrow.compute
-  import pyarrow.parquet
-
   table = tables.read_table(path)
   if not {"stream", "step", "score"} <= set(table):
     raise FileError(f"{path}: needs the columns stream, step, score; it has {', '.join(table)}")
@@ -204,7 +205,6 @@ def from_host(host, threshold_name: str | None = None) -> Callable[[Data], Found
     threshold_name: setting that is calibrated to the ARL0, above 0, larger = fewer alarms; None:
       run as it is, its own ARL0 printed.
   """
-  from mjx_cl.detectors import python_class as host_lib
 
   def get(data: Data) -> Found:
     detector = host(1.0) if threshold_name else host
@@ -289,10 +289,7 @@ def export(streams: StreamSet, folder, robots=(), overwrite: bool = False) -> li
         "step": np.arange(steps, dtype=np.int32),
         "episode": one.episode[:, 0],
         "terminated": r.terminated[:, 0],
-        **{
-          c: (r.groups[:, 0, int(c[6:])] if c.startswith("group_") else getattr(r, c)[:, 0])
-          for c in COLUMNS
-        },
+        **{c: read(c, r)[:, 0] for c in COLUMNS},
       }
       for k, v in values.items():
         table[k].append(v)

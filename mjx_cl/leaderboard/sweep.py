@@ -17,6 +17,8 @@ import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from mjx_cl.scoring import thresholds as healthy
@@ -87,7 +89,6 @@ def samples(
     nominal, fault: monitor.Residual, NumPy. onset, seed: int (F,). horizon: steps kept from the
       onset on. most: rows to fill up to.
   """
-  import jax
 
   leaves = jax.tree.leaves(fault)
   same = lambda a, b, steps: all(
@@ -143,7 +144,6 @@ def updates(detector):
   """Update that gives (state, (fired (), scores (M,))): the score of each member of `any_of`, since
   each restarts by itself; else the one score.
   """
-  import jax.numpy as jnp
 
   members = getattr(detector.update, "members", None)
 
@@ -162,8 +162,6 @@ def shared(build: Callable, sample) -> bool:
   """Whether the scores are free of the threshold, by the structure of the program; sample:
   monitor.Residual of one row.
   """
-  import jax
-  import jax.numpy as jnp
 
   def scores(threshold, xs):
     detector = build(threshold)
@@ -196,8 +194,6 @@ def program(build: Callable, rows: int, pool: int):
     fired bool (K, rows, L), scores float32 (K, rows, L, M), see `updates`; rows that were not
     reached are False, nan.
   """
-  import jax
-  import jax.numpy as jnp
 
   def run(thresholds, first, steps, row, source, into, stretches, residual):
     lanes = first.shape[1]
@@ -272,7 +268,6 @@ class Runner:
 
   def prepare(self, data: Samples) -> None:
     """Compiles for these streams; a second robot that fits needs nothing."""
-    import jax
 
     if not self.together:
       self.together = (

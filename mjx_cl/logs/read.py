@@ -206,6 +206,8 @@ def _number(cell: str, comma: bool = False) -> float | None:
   cell = cell.strip()
   if comma:
     cell = "?" if "." in cell else cell.replace(",", ".")
+  if "_" in cell or not cell.isascii():  # an identifier, which Python's float may take all the same
+    return None
   try:
     return float(cell) if cell else float("nan")
   except ValueError:

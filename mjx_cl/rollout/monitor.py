@@ -28,6 +28,17 @@ from mjx_cl.types import Spec, Var
 
 GROUPS = 8  # parts of the observation with a residual of their own
 LATENT = 16  # dimensions of the latent's projection
+# channels of one number, in the order of every table of them: name -> what it is
+CHANNELS = {
+  "opr": "observation residual, null where its window was cut",
+  "rpr": "reward residual, as opr",
+  "reward": "of arriving",
+  "surprise": "KL(posterior || prior) [nats]",
+  **{
+    f"group_{k}": "mean residual of a part of the observation, in typical deviations"
+    for k in range(GROUPS)
+  },
+}
 
 
 class Residual(NamedTuple):

@@ -20,7 +20,7 @@ from mjx_cl.adapt.convergence import SIGNALS
 from mjx_cl.config import AdaptConfig, RunConfig
 from mjx_cl.errors import FileError
 from mjx_cl.rollout.monitor import watched
-from mjx_cl.scoring import alarms as alarm_score, intervals, recovery, special
+from mjx_cl.scoring import alarms as alarm_score, intervals, recovery
 from mjx_cl.types import Spec
 
 # by decision: what a stream has come to
@@ -486,7 +486,7 @@ def summarise(rows: list[dict], config: RunConfig, control_s: float) -> dict:
   put(
     "false_alarms_per_hour",
     false / hours if hours else None,
-    [x / hours for x in special.poisson_interval(false)] if hours else None,
+    [x / hours for x in intervals.poisson(false)] if hours else None,
   )
   median = lambda x: intervals.finite(intervals.censored_median(x)) if len(x) else None
   put(

@@ -50,7 +50,7 @@ from mjx_cl.rollout.order import Lanes
 from mjx_cl.runs.records import Ledger, acts
 from mjx_cl.rollout.monitor import Monitor
 from mjx_cl.rollout.scan import Rollout, Stream, nest, start
-from mjx_cl.scoring import special, stop_rule
+from mjx_cl.scoring import intervals, stop_rule
 from mjx_cl.runs.snapshots import Snapshots
 from mjx_cl.rollout.transfer import Moving, Transfer
 
@@ -702,7 +702,7 @@ def watching(config: RunConfig) -> str | None:
       "(`mjx-cl leaderboard` finds one)"
     )
   steps = found.arl0 * found.alarms
-  low, high = (steps / n for n in reversed(special.poisson_interval(found.alarms)))
+  low, high = (steps / n for n in reversed(intervals.poisson(found.alarms)))
   plain = {f.name: (f.default,) for f in dataclasses.fields(RunConfig)} | {
     "env": (robot,),
     "agent": (None, robot),

@@ -5,9 +5,10 @@ and percentile bootstrap.
 from __future__ import annotations
 
 import functools
-import math
+from collections.abc import Callable
 
 import numpy as np
+from scipy import special, stats
 
 REPS = 20_000
 
@@ -22,7 +23,9 @@ def iqm(x: np.ndarray, axis: int = -1) -> np.ndarray:
   return np.take(x, np.arange(cut, n - cut), axis).mean(axis)
 
 
-def interval(x, statistic=iqm, seed: int = 0, level: float = 0.95) -> list[float] | None:
+def interval(
+  x: np.ndarray, statistic: Callable = iqm, seed: int = 0, level: float = 0.95
+) -> list[float] | None:
   """Percentile bootstrap interval of `statistic` over runs.
 
   Args:
@@ -42,8 +45,8 @@ def interval(x, statistic=iqm, seed: int = 0, level: float = 0.95) -> list[float
   else:
     rows = rng.integers(0, len(x), (REPS,) + x.shape)
     draws = np.take_along_axis(np.broadcast_to(x, (REPS,) + x.shape), rows, 1).reshape(REPS, -1)
-  stats = statistic(draws, axis=-1)
-  low, high = np.quantile(stats, [(1 - level) / 2, (1 + level) / 2], method="nearest")
+  found = statistic(draws, axis=-1)
+  low, high = np.quantile(found, [(1 - level) / 2, (1 + level) / 2], method="nearest")
   return [finite(low), finite(high)]
 
 
@@ -68,7 +71,7 @@ def weights(n: int, reps: int, seed: int = 0) -> np.ndarray:
   return counts
 
 
-def ends(statistics, level: float = 0.95) -> list[list[float | None] | None]:
+def ends(statistics: np.ndarray, level: float = 0.95) -> list[list[float | None] | None]:
   """Percentile intervals of several bootstrapped statistics at once.
 
   Args:
@@ -91,7 +94,7 @@ def ends(statistics, level: float = 0.95) -> list[list[float | None] | None]:
   return out
 
 
-def censored_median(x, axis: int = -1) -> np.ndarray:
+def censored_median(x: np.ndarray, axis: int = -1) -> np.ndarray:
   """Median of times in which a censored run counts as infinite (Kaplan-Meier's median where all are
   censored at the end).
   """
@@ -99,7 +102,7 @@ def censored_median(x, axis: int = -1) -> np.ndarray:
   return np.take(x, (x.shape[axis] - 1) // 2, axis)
 
 
-def share(x, axis: int = -1) -> np.ndarray:
+def share(x: np.ndarray, axis: int = -1) -> np.ndarray:
   """Mean of zeros and ones."""
   return np.mean(np.asarray(x, float), axis)
 
@@ -108,14 +111,27 @@ def wilson(hits: int, n: int) -> list[float] | None:
   """Wilson 95 % interval of a proportion; unlike the bootstrap it is not of width zero at 0 or n
   hits.
   """
-  if not n:
-    return None
-  z, p = 1.959964, hits / n
-  middle = (p + z * z / (2 * n)) / (1 + z * z / n)
-  half = z / (1 + z * z / n) * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
-  return [max(0.0, middle - half), min(1.0, middle + half)]
+  return list(_wilson(hits, n)) if n else None
 
 
-def finite(x) -> float | None:
+@functools.lru_cache(maxsize=4096)
+def _wilson(hits: int, n: int) -> tuple[float, float]:
+  low, high = stats.binomtest(hits, n).proportion_ci(method="wilson")
+  return float(low), float(high)
+
+
+def poisson(count: int, level: float = 0.95) -> tuple[float, float]:
+  """Exact interval of a Poisson mean after `count` events; below 0 events it begins at 0.
+
+    low: P(N >= count; low) = (1 - level) / 2,  high: P(N <= count; high) = (1 - level) / 2
+
+  Reference: Garwood 1936, Biometrika 28, 437-442.
+  """
+  tail = (1 - level) / 2
+  low = float(special.gammaincinv(count, tail)) if count else 0.0
+  return low, float(special.gammaincinv(count + 1, 1 - tail))
+
+
+def finite(x: float | None) -> float | None:
   """float, None where undefined or infinite."""
   return float(x) if x is not None and np.isfinite(x) else None

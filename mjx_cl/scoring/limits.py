@@ -3,13 +3,12 @@ declared channel.
 
 Physics is deterministic: whoever sees every input of a simulated robot needs one step. A limit
 therefore belongs to the channel that detectors are given (such as the logarithm of OPR), and to a
-model of it. Three are offered, from the most to the least demanding of assumptions:
+model of it. Two are offered, from the most to the least demanding of assumptions:
 
   brownian      closed form for a known shift of the mean of independent Gaussian values;
     `closed_form` prints it only where a stream passes for such
   likelihood-ratio CUSUM (detectors/likelihood_ratio.py) on `fit`, run on the same streams at the
   same ARL0: `efficiency` compares with it
-  bound         any detector, any dependence, given the information that the channel carries
 
 Delay counts the samples used, so delay = latency_steps + 1: an alarm in the first faulty step has
 used one.
@@ -22,10 +21,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from scipy import special
 
 from mjx_cl.errors import UserError
 from mjx_cl.scoring import intervals as bootstrap
-from mjx_cl.scoring import special
 
 # 2 x 0.583: mean overshoot at both ends of a Gaussian random walk, Siegmund 1985, Sequential
 # Analysis
@@ -74,33 +73,6 @@ def brownian(arl0: float, shift: float, discrete: bool = True) -> Limit:
     u = (low + high) / 2
     low, high = (u, high) if math.expm1(u) - u < want else (low, u)
   return Limit(2 * (math.expm1(-u) + u) / shift**2, u - EXCESS * shift if discrete else u)
-
-
-def bound(false_alarm: float, miss: float, information: float) -> float | None:
-  """Least steps after which any detector, on data of any dependence, can have alarmed with
-  probability 1 - miss, if its chance of an alarm within as many healthy steps is at most
-  `false_alarm`.
-
-    information t >= (1 - miss) ln((1 - miss) / false_alarm) + miss ln(miss / (1 - false_alarm))
-
-  Args:
-    false_alarm, miss: probabilities inside (0, 1). information: KL rate of the faulty from the
-      healthy channel [nats per step].
-
-  Returns:
-    Steps (not rounded); 0 where false_alarm >= 1 - miss, which tossing a coin achieves; None
-    without information.
-  Source: the data-processing inequality for the event "alarmed within t" (Wald's inequality).
-  """
-  if not (0 < false_alarm < 1 and 0 < miss < 1):
-    raise UserError(f"bound needs false_alarm and miss inside (0, 1); got {false_alarm}, {miss}")
-  if not information > 0:
-    return None
-  if false_alarm >= 1 - miss:
-    return 0.0
-  return (
-    (1 - miss) * math.log((1 - miss) / false_alarm) + miss * math.log(miss / (1 - false_alarm))
-  ) / information
 
 
 class Conditional(NamedTuple):
@@ -350,7 +322,7 @@ def ljung_box(e, lags: int = 20, fitted: int = 0) -> tuple[float, float]:
     np.sum(e * e, 0), 1e-300
   )
   q = float(np.sum(n * (n + 2) * r**2 / (n - np.arange(1, lags + 1)[:, None])))
-  return q, special.chi_square_tail(q, e.shape[1] * lags - fitted)
+  return q, float(special.chdtrc(e.shape[1] * lags - fitted, q))
 
 
 def closed_form(nominal, faulty, arl0: float, order: int = 8, lags: int = 20) -> dict:

@@ -28,9 +28,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from scipy import special, stats
 
 from mjx_cl.errors import UserError
-from mjx_cl.scoring import alarms, special
+from mjx_cl.scoring import alarms
 from mjx_cl.scoring import intervals as bootstrap
 
 HORIZON_S = 20.0  # a later alarm is no detection, unless a suite says otherwise [s after onset]
@@ -228,7 +229,7 @@ def row(
       )
     if healthy_steps > 0 and not healthy_alarms.sum():
       hours = streams * healthy_steps * control_s / 3600.0
-      intervals["false_alarms_per_hour"] = [x / hours for x in special.poisson_interval(0)]
+      intervals["false_alarms_per_hour"] = [x / hours for x in bootstrap.poisson(0)]
 
   out = {
     "streams": streams,
@@ -292,7 +293,7 @@ def arl0(alarm, count_from: int = 0) -> dict:
   """
   alarm = np.asarray(alarm, bool)[count_from:]
   count, steps = int(alarm.sum()), alarm.size
-  low, high = special.poisson_interval(count)
+  low, high = bootstrap.poisson(count)
   return {
     "arl0": steps / count if count else None,
     "arl0_ci": [steps / high, steps / low if count else None] if steps else None,
@@ -385,7 +386,9 @@ def overall(rows: list[dict], reps: int = REPS) -> Overall:
     for b in (next(iter(rivals.values())) if rivals else ())
     if all(b in t and t[b]["cost_standard"] is not None for t in rivals.values())
   ]
-  ranks = np.array([_ranks([-t[b]["cost_standard"] for t in rivals.values()]) for b in shared])
+  ranks = stats.rankdata(
+    [[-t[b]["cost_standard"] for t in rivals.values()] for b in shared], axis=-1
+  )
   mean = dict(zip(rivals, ranks.mean(0))) if len(shared) else {}
   for r in out:
     r["mean_rank"] = bootstrap.finite(mean.get(r["detector"]))
@@ -397,14 +400,9 @@ def overall(rows: list[dict], reps: int = REPS) -> Overall:
     return Overall(out, None, None, n)
   spread = (ranks - (k + 1) / 2).sum(0)
   within = ((ranks - (k + 1) / 2) ** 2).sum() / (k - 1)
-  p = special.chi_square_tail(float((spread**2).sum() / within), k - 1) if within else 1.0
-  return Overall(out, special.studentised_range(k) / 2**0.5 * (k * (k + 1) / (6 * n)) ** 0.5, p, n)
-
-
-def _ranks(x: list[float]) -> np.ndarray:
-  """1 for the smallest; equal values share the mean of their ranks."""
-  x = np.asarray(x, float)
-  return (x[:, None] > x).sum(1) + ((x[:, None] == x).sum(1) + 1) / 2
+  p = float(special.chdtrc(k - 1, (spread**2).sum() / within)) if within else 1.0
+  q = float(stats.studentized_range.ppf(0.95, k, np.inf)) / 2**0.5
+  return Overall(out, q * (k * (k + 1) / (6 * n)) ** 0.5, p, n)
 
 
 def difference(
@@ -495,6 +493,6 @@ def _means(rows: list[dict], reps: int) -> dict:
       hours = (
         sum(r["streams"] * r["healthy_steps"] * r["control_s"] for r in strata.values()) / 3600.0
       )
-      interval = [x / hours for x in special.poisson_interval(0)]
+      interval = [x / hours for x in bootstrap.poisson(0)]
     out |= {name: value, f"{name}_ci": None if value is None else interval}
   return out

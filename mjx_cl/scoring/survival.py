@@ -5,11 +5,13 @@ and what follows from it.
 from __future__ import annotations
 
 import math
+import warnings
 from typing import NamedTuple
 
 import numpy as np
+from scipy import stats
 
-from mjx_cl.scoring import intervals, recovery
+from mjx_cl.scoring import recovery
 
 Z = 1.959963984540054  # 97.5 % quantile of the normal distribution
 
@@ -22,7 +24,6 @@ class Curve(NamedTuple):
     time: float (k,), distinct times at which something happened, rising.
     survival, low, high: float (k,), the estimate and its pointwise 95 % interval; nan where the
       interval is undefined.
-    error: float (k,), Greenwood's standard error of `survival`.
     at_risk, events: int (k,), streams under observation just before time[i], and those of them that
       recovered at it.
     last: longest time under observation.
@@ -32,48 +33,39 @@ class Curve(NamedTuple):
   survival: np.ndarray
   low: np.ndarray
   high: np.ndarray
-  error: np.ndarray
   at_risk: np.ndarray
   events: np.ndarray
   last: float
 
 
-def kaplan_meier(time, seen, interval: str = "log-log") -> Curve:
+def kaplan_meier(time: np.ndarray, seen: np.ndarray, interval: str = "log-log") -> Curve:
   """Kaplan and Meier's estimate from right-censored times.
 
     S(t) = prod_{t_i <= t} (1 - d_i / n_i)       d_i events at t_i among the n_i still under
       observation; a stream censored at t_i counts in n_i
     V(t) = sum_{t_i <= t} d_i / (n_i (n_i - d_i)),   Greenwood's error = S sqrt(V)
-    log-log: S^exp(+-z sqrt(V) / log S)           greenwood: S +- z S sqrt(V), cut to [0, 1]
+    log-log: S^exp(+-z sqrt(V) / log S)           linear: S +- z S sqrt(V), cut to [0, 1]
 
   Args:
-    time: (n,) times of recovery or of censoring [any unit]. seen: bool (n,), the recovery was seen;
-      False: censored.
-    interval: log-log (stays within [0, 1], fair with ten streams) or greenwood.
+    time: (n,) times of recovery or of censoring [any unit].
+    seen: bool (n,), the recovery was seen; False: censored.
+    interval: log-log (stays within [0, 1], fair with ten streams) or linear.
 
   Returns:
     Curve over the times of events; empty arrays where none was seen.
-  Undefined: the log-log interval where S is 0; Greenwood's too, since V is infinite there.
+  Undefined: either interval where S is 0, since V is infinite there.
   Reference: Kaplan and Meier 1958; Greenwood 1926; Kalbfleisch and Prentice 1980 for log-log.
   """
   time, seen = _checked(time, seen)
-  if interval not in ("log-log", "greenwood"):
-    raise ValueError(f"interval must be log-log or greenwood; got {interval!r}")
   at = np.unique(time[seen])
   events = (time[None] == at[:, None])[:, seen].sum(1)
   at_risk = (time[None] >= at[:, None]).sum(1)
-  survival = np.cumprod(1 - events / at_risk)
-  with np.errstate(divide="ignore", invalid="ignore"):
-    root = np.sqrt(np.cumsum(events / (at_risk * (at_risk - events))))
-    error = survival * root
-    if interval == "log-log":
-      arm = np.exp(Z * root / -np.log(survival))
-      low, high = survival**arm, survival ** (1 / arm)
-    else:
-      low, high = np.clip(survival - Z * error, 0, 1), np.clip(survival + Z * error, 0, 1)
-  unknown = ~np.isfinite(root)
-  low, high, error = (np.where(unknown, np.nan, x) for x in (low, high, error))
-  return Curve(at, survival, low, high, error, at_risk, events, float(time.max()))
+  sf = stats.ecdf(stats.CensoredData.right_censored(time, ~seen)).sf
+  with np.errstate(all="ignore"), warnings.catch_warnings(action="ignore"):  # where nobody is left
+    pair = sf.confidence_interval(method=interval)
+  survival = sf.evaluate(at)
+  low, high = (np.where(survival > 0, x.evaluate(at), np.nan) for x in pair)
+  return Curve(at, survival, low, high, at_risk, events, float(time.max()))
 
 
 def quantile(curve: Curve, share: float = 0.5) -> tuple[float | None, list[float | None]]:
@@ -90,7 +82,7 @@ def quantile(curve: Curve, share: float = 0.5) -> tuple[float | None, list[float
   lifetest have it.
   """
 
-  def first(x):
+  def first(x: np.ndarray) -> float | None:
     hit = np.flatnonzero(
       x <= 1 - share + 1e-12
     )  # products of fractions: S may be 0.5 to the last bit but one
@@ -103,7 +95,9 @@ def quantile(curve: Curve, share: float = 0.5) -> tuple[float | None, list[float
   ]
 
 
-def restricted_mean(time, seen, horizon: float) -> tuple[float | None, list[float] | None]:
+def restricted_mean(
+  time: np.ndarray, seen: np.ndarray, horizon: float
+) -> tuple[float | None, list[float] | None]:
   """Mean time to recovery up to a horizon: a stream that takes longer counts as `horizon`.
 
     mean = integral_0^horizon S(t) dt,   variance = sum_{t_i <= horizon} A_i^2 d_i / (n_i (n_i -
@@ -134,53 +128,7 @@ def restricted_mean(time, seen, horizon: float) -> tuple[float | None, list[floa
   return mean, [max(0.0, mean - half), min(float(horizon), mean + half)] if live.any() else None
 
 
-def paired_difference(
-  a, b, horizon: float, reps: int = intervals.REPS, seed: int = 0
-) -> tuple[float | None, list[float | None] | None]:
-  """Difference of the restricted means of two arms on the same seeds, a - b, with its 95 %
-  percentile bootstrap interval.
-
-  A draw takes seeds, and with each seed what both arms did in it, so that what a seed makes hard is
-  hard for both.
-
-  Args:
-    a, b: (time (n,), seen bool (n,)), entry i of both from the same seed.
-
-  Returns:
-    (difference, [low, high]). Draws in which a mean is undefined are left out; the interval is None
-    for fewer than two seeds or where more than half of the draws are.
-  """
-  a, b = _checked(*a), _checked(*b)
-  if len(a[0]) != len(b[0]):
-    raise ValueError(f"pairs of {len(a[0])} and {len(b[0])} times")
-  means = restricted_mean(*a, horizon)[0], restricted_mean(*b, horizon)[0]
-  difference = None if None in means else means[0] - means[1]
-  if len(a[0]) < 2:
-    return difference, None
-  drawn = intervals.draws(len(a[0]), reps, seed)
-  counts = np.zeros((reps, len(a[0])))
-  np.add.at(counts, (np.arange(reps)[:, None], drawn), 1.0)
-  return difference, intervals.ends([_means(*a, horizon, counts) - _means(*b, horizon, counts)])[0]
-
-
-def _means(time, seen, horizon, counts):
-  """Restricted means (reps,) of samples in which stream j stands counts[:, j] times; nan where
-  undefined.
-  """
-  at = np.unique(time[seen & (time < horizon)])
-  events = counts @ ((time[:, None] == at) & seen[:, None])
-  at_risk = counts @ (time[:, None] >= at)
-  survival = np.cumprod(1 - events / np.maximum(1, at_risk), 1)
-  whole = np.concatenate([np.ones((len(counts), 1)), survival], 1)
-  last = np.max(np.where(counts > 0, time, -np.inf), 1)
-  return np.where(
-    (last < horizon) & (whole[:, -1] > 0),
-    np.nan,
-    whole @ np.diff(np.concatenate([[0.0], at, [horizon]])),
-  )
-
-
-def of_runs(rows, steps: int) -> tuple[np.ndarray, np.ndarray]:
+def of_runs(rows: list[dict], steps: int) -> tuple[np.ndarray, np.ndarray]:
   """Times to recovery of the affected streams of runs.parquet (a list of rows), in control steps
   since the onset, as (time, seen).
 
@@ -195,7 +143,7 @@ def of_runs(rows, steps: int) -> tuple[np.ndarray, np.ndarray]:
   return np.maximum(0.0, np.array(time, float)), seen
 
 
-def watched(rows, steps: int) -> list[int | None]:
+def watched(rows: list[dict], steps: int) -> list[int | None]:
   """Control steps after its onset for which a recovery could be seen, of each row of runs.parquet:
   up to 2,000 before the stream's next change, or before the end of the run. Below 0 where even that
   is earlier; None without an onset.
@@ -208,7 +156,7 @@ def watched(rows, steps: int) -> list[int | None]:
   return [None if r["onset"] is None else end(r) - recovery.HOLD - r["onset"] for r in rows]
 
 
-def _checked(time, seen):
+def _checked(time: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
   time, seen = np.asarray(time, float), np.asarray(seen, bool)
   if time.ndim != 1 or time.shape != seen.shape or not len(time):
     raise ValueError(

@@ -54,6 +54,9 @@ def narrow(
       grid = np.geomspace(max(under, 1e-4 * high), high, TOGETHER + 2)[1:-1]
     else:
       grid = np.linspace(under, high, TOGETHER + 2)[1:-1]
+  if not bad:
+    most = max(tried.values())
+    high = (min if most else max)(t for t, c in tried.items() if c == most)
   return high, list(tried.items())
 
 

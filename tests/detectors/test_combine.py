@@ -10,13 +10,11 @@ from mjx_cl import detectors
 from mjx_cl.detectors import (
   Alarm,
   Detector,
-  all_of,
   cool_down,
   cusum,
   on,
   page_hinkley,
   patience,
-  standardised,
   whitened,
   z_score,
 )
@@ -43,40 +41,6 @@ def rows(opr, rpr=None):
   opr = jnp.asarray(opr, jnp.float32)
   rpr = opr if rpr is None else jnp.asarray(rpr, jnp.float32)
   return unknown(opr.shape, 4)._replace(opr=opr, rpr=rpr, valid=jnp.isfinite(opr))
-
-
-# ---- all_of --------------------------------------------------------------------------------------
-
-
-def script(a, b):
-  """Two members that fire where their own column is 1, as scores."""
-  pick = lambda k: Detector(
-    lambda: jnp.int32(0), lambda state, x: (state + 1, Alarm(x[k] > 0.5, x[k]))
-  )
-  return (pick(0), pick(1)), np.stack([a, b], 1).astype(np.float32)
-
-
-@pytest.mark.parametrize("within, want", [(1, [5]), (2, [5, 9]), (3, [2, 5, 9])])
-def test_all_of_needs_every_member_within_the_time(within, want):
-  members, xs = script([1, 0, 0, 0, 0, 1, 0, 0, 0, 1, 0], [0, 0, 1, 0, 0, 1, 0, 0, 1, 0, 0])
-  _, fired, score = run(all_of(*members, within=within), xs)
-  assert np.flatnonzero(fired).tolist() == want
-  np.testing.assert_array_equal(score, xs.min(1))
-
-
-def test_all_of_spends_its_alarms():
-  """After 2, the alarm of the second member at 3 needs another of the first, which comes at 4."""
-  members, xs = script([1, 0, 0, 0, 1], [0, 0, 1, 1, 0])
-  _, fired, _ = run(all_of(*members, within=5), xs)
-  assert np.flatnonzero(fired).tolist() == [2, 4]
-
-
-def test_all_of_skips_rows_that_tell_nothing():
-  members, xs = script([1, np.nan, np.nan, np.nan, 0], [0, np.nan, np.nan, np.nan, 1])
-  _, fired, score = run(all_of(*members, within=2), xs)
-  assert np.flatnonzero(fired).tolist() == [4] and np.isnan(score[1:4]).all()
-  members, xs = script([1, np.nan], [1, 1])
-  assert np.isnan(run(all_of(*members), xs)[2]).tolist() == [False, True]  # one of two is not all
 
 
 # ---- patience ------------------------------------------------------------------------------------
@@ -160,18 +124,7 @@ def test_cool_down_drops_the_alarms_after_one(steps, want):
   assert int(state.inner) == len(xs)  # the detector runs on
 
 
-# ---- standardised, whitened ----------------------------------------------------------------------
-
-
-def test_standardised_hands_on_what_base_standardises():
-  xs = (7 + 3 * np.random.default_rng(2).normal(size=200)).astype(np.float32)
-  state, fired, score = run(standardised(echo(1.0), 60), xs)
-  z = (xs - xs[:60].astype(float).mean()) / xs[:60].astype(float).std()
-  assert (
-    np.isnan(score[:60]).all() and int(state.inner) == 140
-  )  # the warm-up is not shown to the detector
-  np.testing.assert_allclose(score[60:], z[60:], rtol=1e-4, atol=1e-5)  # float32
-  np.testing.assert_array_equal(fired[60:], z[60:] > 1)
+# ---- whitened ------------------------------------------------------------------------------------
 
 
 def autoregressive(coefficients, steps, seed=0, level=0.0, streams=None):
@@ -348,9 +301,5 @@ def test_make_refuses_settings_out_of_range(settings, match):
 
 
 def test_bad_combinations_are_refused():
-  with pytest.raises(UserError, match="within must be"):
-    all_of(echo(), within=0)
-  with pytest.raises(UserError, match="warmup must be"):
-    standardised(echo(), 0)
   with pytest.raises(UserError, match="warmup must be"):
     whitened(echo(), 8, 16)

@@ -381,7 +381,7 @@ def test_watch_masks_as_other_detectors_do(channel, log):
   np.testing.assert_allclose(
     python_class.samples(one, residual), want, rtol=1e-6, atol=1e-7
   )  # float32 logarithm
-  fired, score = python_class.watch(one, residual)
+  fired, score = python_class.run_host(Above, python_class.samples(one, residual))
   assert fired.shape == shape and np.array_equal(np.isfinite(score), used)
   np.testing.assert_array_equal(
     fired,

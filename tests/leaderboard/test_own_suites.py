@@ -260,6 +260,27 @@ def test_a_threshold_below_one_with_too_many_alarms_is_none():
   )
 
 
+@pytest.mark.parametrize("name", ["slow", "clipped", "constant"])
+def test_no_threshold_lies_where_nothing_is_counted(name):
+  """A score that crosses no level as often as is allowed: the threshold with the most crossings, not
+  one below all scores, above which even a sound score stays from its first step on.
+  """
+  steps = np.arange(6000)
+  score = {
+    "slow": np.sin(steps * 2 * np.pi / 1000) - steps / 6000,
+    "clipped": np.where(steps % 1000 == 999, 1.0, 0.0),
+    "constant": np.full(6000, 5.0),
+  }[name]
+  count = lambda levels: np.array(
+    [submissions.crossings(score[:, None], t)[500:].sum() for t in levels]
+  )
+  threshold, tried = thresholds.narrow(count, score, 20)
+  alarms = dict(tried)[threshold]
+  assert alarms == max(dict(tried).values()) and (alarms == 0) == (name == "constant")
+  rise = np.concatenate([score, score.min() + np.zeros(10), score.max() + np.ones(10)])
+  assert submissions.crossings(rise[:, None], threshold)[6000:].any()
+
+
 @pytest.mark.parametrize("scale", [1e-9, 1e9])
 def test_the_unit_of_a_score_is_its_own_affair(scale):
   score = scale * np.random.default_rng(0).exponential(size=100_000)

@@ -23,6 +23,7 @@ from mjx_cl.detectors import Alarm, Detector, scalar
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.io import tables
 from mjx_cl.logs import detect
+from mjx_cl.logs.read import read
 
 
 def save(path, sign=",", **columns):
@@ -1074,3 +1075,12 @@ def test_defaults_of_the_command_are_those_of_the_function():
   assert {n: parameters[n].default for n in ("arl0", "rate", "logarithm")} == {
     n: fields[n].default for n in ("arl0", "rate", "logarithm")
   }
+
+
+@pytest.mark.parametrize("cell", ["12_34", "1_000.5", "1٢"])
+def test_an_identifier_is_no_number(tmp_path, cell):
+  """Python's own float takes 12_34 for 1234 and the digits of other scripts."""
+  path = tmp_path / "log.csv"
+  path.write_text(f"a,b\n1.5,{cell}\n2.5,{cell}\n")
+  found = read(path)
+  assert list(found.columns) == ["a"] and found.ignored == {"b": (2, cell)}

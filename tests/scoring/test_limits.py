@@ -16,7 +16,7 @@ import scipy.stats
 from mjx_cl.detectors.likelihood_ratio import likelihood_ratio
 from mjx_cl.errors import UserError
 from mjx_cl.rollout.monitor import unknown
-from mjx_cl.scoring import limits, special
+from mjx_cl.scoring import limits
 
 
 def residual(x, reward=None):
@@ -106,25 +106,6 @@ def test_brownian_refuses_what_has_no_limit():
   for arl0, shift in ((0, 1), (100, 0), (math.nan, 1), (100, math.inf)):
     with pytest.raises(UserError, match="brownian"):
       limits.brownian(arl0, shift)
-
-
-@pytest.mark.parametrize("false_alarm, miss, nats", [(0.01, 0.1, 3.82), (0.001, 0.05, 6.36)])
-def test_bound(false_alarm, miss, nats):
-  assert limits.bound(false_alarm, miss, 1.0) == pytest.approx(nats, abs=0.005)
-  assert limits.bound(false_alarm, miss, 0.125) == pytest.approx(
-    8 * limits.bound(false_alarm, miss, 1.0)
-  )
-  entropies = scipy.stats.entropy(
-    [1 - miss, miss], [false_alarm, 1 - false_alarm]
-  )  # KL of the two Bernoulli distributions
-  assert limits.bound(false_alarm, miss, 1.0) == pytest.approx(entropies)
-
-
-def test_bound_at_its_edges():
-  assert limits.bound(0.01, 0.1, 0.0) is None and limits.bound(0.01, 0.1, -1e-3) is None
-  assert limits.bound(0.9, 0.1, 0.5) == 0.0
-  with pytest.raises(UserError):
-    limits.bound(0.0, 0.1, 1.0)
 
 
 # ---- the oracle ----------------------------------------------------------------------------------
@@ -460,26 +441,3 @@ def test_efficiency_draws_seeds_in_pairs():
   """
   got = limits.efficiency([1, 3, 7, 15, 31], [3, 7, 15, 31, 63], horizon=1000)
   assert got["efficiency"] == 0.5 and got["efficiency_ci"] == pytest.approx([0.5, 0.5])
-
-
-# ---- distribution functions ----------------------------------------------------------------------
-
-
-def test_distribution_functions_equal_scipy():
-  for a in (0.5, 1, 7, 300, 1e5):
-    for share in (0.01, 0.5, 0.99, 1.0, 1.02, 3.0):
-      assert special.gamma_cdf(a, a * share) == pytest.approx(
-        scipy.stats.gamma.cdf(a * share, a), abs=1e-9
-      )
-  for freedom, x in ((1, 0.1), (20, 35.0), (500, 420.0)):
-    assert special.chi_square_tail(x, freedom) == pytest.approx(
-      scipy.stats.chi2.sf(x, freedom), abs=1e-9
-    )
-  for p in (1e-6, 0.025, 0.5, 0.999):
-    assert special.normal_quantile(p) == pytest.approx(scipy.stats.norm.ppf(p), abs=1e-9)
-  for a, p in ((0.5, 0.01), (1, 0.975), (40, 0.5), (1e5, 0.025)):
-    assert special.gamma_quantile(a, p) == pytest.approx(scipy.stats.gamma.ppf(p, a), rel=1e-9)
-  for k in (2, 10, 30):
-    assert special.studentised_range(k) == pytest.approx(
-      scipy.stats.studentized_range.ppf(0.95, k, math.inf), abs=1e-6
-    )
