@@ -141,7 +141,7 @@ def main(args) -> None:
       "drives": args.drives,
       "drive_steps": STEPS,
       "rows": rows,
-      **tables.provenance(),
+      **runtime.provenance(),
     },
   )
 

@@ -10,18 +10,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_cl.training import agents
-from mjx_cl import envs, faults as faults_lib
-from mjx_cl.faults import presets
-from mjx_cl.io import tables
+from mjx_cl import envs
+from mjx_cl import faults as faults_lib
 from mjx_cl.config import PRESETS
 from mjx_cl.dreamer.agent import Agent
 from mjx_cl.errors import FileError, UserError
-from mjx_cl.faults import certificate
+from mjx_cl.faults import certificate, presets
+from mjx_cl.io import tables
 from mjx_cl.rollout.monitor import Monitor
 from mjx_cl.rollout.scan import Rollout, nest, start
-from mjx_cl.scoring import intervals
 from mjx_cl.rollout.transfer import Transfer
+from mjx_cl.scoring import intervals
+from mjx_cl.training import agents
 
 CHUNK = 50  # decisions
 WARM = 30  # decisions at an episode's start whose residuals are not compared

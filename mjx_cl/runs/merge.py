@@ -15,10 +15,19 @@ import functools
 import pathlib
 import shutil
 
-from mjx_cl.io import tables as store
+import numpy as np
+import pyarrow
+
+from mjx_cl import envs
 from mjx_cl.adapt.arms import ARMS
 from mjx_cl.config import RunConfig
 from mjx_cl.errors import FileError, UserError
+from mjx_cl.io import tables as store
+from mjx_cl.render import figures
+from mjx_cl.runs import records, run
+from mjx_cl.runs.run import differing, identity
+from mjx_cl.scoring import stop_rule as stop
+from mjx_cl.training import agents
 
 ORDER = {
   "trace": "step",
@@ -65,8 +74,6 @@ def differs(folder, config: RunConfig, but: tuple[str, ...] = ()) -> str | None:
   Raises:
     FileError for a config.json that cannot be read.
   """
-  from mjx_cl.runs.run import differing, identity
-
   folder = pathlib.Path(folder)
   if not (folder / "config.json").exists():
     return None
@@ -108,10 +115,6 @@ def cards(config: RunConfig) -> dict[str, dict]:
 @functools.lru_cache(maxsize=64)
 def _cards(env_name, agent, arms, written) -> dict[str, dict]:
   """written: when the card of an agent by folder was; it stands for its content."""
-  from mjx_cl.training import agents
-  from mjx_cl import envs
-  from mjx_cl.runs import run
-
   try:
     env = envs.make(env_name, "auto")
     others = run.arm_agents(RunConfig(env_name, agent=agent, arms=("none", *arms)), env)
@@ -206,12 +209,6 @@ def join(folders, out, config: RunConfig) -> dict:
     UserError where pieces differ in their agent or physics; FileError for a piece that cannot be
     read.
   """
-  import numpy as np
-  from mjx_cl import envs
-  from mjx_cl.runs import records
-  from mjx_cl.render import figures
-  from mjx_cl.scoring import stop_rule as stop
-
   folders, out = [pathlib.Path(f) for f in folders], pathlib.Path(out)
   summaries, configs = [], []
   for folder in folders:
@@ -315,8 +312,6 @@ def joined(tables, number: dict[tuple[str, int], int], key: str):
   """pyarrow Tables one below the other, `stream` counted anew, ordered by stream and `key`. A
   column that a piece lacks is null there.
   """
-  import pyarrow
-
   table = pyarrow.concat_tables(tables, promote_options="permissive")
   stream = [number[at] for at in zip(table["arm"].to_pylist(), table["seed"].to_pylist())]
   at = table.column_names.index("stream")

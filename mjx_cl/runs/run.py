@@ -22,7 +22,6 @@ import dataclasses
 import hashlib
 import inspect
 import json
-import os
 import pathlib
 import shutil
 import sys
@@ -33,26 +32,28 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_cl.training import agents
-from mjx_cl.io import checkpoints, memory, plugins, runtime, tables
 from mjx_cl import detectors, envs, faults
-from mjx_cl.dreamer import replay
 from mjx_cl.adapt import phase as phase_lib
 from mjx_cl.adapt.arms import ARMS, FOREVER, never_stops
-from mjx_cl.adapt.convergence import SIGNALS
 from mjx_cl.adapt.blocks import Crew
+from mjx_cl.adapt.convergence import SIGNALS
 from mjx_cl.adapt.loop import Choices, Loop, LoopState, choices
 from mjx_cl.config import CHUNK, AdaptConfig, RunConfig, becomes, changes
+from mjx_cl.dreamer import replay
 from mjx_cl.dreamer.agent import CAUSES, EXPLODED
 from mjx_cl.errors import FileError, UserError
+from mjx_cl.io import arrays, checkpoints, folders, plugins, runtime, tables
 from mjx_cl.io.interrupt import Interruptible
-from mjx_cl.rollout.order import Lanes
-from mjx_cl.runs.records import Ledger, acts
+from mjx_cl.render import figures
 from mjx_cl.rollout.monitor import Monitor
+from mjx_cl.rollout.order import Lanes
 from mjx_cl.rollout.scan import Rollout, Stream, nest, start
-from mjx_cl.scoring import special, stop_rule
-from mjx_cl.runs.snapshots import Snapshots
 from mjx_cl.rollout.transfer import Moving, Transfer
+from mjx_cl.runs.records import Ledger, acts
+from mjx_cl.runs.snapshots import Snapshots
+from mjx_cl.scoring import special, stop_rule
+from mjx_cl.training import agents
+from mjx_cl.training import needs as bytes_of
 
 
 class State(NamedTuple):
@@ -145,7 +146,7 @@ class Runner:
     self.chunks = -(-config.steps // self.chunk_steps)
     episode = min(r.spec.episode_steps for r in self.robots)
     needs = lambda steps: capacity(steps, episode, self.repeat)
-    memory.check(
+    bytes_of.check(
       agent.config.size,
       len(spec.obs),
       len(spec.act),
@@ -423,15 +424,7 @@ class Runner:
     if self.checkpoints.latest() == number:
       return
     begin = time.perf_counter()
-    tmp = self.work / "trace.tmp.npz"
-    try:
-      np.savez(tmp, **self._trace())
-      os.replace(tmp, self.work / f"trace-{number:06d}.npz")
-    except OSError as e:
-      tmp.unlink(missing_ok=True)
-      raise FileError(
-        f"cannot write in {self.work}: {e.strerror or e}; the last checkpoint is intact"
-      ) from None
+    arrays.write(self.work / f"trace-{number:06d}.npz", self._trace())
     self.seconds["other"] += time.perf_counter() - begin
     meta = {
       "seconds": self.seconds,
@@ -465,7 +458,7 @@ class Runner:
     number = self.checkpoints.latest()
     self.state = State(streams, self.crew.split(LoopState(**loop)))
     self.acting = self.crew.acting(self.state.loop, self.lanes)
-    self.parts = [tables.read_arrays(self.work / f"trace-{number:06d}.npz")]
+    self.parts = [arrays.read(self.work / f"trace-{number:06d}.npz")]
     self.done_chunks = number
     self.seconds, self.quiet, self.stream_seconds = (
       meta["seconds"],
@@ -497,7 +490,7 @@ class Runner:
       "agent_path": pathlib.Path(self.trained.path).name,
       "repeat": self.repeat,
       "control_s": self.env.spec.control_s,
-      **tables.provenance(),
+      **runtime.provenance(),
     }
 
   def finish(self, tell=lambda text: None) -> dict:
@@ -506,8 +499,6 @@ class Runner:
 
     Returns summary.json's value.
     """
-    from mjx_cl.render import figures
-
     steps = self.config.steps
     if self.snapshots:
       self.save()  # their evaluation takes a while; one that is cut off goes on from here
@@ -767,7 +758,7 @@ def execute(
   `save_every_s` seconds of work.
   """
   fresh = not pathlib.Path(out).exists()
-  state, out = tables.claim_folder(out, resume, overwrite), pathlib.Path(out)
+  state, out = folders.claim_folder(out, resume, overwrite), pathlib.Path(out)
   if state == "done":
     check_same(
       out, {k: v for k, v in identity(config).items() if k != "physics"}
@@ -817,7 +808,7 @@ def execute(
 
 def clear(out: pathlib.Path) -> None:
   """Removes an earlier run's own files, nothing else."""
-  for name in ("config.json", *tables.RESULTS):
+  for name in ("config.json", *folders.RESULTS):
     (out / name).unlink(missing_ok=True)
   for name in ("work", "checkpoints"):
     shutil.rmtree(out / name, ignore_errors=True)

@@ -24,10 +24,10 @@ from mjx_cl.dreamer import replay as replay_lib
 from mjx_cl.dreamer.agent import CAUSES, EXPLODED, Agent, TrainState, Weights, culprit
 from mjx_cl.errors import FileError, UserError, choose
 from mjx_cl.faults import presets
-from mjx_cl.io import checkpoints, memory, runtime
+from mjx_cl.io import checkpoints, runtime, tables
 from mjx_cl.io.interrupt import Interruptible
 from mjx_cl.rollout.scan import Rollout, Stream, nest, records, start
-from mjx_cl.training import demonstrator
+from mjx_cl.training import agents, demonstrator, evaluate, needs
 
 DEMONSTRATOR_STEPS = 8_000_000
 FAULT = 11  # folded into a stream's key for the draw of its faults
@@ -238,8 +238,6 @@ def check(env, dreamer: DreamerConfig, config: TrainConfig, agent_name: str | No
     UserError. Size, bins and obs_scale decide what weights mean, repeat what an action does; what
     else differs a training may change.
   """
-  from mjx_cl.training import agents
-
   for var in env.spec.act:
     if (var.low, var.high) != (-1, 1):
       raise UserError(
@@ -333,7 +331,7 @@ class Trainer:
     spec = env.spec
     self.plain = Agent(dreamer, len(spec.obs), len(spec.act))
     self.mesh = seeds_mesh(seeds)
-    memory.check(
+    needs.check(
       dreamer.size,
       len(spec.obs),
       len(spec.act),
@@ -624,15 +622,11 @@ class Trainer:
       self.checkpoints.save(self.chunks, self.state, meta)
 
   def write_metrics(self) -> None:
-    import pyarrow
-    import pyarrow.parquet
-
+    """Writes OUT/metrics.parquet, a row a chunk."""
     if self.rows:
       names = sorted(set().union(*self.rows))
-      table = pyarrow.table({n: pyarrow.array([r.get(n) for r in self.rows]) for n in names})
-      tmp = self.out / "metrics.parquet.tmp"
-      pyarrow.parquet.write_table(table, tmp)
-      os.replace(tmp, self.out / "metrics.parquet")
+      columns = {n: [r.get(n) for r in self.rows] for n in names}
+      tables.write_table(self.out / "metrics.parquet", columns)
 
   def resume(self) -> None:
     """Goes on from the newest checkpoint.
@@ -641,8 +635,6 @@ class Trainer:
       FileError where no checkpoint can be read, or it or metrics.parquet is not a training's; the
       trainer is as before then.
     """
-    from mjx_cl.io import tables
-
     path = self.out / "metrics.parquet"
     rows = tables.read_arrow(path).to_pylist() if path.exists() else []
     state, meta = self.checkpoints.load(self.state)
@@ -694,9 +686,6 @@ def build(
   """A Trainer with its folder and config.json; trains the demonstrator first where
   `demonstrator_name` is `ppo`.
   """
-  from mjx_cl.io import tables
-  from mjx_cl.training import agents
-
   out = pathlib.Path(out)
   config = shown(config, out, demonstrator_name)
   if demonstrator_name == "ppo":
@@ -726,7 +715,7 @@ def build(
     "train": dataclasses.asdict(config),
     "started_from": agent_name,
   }
-  values = {"command": "train", "seeds": seeds, **trainer.about, **tables.provenance()}
+  values = {"command": "train", "seeds": seeds, **trainer.about, **runtime.provenance()}
   if resume and trainer.checkpoints.latest() is not None:
     trainer.resume()
     tables.write_json(out / "config.json", values)  # `updates` may have grown
@@ -832,9 +821,6 @@ def export(trainer: Trainer, episodes: int = 20) -> dict:
   """Writes OUT/agent of the first seed that has not failed: weights, moments, counters, and the
   card with its returns. Returns the card.
   """
-  from mjx_cl.io import tables
-  from mjx_cl.training import agents, evaluate
-
   sound = min(set(range(trainer.seeds)) - set(trainer.failed))
   train = jax.tree.map(lambda x: jax.device_put(x[sound], jax.devices()[0]), trainer.state.train)
   scores = {
@@ -864,7 +850,7 @@ def export(trainer: Trainer, episodes: int = 20) -> dict:
     "phases": phases,
     "demonstrator_return": trainer.expert_return or None,
     "eval": scores,
-    **tables.provenance(),
+    **runtime.provenance(),
   }
   agents.save(trainer.out / "agent", train, card)
   return card
