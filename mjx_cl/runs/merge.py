@@ -26,7 +26,7 @@ from mjx_cl.io import tables as store
 from mjx_cl.render import figures
 from mjx_cl.runs import records, run
 from mjx_cl.runs.run import differing, identity
-from mjx_cl.scoring import stop_rule as stop
+from mjx_cl.scoring import events, stop_rule as stop
 from mjx_cl.training import agents
 
 ORDER = {
@@ -234,7 +234,8 @@ def join(folders, out, config: RunConfig) -> dict:
     files = [folder / f"{name}.parquet" for folder in folders]
     if not all(file.exists() for file in files):
       continue
-    tables = [store.read_arrow(file) for file in files]
+    read = events.read if name == "events" else store.read_arrow
+    tables = [read(file) for file in files]
     table = joined(tables, number, key)
     rows[name] = table
     store.write_arrow(out / f"{name}.parquet", table)

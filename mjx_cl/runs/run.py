@@ -51,7 +51,7 @@ from mjx_cl.rollout.scan import Rollout, Stream, nest, start
 from mjx_cl.rollout.transfer import Moving, Transfer
 from mjx_cl.runs.records import Ledger, acts
 from mjx_cl.runs.snapshots import Snapshots
-from mjx_cl.scoring import special, stop_rule
+from mjx_cl.scoring import events as event_table, special, stop_rule
 from mjx_cl.training import agents
 from mjx_cl.training import needs as bytes_of
 
@@ -518,13 +518,7 @@ class Runner:
     table, events = ledger.trace(trace), ledger.events(trace)
     runs = ledger.rows(trace, events)
     tables.write_table(self.out / "trace.parquet", table)
-    tables.write_table(
-      self.out / "events.parquet",
-      {
-        k: [e[k] for e in events]
-        for k in ("stream", "arm", "seed", "step", "kind", "reason", "fault")
-      },
-    )
+    event_table.write(self.out / "events.parquet", events)
     tables.write_table(self.out / "runs.parquet", {k: [r[k] for r in runs] for k in runs[0]})
     if self.config.residuals:
       tables.write_table(
