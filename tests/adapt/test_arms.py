@@ -667,8 +667,8 @@ def lived(tiny, tmp_path_factory):
   }
   stops = agent.with_name("stops")
   stops.mkdir()
-  run.store.write_json(stops / "config.json", {"env": "walker", "onset": FAULT, "adapt": {}})
-  run.store.write_table(
+  tables.write_json(stops / "config.json", {"env": "walker", "onset": FAULT, "adapt": {}})
+  tables.write_table(
     stops / "snapshots.parquet",
     {"seed": [SEED] * 3, "since_start": [20, 148, 212], "reward_mean": [0.1, 0.99, 1.0]},
   )
@@ -690,7 +690,7 @@ def lived(tiny, tmp_path_factory):
       runner = run.Runner(config, out)
       out.mkdir(exist_ok=True)
       runner.open()
-      run.store.write_json(out / "config.json", runner.config_dict())
+      tables.write_json(out / "config.json", runner.config_dict())
       for _ in range(cut):
         runner.step()
       runner.save()
