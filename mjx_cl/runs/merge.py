@@ -72,7 +72,7 @@ def differs(folder, config: RunConfig, but: tuple[str, ...] = ()) -> str | None:
   Args:
     but: settings that may differ.
   Raises:
-    FileError for a config.json that cannot be read.
+    FileError for a config.json or an agent that is broken.
   """
   folder = pathlib.Path(folder)
   if not (folder / "config.json").exists():
@@ -100,8 +100,11 @@ def differs(folder, config: RunConfig, but: tuple[str, ...] = ()) -> str | None:
 
 
 def cards(config: RunConfig) -> dict[str, dict]:
-  """Today's `agent_card` and `arm_cards` as config.json holds them; empty where the agent cannot be
-  read, as one that was moved.
+  """Today's `agent_card` and `arm_cards` as config.json holds them; empty where there is no agent, as
+  where it was moved.
+
+  Raises:
+    FileError for a broken one.
   """
   file = pathlib.Path(config.agent or "no agent by folder") / "card.json"
   return _cards(
@@ -122,6 +125,8 @@ def _cards(env_name, agent, arms, written) -> dict[str, dict]:
       "agent_card": agents.of(env, agent).card,
       **({"arm_cards": {arm: other.card for arm, other in others.items()}} if others else {}),
     }
+  except FileError:
+    raise
   except UserError:
     return {}
 

@@ -628,7 +628,7 @@ def arm_agents(config: RunConfig, env) -> dict[str, agents.Trained]:
     try:
       other = agents.of(env, name)
     except UserError as e:
-      raise UserError(f"arm {arm!r}: {e}") from None
+      raise type(e)(f"arm {arm!r}: {e}") from None
     same = lambda t: (t.agent.config.size, t.agent.config.obs_scale, int(t.card.get("repeat", 1)))
     if same(other) != same(trained):
       raise UserError(

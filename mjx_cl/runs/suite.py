@@ -382,7 +382,7 @@ def check(part: Part, robots: Robots | None = None) -> None:
     run.arm_agents(c, robots.make(c.env, c.physics))
     stop_rule.told(c)
   except UserError as e:
-    raise UserError(f"part {part.name}: {e}") from None
+    raise type(e)(f"part {part.name}: {e}") from None
 
 
 def notes(parts) -> list[tuple[str, str]]:

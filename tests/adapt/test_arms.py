@@ -16,6 +16,7 @@ import pyarrow.parquet
 import pytest
 import quick
 
+from mjx_cl.io import tables
 from mjx_cl import envs
 from mjx_cl.adapt import phase as phase_lib
 from mjx_cl.adapt.arms import ARMS, FOREVER
