@@ -6,7 +6,7 @@ import os
 import pathlib
 import re
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from typing import BinaryIO
 
 from mjx_cl.errors import FileError, UserError
@@ -54,6 +54,32 @@ def probe(out: str | os.PathLike) -> None:
       pass
   except OSError as e:
     raise FileError(f"cannot write in {out}: {e.strerror or e}; give another --out") from None
+
+
+def differing(
+  old: Mapping,
+  new: Mapping,
+  skip: Sequence[str] = (),
+  defaults: Mapping | None = None,
+  deep: bool = False,
+) -> list[str]:
+  """In which settings two runs, trainings or agents differ.
+
+  Args:
+    old: what one of them says of itself.
+    new: what the other says; its keys count, in their order.
+    skip: keys that may differ.
+    defaults: what holds where `old` lacks a key; None where they lack it too.
+    deep: whether of a table in both its own keys are named, as `adapt.ratio`.
+  """
+  found = []
+  for key in (k for k in new if k not in skip):
+    before = old.get(key, (defaults or {}).get(key))
+    if deep and isinstance(before, Mapping) and isinstance(new[key], Mapping):
+      found += [f"{key}.{below}" for below in differing(before, new[key], deep=True)]
+    elif before != new[key]:
+      found.append(key)
+  return found
 
 
 # what a run or training leaves beside config.json

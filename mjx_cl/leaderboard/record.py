@@ -17,7 +17,7 @@ import numpy as np
 
 from mjx_cl.config import CHUNK
 from mjx_cl.errors import FileError, UserError
-from mjx_cl.io import arrays, runtime, tables as store
+from mjx_cl.io import arrays, folders, runtime, tables as store
 from mjx_cl.leaderboard.streams import COLUMNS, LATENT, META, SCHEMA, VERSION, Suite
 
 TILE = 16  # lanes are filled up to a multiple of it
@@ -259,7 +259,7 @@ def beside(suite_: Suite, out, robots) -> dict | None:
   whole = json.loads(json.dumps(_plain(suite_, suite_.robots)))
   same = whole | {"robots": {r: whole["robots"].get(r) for r in held}}
   differ = (
-    [k for k, v in config["suite"].items() if same.get(k) != v]
+    folders.differing(same, config["suite"])
     + [k for k in MADE if k not in config]
     + ["version"] * (config["version"] != VERSION)
     + [k for k in ("details", "stream_steps") if set(config.get(k, ())) != set(held)]

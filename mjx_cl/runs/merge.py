@@ -22,7 +22,7 @@ from mjx_cl import envs
 from mjx_cl.adapt.arms import ARMS
 from mjx_cl.config import RunConfig
 from mjx_cl.errors import FileError, UserError
-from mjx_cl.io import tables as store
+from mjx_cl.io import folders as folder_lib, tables as store
 from mjx_cl.render import figures
 from mjx_cl.runs import records, run
 from mjx_cl.runs.run import differing, identity
@@ -90,7 +90,7 @@ def differs(folder, config: RunConfig, but: tuple[str, ...] = ()) -> str | None:
     }
   changed = differing(old, values)
   for name, today in cards(config).items():
-    if name in old and (keys := changed_keys(old[name], today)):
+    if name in old and (keys := folder_lib.differing(today, old[name], deep=True)):
       changed.append(f"{name} ({', '.join(keys)})")
   if changed == ["threshold"]:
     return (
@@ -129,21 +129,6 @@ def _cards(env_name, agent, arms, written) -> dict[str, dict]:
     raise
   except UserError:
     return {}
-
-
-def changed_keys(old, new) -> list[str]:
-  """Keys of the card `old`, in order, of which `new` says something else or nothing; of tables in
-  it as `dreamer.size`.
-  """
-  if not isinstance(old, dict) or not isinstance(new, dict):
-    return [] if old == new else ["all"]
-  out = []
-  for key, value in old.items():
-    if isinstance(value, dict) and isinstance(new.get(key), dict):
-      out += [f"{key}.{below}" for below in changed_keys(value, new[key])]
-    elif key not in new or new[key] != value:
-      out.append(key)
-  return out
 
 
 def seeds_of(folder, config: RunConfig) -> list[int] | None:
@@ -222,7 +207,8 @@ def join(folders, out, config: RunConfig) -> dict:
     lacks = [k for k in SUMMED if k not in summaries[-1]]
     if lacks:
       raise FileError(f"{folder / 'summary.json'} is not a run's: it lacks {', '.join(lacks)}")
-  differ = [k for k in SAME if any(own.get(k) != configs[0].get(k) for own in configs)]
+  first = {k: configs[0].get(k) for k in SAME}
+  differ = sorted({k for own in configs for k in folder_lib.differing(own, first)}, key=SAME.index)
   if differ:
     raise UserError(
       f"{', '.join(map(str, folders))} are no pieces of one run: they differ in {', '.join(differ)}"

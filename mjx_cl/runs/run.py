@@ -849,18 +849,11 @@ def differing(old: dict, values: dict) -> list[str]:
   """Keys of `values` in which the run differs whose config.json holds `old`. A setting that did not
   exist when it began counts as its default.
   """
-  skip = ("git_commit", "machine", "python")
   if isinstance(old.get("adapt"), dict):
     old = old | {"adapt": {**dataclasses.asdict(AdaptConfig()), **old["adapt"]}}
-  default = {
-    f.name: f.default for f in dataclasses.fields(RunConfig)
-  }  # nor did `changes` always exist
-  changed = [
-    k
-    for k in values
-    if k not in skip
-    and old.get(k, default.get(k, values[k] if k == "changes" else None)) != values[k]
-  ]
+  defaults = {f.name: f.default for f in dataclasses.fields(RunConfig)}
+  defaults["changes"] = values.get("changes")  # nor did they always exist
+  changed = folders.differing(old, values, ("git_commit", "machine", "python"), defaults)
   return changed + ["threshold"] * ("threshold" in old and "threshold" not in values)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from mjx_cl.adapt.arms import ARMS, never_stops, stops
 from mjx_cl.errors import FileError, UserError
-from mjx_cl.io import tables
+from mjx_cl.io import folders, tables
 from mjx_cl.scoring import events, intervals, normalised_recovery
 
 SHARE = 0.95  # of the best snapshot's reward, from which a stop is good enough
@@ -482,8 +482,9 @@ def told(config) -> dict[int, int]:
     raise FileError(f"stops: {folder} holds no run: {e}") from None
   if not isinstance(adapt := theirs.get("adapt"), dict):
     raise FileError(f"stops: {folder} holds no run: its config.json has no settings of adaptation")
-  differ = [k for k in SAME if k in theirs and theirs[k] != getattr(config, k)]
-  differ += [f"adapt.{k}" for k in LEARNS if k in adapt and adapt[k] != getattr(config.adapt, k)]
+  ours = {k: getattr(config, k) for k in SAME if k in theirs}
+  ours["adapt"] = {k: getattr(config.adapt, k) for k in LEARNS if k in adapt}
+  differ = folders.differing(theirs, ours, deep=True)
   if differ:
     raise UserError(
       f"stops: {folder} was run with another {', '.join(differ)}; its oracle stops are not "

@@ -24,7 +24,7 @@ from mjx_cl.dreamer import replay as replay_lib
 from mjx_cl.dreamer.agent import CAUSES, EXPLODED, Agent, TrainState, Weights, culprit
 from mjx_cl.errors import FileError, UserError, choose
 from mjx_cl.faults import presets
-from mjx_cl.io import checkpoints, runtime, tables
+from mjx_cl.io import checkpoints, folders, runtime, tables
 from mjx_cl.io.interrupt import Interruptible
 from mjx_cl.rollout.scan import Rollout, Stream, nest, records, start
 from mjx_cl.training import agents, demonstrator, evaluate, needs
@@ -797,7 +797,7 @@ def check_same(
       else names[0].name == names[1].name
     ):
       before[key] = now[key]
-  changed = [k for k in now if k != "updates" and before.get(k) != now[k]]
+  changed = folders.differing(before, now, ("updates",))
   if changed:
     raise UserError(
       f"--resume: {out} was begun with another {', '.join(changed)}; give the same settings, "

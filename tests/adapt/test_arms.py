@@ -890,11 +890,11 @@ def test_an_arm_with_an_agent_of_its_own(lived):
   np.testing.assert_allclose(mine["reward"][:50], same["reward"][:50], atol=1e-3)
   assert np.abs(np.subtract(mine["reward"][:50], first["reward"][:50])).max() > 0.02
   assert (
-    "randomised" in {r["arm"] for r in normalised_recovery.of_folders(whole)}
-    and len({r["reward_none"] for r in normalised_recovery.of_folders(whole)}) == 1
+    "randomised" in {r["arm"] for r in normalised_recovery.rows(tables.read_rows(whole / "runs.parquet"))}
+    and len({r["reward_none"] for r in normalised_recovery.rows(tables.read_rows(whole / "runs.parquet"))}) == 1
   )
   assert (
-    normalised_recovery.of_folders(whole)[0]["reward_none"]
+    normalised_recovery.rows(tables.read_rows(whole / "runs.parquet"))[0]["reward_none"]
     == columns(whole, "runs", "none")["reward_final"][0]
   )
 
