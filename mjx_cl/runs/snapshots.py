@@ -23,6 +23,7 @@ from mjx_cl.errors import FileError, UserError
 from mjx_cl.io import arrays, folders
 from mjx_cl.io.interrupt import Interruptible
 from mjx_cl.rollout.scan import Rollout, nest, start
+from mjx_cl.training.episodes import Episodes
 
 ACTS = ("enc", "dyn", "pol")  # of the parameters: what Agent.act reads
 EPISODES = 5
@@ -245,15 +246,9 @@ class Snapshots:
     )
     severity = jnp.asarray([self.severities(s.since) for s in batch], jnp.float32)
     streams = begin(keys, jnp.asarray(targets[[s.stream for s in batch]], jnp.int32), severity)
-    total, steps = np.zeros((len(batch), EPISODES)), np.zeros((len(batch), EPISODES), int)
-    alive = np.ones((len(batch), EPISODES), bool)
-    while alive.any():
+    lived = Episodes((len(batch), EPISODES))
+    while lived.alive.any():
       streams, rows = rollout.chunk(params, streams, LENGTH)
-      done = np.asarray(rows.terminated | rows.truncated)
-      before = np.concatenate([~alive[None], done[:-1]])
-      counts = ~np.logical_or.accumulate(before, 0)  # up to the decision that ends the episode
-      total += (np.asarray(rows.reward, np.float64) * counts).sum(0)
-      steps += counts.sum(0) * self.repeat
-      alive &= ~done.any(0)
+      lived.add(rows)
       interrupt.check()
-    return total, steps
+    return lived.total, lived.steps * self.repeat

@@ -27,7 +27,7 @@ from mjx_cl.faults import presets
 from mjx_cl.io import checkpoints, folders, runtime, tables
 from mjx_cl.io.interrupt import Interruptible
 from mjx_cl.rollout.scan import Rollout, Stream, nest, records, start
-from mjx_cl.training import agents, demonstrator, evaluate, needs
+from mjx_cl.training import agents, demonstrator, episodes, evaluate, needs
 
 DEMONSTRATOR_STEPS = 8_000_000
 FAULT = 11  # folded into a stream's key for the draw of its faults
@@ -286,24 +286,6 @@ def scaled(env, dreamer: DreamerConfig) -> DreamerConfig:
   )
 
 
-class Returns:
-  """Returns of finished episodes, per stream, from chunks of rewards."""
-
-  def __init__(self, shape):
-    self.sums = np.zeros(shape)
-
-  def add(self, rows) -> list[tuple[tuple[int, int], float]]:
-    """Rows of a chunk -> [((group, member), return)] of the episodes that ended in it."""
-    reward, done = np.asarray(rows.reward), np.asarray(rows.terminated | rows.truncated)
-    ended = []
-    for r, d in zip(reward, done):
-      self.sums += r
-      for at in zip(*np.nonzero(d)):
-        ended.append((tuple(int(i) for i in at), float(self.sums[at])))
-        self.sums[at] = 0.0
-    return ended
-
-
 class Trainer:
   """Pretrains `seeds` agents on one environment.
 
@@ -376,7 +358,7 @@ class Trainer:
     )
     replay = jax.tree.map(lambda x: jnp.broadcast_to(x, (seeds,) + x.shape).copy(), empty)
     self.state = self._place(Learner(train, streams, replay, key))
-    self.returns = Returns((seeds, config.envs))
+    self.returns = episodes.Returns((seeds, config.envs))
     self._add = jax.jit(jax.vmap(replay_lib.add), donate_argnums=0)
     self._redraw = jax.jit(nest(self._new_fault, 0, 0))
     self.checkpoints = checkpoints.Checkpoints(self.out / "checkpoints")
@@ -817,7 +799,7 @@ def clear(out: pathlib.Path) -> None:
     path.unlink()
 
 
-def export(trainer: Trainer, episodes: int = 20) -> dict:
+def export(trainer: Trainer, count: int = 20) -> dict:
   """Writes OUT/agent of the first seed that has not failed: weights, moments, counters, and the
   card with its returns. Returns the card.
   """
@@ -825,9 +807,7 @@ def export(trainer: Trainer, episodes: int = 20) -> dict:
   train = jax.tree.map(lambda x: jax.device_put(x[sound], jax.devices()[0]), trainer.state.train)
   scores = {
     "first_seed": 0,
-    **evaluate.evaluate(
-      trainer.env, trainer.plain, train.params, episodes, 0, trainer.config.repeat
-    ),
+    **evaluate.evaluate(trainer.env, trainer.plain, train.params, count, 0, trainer.config.repeat),
   }
   phases: dict[str, dict] = {}
   for row in trainer.rows:
