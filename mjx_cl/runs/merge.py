@@ -22,11 +22,13 @@ from mjx_cl import envs
 from mjx_cl.adapt.arms import ARMS
 from mjx_cl.config import RunConfig
 from mjx_cl.errors import FileError, UserError
-from mjx_cl.io import folders as folder_lib, tables as store
+from mjx_cl.io import folders as folder_lib
+from mjx_cl.io import tables as store
 from mjx_cl.render import figures
-from mjx_cl.runs import records, run
-from mjx_cl.runs.run import differing, identity
-from mjx_cl.scoring import events, stop_rule as stop
+from mjx_cl.runs import records
+from mjx_cl.runs.identity import arm_agents, differing, identity
+from mjx_cl.scoring import events
+from mjx_cl.scoring import stop_rule as stop
 from mjx_cl.training import agents
 
 ORDER = {
@@ -120,7 +122,7 @@ def _cards(env_name, agent, arms, written) -> dict[str, dict]:
   """written: when the card of an agent by folder was; it stands for its content."""
   try:
     env = envs.make(env_name, "auto")
-    others = run.arm_agents(RunConfig(env_name, agent=agent, arms=("none", *arms)), env)
+    others = arm_agents(RunConfig(env_name, agent=agent, arms=("none", *arms)), env)
     return {
       "agent_card": agents.of(env, agent).card,
       **({"arm_cards": {arm: other.card for arm, other in others.items()}} if others else {}),

@@ -42,6 +42,8 @@ from mjx_cl.io import folders, memory, tables
 from mjx_cl.render import figures
 from mjx_cl.rollout.order import Lanes
 from mjx_cl.runs import merge, run, workers
+from mjx_cl.runs.doubts import doubts, watching
+from mjx_cl.runs.identity import arm_agents
 from mjx_cl.runs.records import acts
 from mjx_cl.scoring import normalised_recovery, stop_rule, survival
 from mjx_cl.training import agents, needs
@@ -379,19 +381,19 @@ def check(part: Part, robots: Robots | None = None) -> None:
     detectors.make(c.detector, **c.settings)
     faults.build(changes(c), robots.make(becomes(c) or c.env, c.physics), c.onset)
     robots.learner(c.env, c.agent)
-    run.arm_agents(c, robots.make(c.env, c.physics))
+    arm_agents(c, robots.make(c.env, c.physics))
     stop_rule.told(c)
   except UserError as e:
     raise type(e)(f"part {part.name}: {e}") from None
 
 
 def notes(parts) -> list[tuple[str, str]]:
-  """What `mjx-cl run` would say of these parts' settings before it starts (run.watching,
-  run.doubts), each with the parts that it holds for.
+  """What `mjx-cl run` would say of these parts' settings before it starts (doubts.py),
+  each with the parts that it holds for.
   """
   which: dict[str, list[str]] = {}
   for part in parts:
-    for text in [*filter(None, [run.watching(part.config)]), *run.doubts(part.config)]:
+    for text in [*filter(None, [watching(part.config)]), *doubts(part.config)]:
       which.setdefault(text, []).append(part.name)
   return [
     (text, names[0] if len(names) == 1 else f"{names[0]} and {len(names) - 1} more")
