@@ -11,9 +11,17 @@ from __future__ import annotations
 import json
 import pathlib
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+import pyarrow
+import pyarrow.parquet
 
+from mjx_cl.adapt import phase
 from mjx_cl.adapt.arms import ARMS, never_stops, stops
+from mjx_cl.adapt.convergence import SIGNALS
+from mjx_cl.adapt.phase import REASONS, START, STOP
+from mjx_cl.config import AdaptConfig
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.io import folders, tables
 from mjx_cl.scoring import events, intervals, normalised_recovery
@@ -289,10 +297,6 @@ def ablation(folder, **rule) -> list[dict]:
       f"the stop rule has no {', '.join(sorted(set(rule) - set(RULE)))}; choose from: "
       f"{', '.join(RULE)}"
     )
-  from mjx_cl.adapt.convergence import SIGNALS
-  from mjx_cl.adapt.phase import REASONS, START, STOP
-  from mjx_cl.config import AdaptConfig
-
   try:
     config = AdaptConfig(
       **json.loads((pathlib.Path(folder) / "config.json").read_text())["adapt"] | rule
@@ -380,11 +384,6 @@ def _relive(own, since, names, config):
   """Stream -> decisions (1 + 6, chunks) of the phase machine: with all signals, then with each left
   out.
   """
-  import jax
-  import jax.numpy as jnp
-
-  from mjx_cl.adapt import phase
-
   number = lambda x: np.float32(np.nan if x is None else x)
   signals = np.array(
     [[[number(c[n]) for n in names] for c in chunks] for chunks in own.values()], np.float32
@@ -515,9 +514,6 @@ def told(config) -> dict[int, int]:
 
 
 def _table(folder, name, columns=None):
-  import pyarrow
-  import pyarrow.parquet
-
   try:
     return pyarrow.parquet.read_table(pathlib.Path(folder) / f"{name}.parquet", columns=columns)
   except (OSError, pyarrow.ArrowException) as e:
