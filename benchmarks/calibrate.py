@@ -278,7 +278,7 @@ def main() -> None:
     "plain": plain,
     "frontier": sorted(good, key=finds, reverse=True)[:20],
     "wall_s": round(time.time() - begin),
-    **tables.provenance(),
+    **runtime.provenance(),
   }
   tables.write_json(args.out, value)
   out = [

@@ -95,7 +95,7 @@ def main() -> None:
   if args.first:
     print(first(args.first))
     return
-  from mjx_cl.io import runtime, tables
+  from mjx_cl.io import runtime
 
   runtime.setup()
   from mjx_cl.physics import by_name
@@ -124,7 +124,7 @@ def main() -> None:
   if args.json:
     print(
       json.dumps(
-        {"command": "python benchmarks/host_call.py --json", **tables.provenance(), "rows": rows},
+        {"command": "python benchmarks/host_call.py --json", **runtime.provenance(), "rows": rows},
         indent=1,
       )
     )

@@ -130,7 +130,7 @@ def main(args: argparse.Namespace) -> None:
       },
       "charts": best,
       "detectors": tables,
-      **store.provenance(),
+      **runtime.provenance(),
     },
   )
   print(json.dumps({"charts": best}))

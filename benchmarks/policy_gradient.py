@@ -39,7 +39,6 @@ from mjx_cl.dreamer import (
   replay,
 )
 from mjx_cl.dreamer.agent import Agent, Weights  # noqa: E402
-from mjx_cl.io import tables  # noqa: E402
 from mjx_cl.rollout.scan import Rollout, nest, records, start  # noqa: E402
 from mjx_cl.scoring import intervals  # noqa: E402
 from mjx_cl.training import agents
@@ -179,7 +178,7 @@ def measure(args) -> dict:
     "signal_to_noise": signal,
     "slope": (at[args.size]["gain"] - at[-args.size]["gain"]) / 2,
     "rows": rows,
-    **tables.provenance(),
+    **runtime.provenance(),
   }
 
 

@@ -274,7 +274,7 @@ def measure(args) -> dict:
     "wall_s": time.monotonic() - began,
     "wall_s_updates": learning,
     **value,
-    **tables.provenance(),
+    **runtime.provenance(),
   }
 
 

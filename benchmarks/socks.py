@@ -30,7 +30,8 @@ from mjx_cl.io import tables  # noqa: E402
 from mjx_cl.io.interrupt import Interruptible  # noqa: E402
 from mjx_cl.rollout.scan import Rollout, nest, start  # noqa: E402
 from mjx_cl.runs import suite
-from mjx_cl.runs.run import Runner, check_same  # noqa: E402
+from mjx_cl.runs.identity import check_same  # noqa: E402
+from mjx_cl.runs.run import Runner  # noqa: E402
 from mjx_cl.scoring import intervals  # noqa: E402
 
 GRIPS = (0.65, 0.61, 0.60, 0.59, 0.58, 0.575, 0.57, 0.56, 0.55, 0.50, 0.45, 0.40, 0.35, 0.30)
@@ -141,7 +142,7 @@ def main(args) -> None:
       "drives": args.drives,
       "drive_steps": STEPS,
       "rows": rows,
-      **tables.provenance(),
+      **runtime.provenance(),
     },
   )
 

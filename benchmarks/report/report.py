@@ -21,7 +21,7 @@ from benchmarks.report.paper import number, span
 from mjx_cl.config import CHUNK
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.faults import presets
-from mjx_cl.io import tables
+from mjx_cl.io import folders
 from mjx_cl.sizes import SIZES
 
 WIDTH = 150
@@ -1814,14 +1814,14 @@ def schema(results: pathlib.Path) -> str:
 
 def sizes_table(results: pathlib.Path) -> str:
   """Parameters and bytes of every size, as `mjx-cl list sizes` has them."""
-  from mjx_cl.io import memory
+  from mjx_cl.training import needs
 
   rows = [
     (
       f"`{name}`",
       *(part.removesuffix(" with slow critic and moments") for part in text.split("; ")),
     )
-    for name, text in memory.table().items()
+    for name, text in needs.table().items()
   ]
   return grid(("size", "on the walker", "weights, slow critic and moments", "replay"), rows)
 
@@ -1956,5 +1956,5 @@ def report(results="results", readme="README.md", check: bool = False) -> list[d
     at = block.last
   text = "".join(out + lines[at:])
   if not check and text != old:
-    tables.atomic(readme, lambda file: file.write(text.encode()))
+    folders.atomic(readme, lambda file: file.write(text.encode()))
   return rows

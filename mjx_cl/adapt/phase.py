@@ -23,6 +23,16 @@ PHASES = ("nominal", "adapting", "converged", "aborted", "ended")
 NOTHING, START, STOP, ABORT_BELOW, ABORT_HOPELESS, ABORT_BUDGET, END, ABORT_NUMERIC = range(
   8
 )  # the last is Loop's own: a loss at fault
+DECISIONS = (
+  "nothing",
+  "start",
+  "stop",
+  "abort_below",
+  "abort_hopeless",
+  "abort_budget",
+  "end",
+  "abort_numeric",
+)
 REASONS = (
   "",
   "alarm",

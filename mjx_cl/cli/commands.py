@@ -189,7 +189,9 @@ def do_bench(args: Bench) -> None:
   jobs = workers.number(args.jobs, needs, space)
   for line in plan_lines(suite, parts, done, estimates):
     say(line)
-  value = bench.execute(suite, out, parts, estimates, say, RunDisplay, jobs=jobs)
+  value = bench.execute(
+    suite, out, parts, estimates, say, RunDisplay, jobs=jobs, worker="mjx_cl.cli.worker"
+  )
   if args.publish:
     bench.publish(out, suite, args.publish)
   if args.json:
@@ -224,7 +226,7 @@ def do_train(args: Train) -> None:
   if not 0 < args.save_every_s < float("inf"):
     raise UserError(f"--save-every-s must be above 0; got {args.save_every_s}")
   from mjx_cl import envs
-  from mjx_cl.io import tables as store
+  from mjx_cl.io import folders
   from mjx_cl.runs import run
   from mjx_cl.training import trainer as train
 
@@ -237,7 +239,7 @@ def do_train(args: Train) -> None:
   train.faults_of(env, train_config)
   train.shown(train_config, args.out, args.demonstrator)
   train.check(env, dreamer, train_config, args.agent)
-  state = store.claim_folder(args.out, args.resume, args.overwrite, done_marker="agent/card.json")
+  state = folders.claim_folder(args.out, args.resume, args.overwrite, done_marker="agent/card.json")
   if state != "new":
     updates = train.check_same(
       args.out, env, dreamer, train_config, args.seed, args.seeds, args.demonstrator, args.agent
@@ -364,7 +366,7 @@ def do_certify(args: Certify) -> None:
 
 
 def do_record(args: Record) -> None:
-  from mjx_cl.io import tables as store
+  from mjx_cl.io import folders
   from mjx_cl.leaderboard import record, streams
 
   suite, out = streams.suite(args.suite), args.out
@@ -373,7 +375,7 @@ def do_record(args: Record) -> None:
       suite, args.robot, args.physics, args.agent
     )  # what is refused must not cost the set that is there
   record.claim(suite, out, args.overwrite, args.robot)
-  store.probe(out)
+  folders.probe(out)
   told = [0.0]
 
   def progress(part, done, steps, lanes):
@@ -399,7 +401,7 @@ def do_record(args: Record) -> None:
 
 
 def do_leaderboard(args: Leaderboard) -> None:
-  from mjx_cl.io import tables as store
+  from mjx_cl.io import folders, runtime
   from mjx_cl.leaderboard import score, streams, submissions
 
   for flag, given, other in (
@@ -420,7 +422,7 @@ def do_leaderboard(args: Leaderboard) -> None:
   held = streams.StreamSet(args.streams)
   robots = held.choose(args.robot)
   if args.export:
-    store.probe(args.export)
+    folders.probe(args.export)
     files = submissions.export(held, args.export, robots, args.overwrite)
     emit(files) if args.json else print("\n".join(files))
     return
@@ -468,7 +470,7 @@ def do_leaderboard(args: Leaderboard) -> None:
         f"{clock(seconds / done * (total - done))} left"
       )
 
-  store.probe(args.out)  # before minutes are spent
+  folders.probe(args.out)  # before minutes are spent
   board = score.score(held, entries, robots, extra, progress)
   meta = {
     "command": "mjx-cl " + " ".join(sys.argv[1:]),
@@ -482,7 +484,7 @@ def do_leaderboard(args: Leaderboard) -> None:
     ),
     "wall_s": round(board.seconds, 1),
     "stream_steps": board.stream_steps,
-    **store.provenance(),
+    **runtime.provenance(),
   }
   files = score.write(board, args.out, meta)
   if args.json:
@@ -710,10 +712,9 @@ def do_report(args: Report) -> None:
 def do_list(args: List) -> None:
   from mjx_cl import detectors, envs, faults
   from mjx_cl.faults import presets
-  from mjx_cl.io import memory
   from mjx_cl.leaderboard import streams
   from mjx_cl.runs import suite as bench
-  from mjx_cl.training import agents
+  from mjx_cl.training import agents, needs
 
   first = lambda f: (f.__doc__ or "").strip().split("\n")[0]
   tables = {
@@ -725,7 +726,7 @@ def do_list(args: List) -> None:
     "arms": lambda: {k: a.about for k, a in ARMS.items()},
     "fault-presets": lambda: {k: f"{p.about} ({p.source})" for k, p in presets.PRESETS.items()},
     "schedules": lambda: presets.SCHEDULES,
-    "sizes": memory.table,
+    "sizes": needs.table,
     "suites": streams.about,
     "benches": bench.shipped,
   }

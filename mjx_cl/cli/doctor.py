@@ -13,12 +13,12 @@ def report() -> dict:
   import numpy as np
 
   from mjx_cl import __version__, envs
-  from mjx_cl.io import runtime, tables
+  from mjx_cl.io import runtime
   from mjx_cl.runs import suite
 
   rows = {
     "mjx_cl": __version__,
-    **{k: v for k, v in tables.provenance().items() if k in ("versions", "python", "machine")},
+    **{k: v for k, v in runtime.provenance().items() if k in ("versions", "python", "machine")},
   }
   rows["devices"] = ", ".join(str(d) for d in jax.devices())
   rows["physics"] = runtime.default_physics()

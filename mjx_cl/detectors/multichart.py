@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import jax
 import jax.numpy as jnp
 
 from mjx_cl.detectors.base import Alarm, Detector, above, demand

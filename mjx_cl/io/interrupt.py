@@ -6,10 +6,13 @@ the chunk end, the state be saved, and then KeyboardInterrupt be raised.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import sys
 import threading
+import types
+from typing import TextIO
 
 
 class Lasting:
@@ -17,7 +20,7 @@ class Lasting:
   (`2>&1 | tee log` dies of the same Ctrl-C) the work goes on and is saved.
   """
 
-  def __init__(self, stream):
+  def __init__(self, stream: TextIO):
     self._stream = stream
 
   def write(self, text: str) -> int:
@@ -39,11 +42,11 @@ class Lasting:
     """
     self._stream = open(os.devnull, "w")
 
-  def __getattr__(self, name):
+  def __getattr__(self, name: str) -> object:
     return getattr(self._stream, name)
 
 
-def later(number: int, frame) -> bool:
+def later(number: int, frame: types.FrameType | None) -> bool:
   """Whether the signal came within JAX's hook of the collector, where Python drops what is raised;
   it is then sent once more, in a moment.
   """
@@ -68,25 +71,29 @@ class Interruptible:
     self._set = False
     self._old: dict[int, object] = {}
 
-  def __enter__(self):
+  def __enter__(self) -> Interruptible:
     if threading.current_thread() is threading.main_thread():
       for number in (signal.SIGINT, signal.SIGTERM):
         self._old[number] = signal.signal(number, self._handle)
     return self
 
-  def __exit__(self, *_):
+  def __exit__(self, *_: object) -> None:
     for number, old in self._old.items():
       signal.signal(number, old)
 
-  def _handle(self, number, frame):
+  def _handle(self, number: int, frame: types.FrameType | None) -> None:
     if self._set:
       if later(number, frame):
         return
       Interruptible.again = True
       raise KeyboardInterrupt
     self._set = True
-    print("mjx-cl: stopping after this chunk, saving", file=sys.stderr, flush=True)
+    with contextlib.suppress(
+      RuntimeError
+    ):  # the stream itself was being written to: a reentrant call
+      print("mjx-cl: stopping after this chunk, saving", file=sys.stderr, flush=True)
 
   def check(self) -> None:
+    """Raises KeyboardInterrupt once a signal has come."""
     if self._set:
       raise KeyboardInterrupt

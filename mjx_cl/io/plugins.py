@@ -86,10 +86,6 @@ class Registry(collections.UserDict):
       return find(name, self.kind)
     raise KeyError(name)
 
-  def plugged(self) -> list[str]:
-    """Names that are not this package's own."""
-    return [name for name in self if name not in self.own]
-
 
 def line(e: BaseException) -> str:
   """An exception in one line."""

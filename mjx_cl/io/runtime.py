@@ -7,9 +7,12 @@ import runtime; runtime.setup()`.
 
 from __future__ import annotations
 
+import functools
 import importlib.metadata
 import os
 import pathlib
+import platform
+import subprocess
 import sys
 
 # jaxlib 0.10.x can lose a completion event in MJX programs and hang for ever (256 robots under
@@ -176,3 +179,65 @@ def default_physics() -> str:
     print("mjx-cl: mjbatch is not available on this platform, physics runs on mjx", file=sys.stderr)
     return "mjx"
   return "native"
+
+
+PACKAGES = (
+  "jax",
+  "jaxlib",
+  "mujoco",
+  "mujoco-mjx",
+  "mjbatch",
+  "flax",
+  "optax",
+  "orbax-checkpoint",
+  "numpy",
+)
+
+
+def provenance() -> dict:
+  """Versions, machine and commit of this process, for config.json; cores: those that it may use."""
+  versions = {}
+  for name in PACKAGES:
+    try:
+      versions[name] = importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+      versions[name] = None
+  return {
+    "versions": versions,
+    "python": platform.python_version(),
+    "git_commit": _commit(),
+    "machine": {
+      "cpu": _cpu(),
+      "cores": len(cores()),
+      "system": platform.system(),
+      "arch": platform.machine(),
+    },
+  }
+
+
+@functools.cache
+def _commit() -> str | None:
+  """Commit of the source tree this package runs from, None outside a checkout; asked once, since a
+  later one is not what this process has loaded.
+  """
+  try:
+    out = subprocess.run(
+      ["git", "rev-parse", "HEAD"],
+      cwd=pathlib.Path(__file__).parent,
+      capture_output=True,
+      text=True,
+      timeout=5,
+    )
+  except (OSError, subprocess.SubprocessError):
+    return None
+  return out.stdout.strip() or None
+
+
+def _cpu() -> str:
+  try:
+    for line in pathlib.Path("/proc/cpuinfo").read_text().splitlines():
+      if line.startswith("model name"):
+        return line.split(":", 1)[1].strip()
+  except OSError:
+    pass
+  return platform.processor() or platform.machine()

@@ -1,31 +1,19 @@
-"""Result files: Parquet written to a temporary name and renamed, DuckDB views to query them."""
+"""Result files: JSON, Parquet, suites in TOML, and SQL views over tables."""
 
 from __future__ import annotations
 
-import functools
-import importlib.metadata
 import json
-import os
 import pathlib
-import platform
 import re
-import subprocess
-import tempfile
 import tomllib
 
-from mjx_cl.errors import FileError, UserError
+import duckdb
+import numpy as np
+import pyarrow
+import pyarrow.parquet
 
-PACKAGES = (
-  "jax",
-  "jaxlib",
-  "mujoco",
-  "mujoco-mjx",
-  "mjbatch",
-  "flax",
-  "optax",
-  "orbax-checkpoint",
-  "numpy",
-)
+from mjx_cl.errors import FileError, UserError
+from mjx_cl.io import folders
 
 
 def plain(x):
@@ -35,29 +23,10 @@ def plain(x):
   raise TypeError(f"{type(x).__name__} is no JSON value")
 
 
-def atomic(path, write) -> None:
-  """Calls `write` with a binary file of a temporary name and renames it to `path`.
-
-  Raises:
-    FileError where the disk is full or the folder refuses; what was at `path` stays.
-  """
-  path = pathlib.Path(path)
-  tmp = path.with_name(path.name + ".tmp")
-  try:
-    with open(tmp, "wb") as file:
-      write(file)
-    os.replace(tmp, path)
-  except OSError as e:
-    tmp.unlink(missing_ok=True)
-    raise FileError(
-      f"cannot write {path}: {e.strerror or e}; what was there is unchanged"
-    ) from None
-
-
 def write_json(path, value) -> None:
   """Writes JSON (nan and infinity refused)."""
   text = json.dumps(value, indent=1, allow_nan=False, default=plain) + "\n"
-  atomic(path, lambda file: file.write(text.encode()))
+  folders.atomic(path, lambda file: file.write(text.encode()))
 
 
 def read_json(path) -> dict:
@@ -93,10 +62,6 @@ def write_table(
     codec, level: of the compression. split: float columns whose bytes are stored apart, which suits
       rounded values; integers then as differences.
   """
-  import numpy as np
-  import pyarrow
-  import pyarrow.parquet
-
   arrays = {}
   how = (
     {
@@ -112,7 +77,7 @@ def write_table(
     arrays[name] = pyarrow.array(
       values, mask=np.isnan(values) if floating and nan_is_null else None
     )
-  atomic(
+  folders.atomic(
     path,
     lambda file: pyarrow.parquet.write_table(
       pyarrow.table(arrays), file, compression=codec, compression_level=level, **how
@@ -122,9 +87,8 @@ def write_table(
 
 def write_arrow(path, table) -> None:
   """Writes a pyarrow Table as Parquet, compressed as `write_table` does."""
-  import pyarrow.parquet
 
-  atomic(
+  folders.atomic(
     path,
     lambda file: pyarrow.parquet.write_table(table, file, compression="zstd", use_dictionary=False),
   )
@@ -158,8 +122,6 @@ def read_arrow(path):
   Raises:
     FileError for a file that cannot be read.
   """
-  import pyarrow
-  import pyarrow.parquet
 
   try:
     return pyarrow.parquet.read_table(path)
@@ -167,22 +129,6 @@ def read_arrow(path):
     raise FileError(f"cannot read {path}: no such file") from None
   except (OSError, pyarrow.ArrowException) as e:
     raise FileError(f"cannot read {path}: {str(e).splitlines()[0]}") from None
-
-
-def read_arrays(path) -> dict:
-  """Arrays of an .npz file by name; FileError where there is none or it is broken. Nothing is
-  unpickled.
-  """
-  import zipfile
-  import zlib
-
-  import numpy as np
-
-  try:
-    with np.load(path, allow_pickle=False) as z:
-      return {k: z[k] for k in z.files}
-  except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error) as e:
-    raise FileError(f"cannot read {path}: {e}") from None
 
 
 def read_table(path) -> dict:
@@ -259,7 +205,6 @@ def query(tables, sql: str | None = None) -> tuple[list[str], list[tuple]]:
   Returns:
     (names of columns, rows).
   """
-  import duckdb
 
   if not isinstance(tables, dict):
     tables = {file.stem: file for file in sorted(pathlib.Path(tables).glob("*.parquet"))} or _none(
@@ -320,144 +265,3 @@ def _describe(db, name: str) -> tuple[str, int, str]:
     rows,
     ", ".join(c[0] for c in db.execute(f"select * from {quoted} limit 0").description),
   )
-
-
-def provenance() -> dict:
-  """Versions, machine and commit of this process, for config.json; cores: those that it may use."""
-  from mjx_cl.runs import workers
-
-  versions = {}
-  for name in PACKAGES:
-    try:
-      versions[name] = importlib.metadata.version(name)
-    except importlib.metadata.PackageNotFoundError:
-      versions[name] = None
-  return {
-    "versions": versions,
-    "python": platform.python_version(),
-    "git_commit": _commit(),
-    "machine": {
-      "cpu": _cpu(),
-      "cores": len(workers.cores()),
-      "system": platform.system(),
-      "arch": platform.machine(),
-    },
-  }
-
-
-@functools.cache
-def _commit() -> str | None:
-  """Commit of the source tree this package runs from, None outside a checkout; asked once, since a
-  later one is not what this process has loaded.
-  """
-  try:
-    out = subprocess.run(
-      ["git", "rev-parse", "HEAD"],
-      cwd=pathlib.Path(__file__).parent,
-      capture_output=True,
-      text=True,
-      timeout=5,
-    )
-  except (OSError, subprocess.SubprocessError):
-    return None
-  return out.stdout.strip() or None
-
-
-def _cpu() -> str:
-  try:
-    for line in pathlib.Path("/proc/cpuinfo").read_text().splitlines():
-      if line.startswith("model name"):
-        return line.split(":", 1)[1].strip()
-  except OSError:
-    pass
-  return platform.processor() or platform.machine()
-
-
-def probe(out) -> None:
-  """Makes the folder `out` and refuses one that cannot be written to, before what goes there is
-  computed. An empty folder that was not there is left.
-  """
-  if not str(out):
-    raise UserError("--out is a folder; got an empty name")
-  out = pathlib.Path(out)
-  if out.exists() and not out.is_dir():
-    raise UserError(f"--out {out} is a file")
-  try:
-    out.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryFile(dir=out):
-      pass
-  except OSError as e:
-    raise FileError(f"cannot write in {out}: {e.strerror or e}; give another --out") from None
-
-
-# what a run or training leaves beside config.json
-RESULTS = (
-  "trace.parquet",
-  "events.parquet",
-  "runs.parquet",
-  "residuals.parquet",
-  "summary.json",
-  "figure.png",
-  "metrics.parquet",
-  "signals.parquet",
-  "snapshots.parquet",
-  "stop.parquet",
-)
-
-
-def _foreign(out: pathlib.Path) -> str | None:
-  """What a run or training would replace in a folder without config.json that is not one's own,
-  which was cut off while it began: its name, or None.
-  """
-  left = {
-    "work": r"checkpoints|snapshots|trace(-\d+|\.tmp)\.npz",
-    "work/checkpoints": r"\d.*",
-    "checkpoints": r"\d.*",
-  }
-  strange = [name for name in (*RESULTS, "agent") if (out / name).exists()]
-  strange += [
-    f"{folder}/{path.name}"
-    for folder, known in left.items()
-    for path in sorted((out / folder).glob("*"))
-    if not re.fullmatch(known, path.name)
-  ]
-  return strange[0] if strange else None
-
-
-def claim_folder(out, resume: bool, overwrite: bool, done_marker: str = "summary.json") -> str:
-  """Decides what a command may do with --out.
-
-  Returns:
-    `new`, `resume` or `done` (a finished run that --resume finds).
-
-  Raises:
-    UserError where the folder holds another run and neither --resume nor --overwrite was given.
-  """
-  if not str(out):
-    raise UserError("--out is a folder; got an empty name")
-  out = pathlib.Path(out)
-  if out.exists() and not out.is_dir():
-    raise UserError(f"--out {out} is a file")
-  if resume and overwrite:
-    raise UserError("--resume and --overwrite exclude each other")
-  if (out / "config.json").exists():
-    if resume:
-      return "done" if (out / done_marker).exists() else "resume"
-    if not overwrite:
-      raise UserError(
-        f"{out} holds another run; give --resume to go on with it, --overwrite to replace it, "
-        "or another --out"
-      )
-  elif out.is_dir() and any(out.iterdir()):
-    if not (resume or overwrite):
-      raise UserError(f"{out} is not empty and holds no run of mjx-cl; give another --out")
-    if name := _foreign(out):
-      raise UserError(
-        f"{out} holds no config.json of mjx-cl, but {name}, which would be replaced; give "
-        "another --out"
-      )
-  try:
-    out.mkdir(parents=True, exist_ok=True)
-  except OSError as e:
-    raise FileError(f"cannot make {out}: {e.strerror}") from None
-  return "new"

@@ -6,11 +6,11 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import pathlib
 from typing import NamedTuple
 
 from mjx_cl.errors import FileError, UserError
+from mjx_cl.io import folders
 
 ASSETS = pathlib.Path(__file__).parent / "assets"
 REFERENCES = ("never", "always", "periodic", "random", "oracle")  # drawn in grey and not ranked
@@ -316,16 +316,7 @@ def write(
   text = HTML
   for mark, part in parts.items():  # the data last, since a name may hold a mark
     text = text.replace(mark, part)
-  path = pathlib.Path(path)
-  tmp = path.with_name(path.name + ".tmp")
-  try:
-    tmp.write_text(text, encoding="utf-8")
-    os.replace(tmp, path)
-  except OSError as e:
-    tmp.unlink(missing_ok=True)
-    raise FileError(
-      f"cannot write {path}: {e.strerror or e}; what was there is unchanged"
-    ) from None
+  folders.atomic(path, lambda file: file.write(text.encode()))
 
 
 def embed(value) -> str:

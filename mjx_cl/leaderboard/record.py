@@ -23,7 +23,7 @@ from mjx_cl import faults as faults_lib
 from mjx_cl.config import CHUNK
 from mjx_cl.detectors.combine import read
 from mjx_cl.errors import FileError, UserError
-from mjx_cl.io import runtime
+from mjx_cl.io import arrays, folders, runtime
 from mjx_cl.io import tables as store
 from mjx_cl.leaderboard.streams import COLUMNS, LATENT, META, SCHEMA, VERSION, Suite
 from mjx_cl.rollout.frozen import stream_keys
@@ -262,7 +262,7 @@ def beside(suite_: Suite, out, robots) -> dict | None:
   whole = json.loads(json.dumps(_plain(suite_, suite_.robots)))
   same = whole | {"robots": {r: whole["robots"].get(r) for r in held}}
   differ = (
-    [k for k, v in config["suite"].items() if same.get(k) != v]
+    folders.differing(same, config["suite"])
     + [k for k in MADE if k not in config]
     + ["version"] * (config["version"] != VERSION)
     + [k for k in ("details", "stream_steps") if set(config.get(k, ())) != set(held)]
@@ -430,12 +430,7 @@ def record(
             lambda *a, part=f"{robot} {split} {kind}": progress(part, *a),
           )
           seconds, lived = seconds + time.monotonic() - begin, lived + steps * len(who)
-          store.atomic(
-            path,
-            lambda f, data=data, tag=tag, of=of: np.savez(
-              f, tag=np.asarray(tag), of=np.asarray(of), **data
-            ),
-          )
+          arrays.write(path, {"tag": tag, "of": of, **data})
         parts[split, kind] = (who, onsets, data)
     groups = ",".join(name for name, _ in watched(env.spec))
     number = min((row["stream"] for row in table if row["robot"] == robot), default=free)
@@ -460,7 +455,7 @@ def record(
     "agents": who_acts,
     "details": details,
     "stream_steps": steps_of,
-    **store.provenance(),
+    **runtime.provenance(),
   }
   store.write_json(staged / "config.json", config | ({"kept": kept} if kept else {}))
   _publish(staged, out)
@@ -531,16 +526,12 @@ def _part(path: pathlib.Path, tag: str, of: str) -> dict | None:
   length; of, onsets, agent and physics.
   """
   try:
-    with np.load(path, allow_pickle=False) as z:
-      if str(z["tag"]) != tag or "of" in z.files and str(z["of"]) != of:
-        return None
-      return {k: z[k] for k in z.files if k not in ("tag", "of")}
-  except (OSError, ValueError, KeyError, EOFError):
+    part = arrays.read(path)
+  except FileError:
     return None
-  except Exception as e:  # zipfile's own errors for a truncated file
-    if type(e).__module__ in ("zipfile", "zlib"):
-      return None
-    raise
+  if str(part.pop("tag", None)) != tag or str(part.pop("of", of)) != of:
+    return None
+  return part
 
 
 def _write(suite_, out, robot, parts, number, control_s, groups) -> tuple[dict, list[dict]]:

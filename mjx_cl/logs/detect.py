@@ -21,7 +21,7 @@ import numpy as np
 
 from mjx_cl.detectors import DETECTORS, Alarm, Detector, python_class, rolling_sigma
 from mjx_cl.errors import FileError, UserError, choose
-from mjx_cl.io import tables
+from mjx_cl.io import folders, tables
 from mjx_cl.logs.read import Log, choose_columns, read
 from mjx_cl.rollout.monitor import unknown
 
@@ -490,8 +490,8 @@ def write(result: Detection, out) -> None:
           )
         )
       )
-  tables.atomic(out / "alarms.csv", lambda file: file.write(("\n".join(lines) + "\n").encode()))
-  tables.atomic(out / "detect.png", lambda file: figure(result, file))
+  folders.atomic(out / "alarms.csv", lambda file: file.write(("\n".join(lines) + "\n").encode()))
+  folders.atomic(out / "detect.png", lambda file: figure(result, file))
   tables.write_json(out / "detect.json", result.summary)
 
 

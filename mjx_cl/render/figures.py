@@ -4,14 +4,13 @@
 
 from __future__ import annotations
 
-import os
 import pathlib
 import warnings
 
 import numpy as np
 
 from mjx_cl.errors import FileError
-from mjx_cl.io import tables
+from mjx_cl.io import folders, tables
 
 UPPER = (("reward", "reward per step"), ("opr", "OPR"), ("rpr", "RPR"))
 LOWER = (
@@ -171,10 +170,8 @@ def _figure(folder, width: int) -> pathlib.Path:
     fontsize=10,
   )
   axes[1].set_xlabel(f"control step ({control_s:g} s)")
-  tmp = folder / "figure.tmp.png"
-  fig.savefig(tmp, dpi=130)
+  folders.atomic(folder / "figure.png", lambda file: fig.savefig(file, format="png", dpi=130))
   plt.close(fig)
-  os.replace(tmp, folder / "figure.png")
   return folder / "figure.png"
 
 
@@ -254,10 +251,8 @@ def survival(out, parts: list[str], columns: int = 3) -> pathlib.Path | None:
     axis.locator_params(axis="x", nbins=5)
     axis.legend(fontsize=7, title="recovered", title_fontsize=7)
   axes[0, 0].set_ylabel("share not yet recovered")
-  tmp = out / "recovery.tmp.png"
-  fig.savefig(tmp, dpi=110)
+  folders.atomic(out / "recovery.png", lambda file: fig.savefig(file, format="png", dpi=110))
   plt.close(fig)
-  os.replace(tmp, out / "recovery.png")
   return out / "recovery.png"
 
 
@@ -325,8 +320,6 @@ def ratios(out, points: list[dict]) -> pathlib.Path | None:
   )
   axis.minorticks_off()
   axis.legend(fontsize=8)
-  tmp = out / "ratio.tmp.png"
-  fig.savefig(tmp, dpi=110)
+  folders.atomic(out / "ratio.png", lambda file: fig.savefig(file, format="png", dpi=110))
   plt.close(fig)
-  os.replace(tmp, out / "ratio.png")
   return out / "ratio.png"

@@ -10,18 +10,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_cl.training import agents
-from mjx_cl import envs, faults as faults_lib
-from mjx_cl.faults import presets
-from mjx_cl.io import tables
+from mjx_cl import envs
+from mjx_cl import faults as faults_lib
 from mjx_cl.config import PRESETS
 from mjx_cl.dreamer.agent import Agent
 from mjx_cl.errors import FileError, UserError
-from mjx_cl.faults import certificate
+from mjx_cl.faults import certificate, presets
+from mjx_cl.io import tables
 from mjx_cl.rollout.monitor import Monitor
 from mjx_cl.rollout.scan import Rollout, nest, start
-from mjx_cl.scoring import intervals
 from mjx_cl.rollout.transfer import Transfer
+from mjx_cl.scoring import intervals
+from mjx_cl.training import agents
+from mjx_cl.training.episodes import Episodes
 
 CHUNK = 50  # decisions
 WARM = 30  # decisions at an episode's start whose residuals are not compared
@@ -74,31 +75,24 @@ class Cost:
       lambda x: x[None], self.begin(keys, jax.tree.map(spread, plan), spread(target))
     )
     history = self.monitor.init(1, lanes * self.episodes)
-    total, alive = np.zeros(lanes * self.episodes), np.ones(lanes * self.episodes, bool)
-    residuals, kept = [], []
+    lived, residuals, kept = Episodes((1, lanes * self.episodes)), [], []
     for chunk in range(-(-self.env.spec.episode_steps // self.repeat // CHUNK)):
       streams, rows = self.rollout.chunk(self.params, streams, CHUNK)
       history, residual = self.watch(
         self.params, history, rows, jax.random.split(jax.random.key(chunk), 1)
       )
-      reward, done = (
-        np.asarray(rows.reward)[:, 0],
-        np.asarray(rows.terminated | rows.truncated)[:, 0],
-      )
       residuals.append(
         np.stack([np.asarray(residual.opr)[:, 0], np.asarray(residual.rpr)[:, 0]], -1)
       )
-      for k in range(CHUNK):
-        total += reward[k] * alive
-        kept.append(alive.copy() & (chunk * CHUNK + k >= WARM))
-        alive &= ~done[k]
-      if not alive.any():
+      warm = np.arange(chunk * CHUNK, (chunk + 1) * CHUNK) >= WARM
+      kept.append(lived.add(rows)[:, 0] & warm[:, None])
+      if not lived.alive.any():
         break
-    values, kept = np.concatenate(residuals), np.stack(kept)
+    values, kept = np.concatenate(residuals), np.concatenate(kept)
     good = kept & np.isfinite(values).all(-1)
     logs = np.log(np.maximum(values, 1e-9))
     mine = lambda i: slice(i * self.episodes, (i + 1) * self.episodes)
-    return total.reshape(lanes, self.episodes), [
+    return lived.total.reshape(lanes, self.episodes), [
       logs[:, mine(i)][good[:, mine(i)]] for i in range(lanes)
     ]
 

@@ -15,10 +15,21 @@ import functools
 import pathlib
 import shutil
 
-from mjx_cl.io import tables as store
+import numpy as np
+import pyarrow
+
+from mjx_cl import envs
 from mjx_cl.adapt.arms import ARMS
 from mjx_cl.config import RunConfig
 from mjx_cl.errors import FileError, UserError
+from mjx_cl.io import folders as folder_lib
+from mjx_cl.io import tables as store
+from mjx_cl.render import figures
+from mjx_cl.runs import records
+from mjx_cl.runs.identity import arm_agents, differing, identity
+from mjx_cl.scoring import events
+from mjx_cl.scoring import stop_rule as stop
+from mjx_cl.training import agents
 
 ORDER = {
   "trace": "step",
@@ -63,10 +74,8 @@ def differs(folder, config: RunConfig, but: tuple[str, ...] = ()) -> str | None:
   Args:
     but: settings that may differ.
   Raises:
-    FileError for a config.json that cannot be read.
+    FileError for a config.json or an agent that is broken.
   """
-  from mjx_cl.runs.run import differing, identity
-
   folder = pathlib.Path(folder)
   if not (folder / "config.json").exists():
     return None
@@ -83,7 +92,7 @@ def differs(folder, config: RunConfig, but: tuple[str, ...] = ()) -> str | None:
     }
   changed = differing(old, values)
   for name, today in cards(config).items():
-    if name in old and (keys := changed_keys(old[name], today)):
+    if name in old and (keys := folder_lib.differing(today, old[name], deep=True)):
       changed.append(f"{name} ({', '.join(keys)})")
   if changed == ["threshold"]:
     return (
@@ -93,8 +102,11 @@ def differs(folder, config: RunConfig, but: tuple[str, ...] = ()) -> str | None:
 
 
 def cards(config: RunConfig) -> dict[str, dict]:
-  """Today's `agent_card` and `arm_cards` as config.json holds them; empty where the agent cannot be
-  read, as one that was moved.
+  """Today's `agent_card` and `arm_cards` as config.json holds them; empty where there is no agent, as
+  where it was moved.
+
+  Raises:
+    FileError for a broken one.
   """
   file = pathlib.Path(config.agent or "no agent by folder") / "card.json"
   return _cards(
@@ -108,34 +120,17 @@ def cards(config: RunConfig) -> dict[str, dict]:
 @functools.lru_cache(maxsize=64)
 def _cards(env_name, agent, arms, written) -> dict[str, dict]:
   """written: when the card of an agent by folder was; it stands for its content."""
-  from mjx_cl.training import agents
-  from mjx_cl import envs
-  from mjx_cl.runs import run
-
   try:
     env = envs.make(env_name, "auto")
-    others = run.arm_agents(RunConfig(env_name, agent=agent, arms=("none", *arms)), env)
+    others = arm_agents(RunConfig(env_name, agent=agent, arms=("none", *arms)), env)
     return {
       "agent_card": agents.of(env, agent).card,
       **({"arm_cards": {arm: other.card for arm, other in others.items()}} if others else {}),
     }
+  except FileError:
+    raise
   except UserError:
     return {}
-
-
-def changed_keys(old, new) -> list[str]:
-  """Keys of the card `old`, in order, of which `new` says something else or nothing; of tables in
-  it as `dreamer.size`.
-  """
-  if not isinstance(old, dict) or not isinstance(new, dict):
-    return [] if old == new else ["all"]
-  out = []
-  for key, value in old.items():
-    if isinstance(value, dict) and isinstance(new.get(key), dict):
-      out += [f"{key}.{below}" for below in changed_keys(value, new[key])]
-    elif key not in new or new[key] != value:
-      out.append(key)
-  return out
 
 
 def seeds_of(folder, config: RunConfig) -> list[int] | None:
@@ -206,12 +201,6 @@ def join(folders, out, config: RunConfig) -> dict:
     UserError where pieces differ in their agent or physics; FileError for a piece that cannot be
     read.
   """
-  import numpy as np
-  from mjx_cl import envs
-  from mjx_cl.runs import records
-  from mjx_cl.render import figures
-  from mjx_cl.scoring import stop_rule as stop
-
   folders, out = [pathlib.Path(f) for f in folders], pathlib.Path(out)
   summaries, configs = [], []
   for folder in folders:
@@ -220,7 +209,8 @@ def join(folders, out, config: RunConfig) -> dict:
     lacks = [k for k in SUMMED if k not in summaries[-1]]
     if lacks:
       raise FileError(f"{folder / 'summary.json'} is not a run's: it lacks {', '.join(lacks)}")
-  differ = [k for k in SAME if any(own.get(k) != configs[0].get(k) for own in configs)]
+  first = {k: configs[0].get(k) for k in SAME}
+  differ = sorted({k for own in configs for k in folder_lib.differing(own, first)}, key=SAME.index)
   if differ:
     raise UserError(
       f"{', '.join(map(str, folders))} are no pieces of one run: they differ in {', '.join(differ)}"
@@ -237,7 +227,8 @@ def join(folders, out, config: RunConfig) -> dict:
     files = [folder / f"{name}.parquet" for folder in folders]
     if not all(file.exists() for file in files):
       continue
-    tables = [store.read_arrow(file) for file in files]
+    read = events.read if name == "events" else store.read_arrow
+    tables = [read(file) for file in files]
     table = joined(tables, number, key)
     rows[name] = table
     store.write_arrow(out / f"{name}.parquet", table)
@@ -315,8 +306,6 @@ def joined(tables, number: dict[tuple[str, int], int], key: str):
   """pyarrow Tables one below the other, `stream` counted anew, ordered by stream and `key`. A
   column that a piece lacks is null there.
   """
-  import pyarrow
-
   table = pyarrow.concat_tables(tables, promote_options="permissive")
   stream = [number[at] for at in zip(table["arm"].to_pylist(), table["seed"].to_pylist())]
   at = table.column_names.index("stream")

@@ -13,27 +13,26 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mjx_cl.io import tables
 from mjx_cl.adapt import phase as phase_lib
 from mjx_cl.adapt.arms import ARMS, FOREVER, NEVER
 from mjx_cl.adapt.convergence import SIGNALS
 from mjx_cl.config import AdaptConfig, RunConfig
 from mjx_cl.errors import FileError
+from mjx_cl.io import tables
 from mjx_cl.rollout.monitor import watched
-from mjx_cl.scoring import alarms as alarm_score, intervals, recovery
+from mjx_cl.scoring import alarms as alarm_score
+from mjx_cl.scoring import intervals, recovery
 from mjx_cl.types import Spec
 
 # by decision: what a stream has come to
-OUTCOMES = (
-  "nominal",
-  "adapting",
-  "converged",
-  "aborted_by_rule",
-  "aborted_by_rule",
-  "aborted_by_budget",
-  "ended",
-  "failed",
-)
+OUTCOMES = {
+  "stop": "converged",
+  "abort_below": "aborted_by_rule",
+  "abort_hopeless": "aborted_by_rule",
+  "abort_budget": "aborted_by_budget",
+  "end": "ended",
+  "abort_numeric": "failed",
+}
 
 
 def acts(change) -> bool:
@@ -150,7 +149,7 @@ class Ledger(NamedTuple):
       healthy = "on a healthy robot" if onset is None else "before onset"
       onset, trigger = c.steps if onset is None else onset, ARMS[arm].trigger
 
-      def add(step, kind, reason):
+      def add(step, kind, reason, cause=None, decision=None, since=None):
         events.append(
           {
             "stream": g,
@@ -158,13 +157,17 @@ class Ledger(NamedTuple):
             "seed": seed,
             "step": int(step),
             "kind": kind,
+            "cause": cause,
+            "decision": decision,
+            "since": since,
+            "chunk": int(step) // self.chunk_steps,
             "reason": reason,
             "fault": self.names[g],
           }
         )
 
       if self.becomes is not None and onset < c.steps:
-        add(onset, "onset", f"becomes {self.becomes}, severity 1")
+        add(onset, "onset", f"becomes {self.becomes}, severity 1", f"becomes {self.becomes}")
       for change in self.changes:
         begin = c.onset + change.after
         if self.breaks[g] and acts(change) and begin < c.steps:
@@ -174,15 +177,17 @@ class Ledger(NamedTuple):
             "onset",
             f"{several}severity {change.severity:g}"
             + ("" if change.schedule == "abrupt" else f", {change.schedule}"),
+            change.fault,
           )
           if change.duration and begin + change.duration < c.steps:
-            add(begin + change.duration, "repair", f"{several}after {change.duration} steps")
+            said = f"{several}after {change.duration} steps"
+            add(begin + change.duration, "repair", said, change.fault)
       decisions = trace["decision"][:, g]
       started = {int(trace["since"][i, g]) for i in np.flatnonzero(decisions == phase_lib.START)}
       for step in np.flatnonzero(trace["alarm"][:, g]):
         false = f", {healthy}: a false alarm" if step < onset else ""
         if trigger.listens and int(step) in started:
-          add(step, "alarm", "acted on" + false)
+          add(step, "alarm", "acted on" + false, "acted on")
         else:
           phase = phase_lib.PHASES[trace["phase"][step, g]]
           late = (
@@ -197,19 +202,21 @@ class Ledger(NamedTuple):
           )
           if not trigger.listens:
             why = "arm does not adapt" if trigger is NEVER else "arm does not listen"
-          add(step, "alarm", f"logged, not acted on: {why}" + false)
+          add(step, "alarm", f"logged, not acted on: {why}" + false, why)
       for i in np.flatnonzero(decisions):
         end = min((i + 1) * self.chunk_steps, c.steps) - 1
         decision = int(decisions[i])
         kind = {phase_lib.START: "start", phase_lib.STOP: "stop", phase_lib.END: "stop"}.get(
           decision, "abort"
         )
+        starts, since = decision == phase_lib.START, int(trace["since"][i, g])
         add(
           end,
           kind,
-          phase_lib.REASONS[decision]
-          if decision != phase_lib.START
-          else f"{trigger.why} at step {int(trace['since'][i, g])}",
+          f"{trigger.why} at step {since}" if starts else phase_lib.REASONS[decision],
+          trigger.why if starts else None,
+          phase_lib.DECISIONS[decision],
+          since,
         )
         if "back" in trace and trace["back"][i, g]:
           add(
@@ -219,6 +226,7 @@ class Ledger(NamedTuple):
               f"the weights of before earned {trace['earned'][i, g]:.3f} a step, those of now "
               f"{trace['earns'][i, g]:.3f}"
             ),
+            since=since,
           )
     return sorted(events, key=lambda e: (e["stream"], e["step"]))
 
@@ -263,7 +271,7 @@ class Ledger(NamedTuple):
           else "nominal"
         )
         if ends and (not starts or ends[-1]["step"] > starts[-1]):
-          outcome = OUTCOMES[phase_lib.REASONS.index(ends[-1]["reason"])]
+          outcome = OUTCOMES[ends[-1]["decision"]]
         never = self.onsets[g] is None
         before, lost = pre[g], None if never else drop.get(seed)
         # no arm without adaptation lives on as this one does: its own first steps after the change
@@ -506,7 +514,7 @@ def summarise(rows: list[dict], config: RunConfig, control_s: float) -> dict:
   ]
   count("affected_watched", len(hit), len(affected))
   count("affected_alarmed_within_500", sum(hit), len(hit))
-  for outcome in dict.fromkeys((*OUTCOMES[phase_lib.STOP :], "adapting")):
+  for outcome in dict.fromkeys((*OUTCOMES.values(), "adapting")):
     hits = sum(r["outcome"] == outcome for r in rows)
     if hits or outcome != "failed":  # numeric failures are named where there are any
       count(outcome, hits, len(rows))

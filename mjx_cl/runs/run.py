@@ -18,11 +18,7 @@ without adaptation shares its past.
 
 from __future__ import annotations
 
-import dataclasses
-import hashlib
-import inspect
 import json
-import os
 import pathlib
 import shutil
 import sys
@@ -33,26 +29,31 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_cl.training import agents
-from mjx_cl.io import checkpoints, memory, plugins, runtime, tables
 from mjx_cl import detectors, envs, faults
-from mjx_cl.dreamer import replay
 from mjx_cl.adapt import phase as phase_lib
 from mjx_cl.adapt.arms import ARMS, FOREVER, never_stops
-from mjx_cl.adapt.convergence import SIGNALS
 from mjx_cl.adapt.blocks import Crew
+from mjx_cl.adapt.convergence import SIGNALS
 from mjx_cl.adapt.loop import Choices, Loop, LoopState, choices
-from mjx_cl.config import CHUNK, AdaptConfig, RunConfig, becomes, changes
+from mjx_cl.config import CHUNK, RunConfig, becomes, changes
+from mjx_cl.dreamer import replay
 from mjx_cl.dreamer.agent import CAUSES, EXPLODED
 from mjx_cl.errors import FileError, UserError
+from mjx_cl.io import arrays, checkpoints, folders, runtime, tables
 from mjx_cl.io.interrupt import Interruptible
-from mjx_cl.rollout.order import Lanes
-from mjx_cl.runs.records import Ledger, acts
+from mjx_cl.render import figures
 from mjx_cl.rollout.monitor import Monitor
+from mjx_cl.rollout.order import Lanes
 from mjx_cl.rollout.scan import Rollout, Stream, nest, start
-from mjx_cl.scoring import intervals, stop_rule
-from mjx_cl.runs.snapshots import Snapshots
 from mjx_cl.rollout.transfer import Moving, Transfer
+from mjx_cl.runs.doubts import doubts, watching
+from mjx_cl.runs.identity import arm_agents, check_same, identity, known_as, threshold_of
+from mjx_cl.runs.records import Ledger, acts
+from mjx_cl.runs.snapshots import Snapshots
+from mjx_cl.scoring import events as event_table
+from mjx_cl.scoring import stop_rule
+from mjx_cl.training import agents
+from mjx_cl.training import needs as bytes_of
 
 
 class State(NamedTuple):
@@ -145,7 +146,7 @@ class Runner:
     self.chunks = -(-config.steps // self.chunk_steps)
     episode = min(r.spec.episode_steps for r in self.robots)
     needs = lambda steps: capacity(steps, episode, self.repeat)
-    memory.check(
+    bytes_of.check(
       agent.config.size,
       len(spec.obs),
       len(spec.act),
@@ -423,15 +424,7 @@ class Runner:
     if self.checkpoints.latest() == number:
       return
     begin = time.perf_counter()
-    tmp = self.work / "trace.tmp.npz"
-    try:
-      np.savez(tmp, **self._trace())
-      os.replace(tmp, self.work / f"trace-{number:06d}.npz")
-    except OSError as e:
-      tmp.unlink(missing_ok=True)
-      raise FileError(
-        f"cannot write in {self.work}: {e.strerror or e}; the last checkpoint is intact"
-      ) from None
+    arrays.write(self.work / f"trace-{number:06d}.npz", self._trace())
     self.seconds["other"] += time.perf_counter() - begin
     meta = {
       "seconds": self.seconds,
@@ -465,7 +458,7 @@ class Runner:
     number = self.checkpoints.latest()
     self.state = State(streams, self.crew.split(LoopState(**loop)))
     self.acting = self.crew.acting(self.state.loop, self.lanes)
-    self.parts = [tables.read_arrays(self.work / f"trace-{number:06d}.npz")]
+    self.parts = [arrays.read(self.work / f"trace-{number:06d}.npz")]
     self.done_chunks = number
     self.seconds, self.quiet, self.stream_seconds = (
       meta["seconds"],
@@ -497,7 +490,7 @@ class Runner:
       "agent_path": pathlib.Path(self.trained.path).name,
       "repeat": self.repeat,
       "control_s": self.env.spec.control_s,
-      **tables.provenance(),
+      **runtime.provenance(),
     }
 
   def finish(self, tell=lambda text: None) -> dict:
@@ -506,8 +499,6 @@ class Runner:
 
     Returns summary.json's value.
     """
-    from mjx_cl.render import figures
-
     steps = self.config.steps
     if self.snapshots:
       self.save()  # their evaluation takes a while; one that is cut off goes on from here
@@ -527,13 +518,7 @@ class Runner:
     table, events = ledger.trace(trace), ledger.events(trace)
     runs = ledger.rows(trace, events)
     tables.write_table(self.out / "trace.parquet", table)
-    tables.write_table(
-      self.out / "events.parquet",
-      {
-        k: [e[k] for e in events]
-        for k in ("stream", "arm", "seed", "step", "kind", "reason", "fault")
-      },
-    )
+    event_table.write(self.out / "events.parquet", events)
     tables.write_table(self.out / "runs.parquet", {k: [r[k] for r in runs] for k in runs[0]})
     if self.config.residuals:
       tables.write_table(
@@ -627,131 +612,9 @@ class Runner:
         ) from None
 
 
-def arm_agents(config: RunConfig, env) -> dict[str, agents.Trained]:
-  """Arm -> its own agent, of the arms that bring one: the run's with the arm's word behind its
-  name, or beside the folder that --agent gives.
-
-  Raises:
-    UserError where there is no such agent, or it differs from the run's in size, obs_scale or
-    repeat.
-  """
-  out = {}
-  for arm in (a for a in config.arms if ARMS[a].agent):
-    trained = agents.of(env, config.agent)
-    given = config.agent and pathlib.Path(config.agent).exists()
-    name = f"{trained.path if given else pathlib.Path(trained.path).name}-{ARMS[arm].agent}"
-    try:
-      other = agents.of(env, name)
-    except UserError as e:
-      raise UserError(f"arm {arm!r}: {e}") from None
-    same = lambda t: (t.agent.config.size, t.agent.config.obs_scale, int(t.card.get("repeat", 1)))
-    if same(other) != same(trained):
-      raise UserError(
-        f"arm {arm!r}: agent {name!r} differs from the run's in size, obs_scale or repeat"
-      )
-    out[arm] = other
-  return out
-
-
 def spared(plan: faults.Plan, breaks) -> faults.Plan:
   """`plan` for a robot that breaks, bool (); without any severity for one that does not."""
   return plan._replace(severity=jnp.where(breaks, plan.severity, 0.0))
-
-
-def known_as(env) -> str:
-  """The robot whose agents and figures `env` takes: its own name, or that of the one that it is
-  another fidelity of.
-  """
-  return getattr(env, "agents_of", None) or env.spec.name
-
-
-def threshold_of(config: RunConfig) -> detectors.Threshold | None:
-  """The board's threshold that this run's detector has without having been given one; None where it
-  has another.
-  """
-  if "threshold" in config.settings or detectors.split(config.detector)[0] in detectors.PAPER:
-    return None
-  return detectors.calibrated(
-    config.detector, known_as(envs.make(config.env, config.physics)), config.settings
-  )
-
-
-def watching(config: RunConfig) -> str | None:
-  """The threshold that a detector has without having been given one, in a line; None where it was,
-  takes none, is one of the paper's rules or looks at nothing."""
-  name = detectors.split(config.detector)[0]
-  build = detectors.factory(config.detector)
-  if (
-    name in detectors.PAPER
-    or getattr(build, "reference", False)
-    or "threshold" in config.settings
-    or "threshold" not in detectors.known_settings(build)
-    or not any(ARMS[arm].trigger.listens for arm in config.arms)
-  ):
-    return None
-  robot = known_as(envs.make(config.env, config.physics))
-  found = detectors.calibrated(config.detector, robot, config.settings)
-  if found is None:
-    default = inspect.signature(build).parameters.get("threshold")
-    own = "its own default threshold" + (
-      f", {default.default:g}" if default and isinstance(default.default, (int, float)) else ""
-    )
-    return (
-      f"detector {config.detector} runs at {own}: none was found for {robot} with these "
-      "settings, and false alarms may be many; --set threshold=... "
-      "(`mjx-cl leaderboard` finds one)"
-    )
-  steps = found.arl0 * found.alarms
-  low, high = (steps / n for n in reversed(intervals.poisson(found.alarms)))
-  plain = {f.name: (f.default,) for f in dataclasses.fields(RunConfig)} | {
-    "env": (robot,),
-    "agent": (None, robot),
-  }
-  other = [
-    k
-    for k in ("env", "agent", "form", "actions", "deterministic")
-    if getattr(config, k) not in plain[k]
-  ]
-  return (
-    f"detector {config.detector} at threshold {found.value:.6g}, at which the shipped {robot} "
-    f"gave {found.alarms} false alarms in {steps:,.0f} healthy control steps, "
-    f"one in {found.arl0:,.0f} [{low:,.0f}, {high:,.0f}]"
-    + (f"; this run has another {' and '.join(other)}" if other else "")
-  )
-
-
-def doubts(config: RunConfig) -> list[str]:
-  """What a user may not have meant, one line each."""
-  adapt, warmup, said = config.adapt, config.adapt.warmup, []
-  if (
-    config.onset >= config.steps
-    and becomes(config) is None
-    and any(acts(change) for change in changes(config))
-  ):
-    said.append(
-      f"the run ends at step {config.steps:,}, before its fault at {config.onset:,}: no stream "
-      "meets it"
-    )
-  least = max(adapt.least, adapt.patience * CHUNK)
-  if adapt.budget < least and any(ARMS[arm].end.rule for arm in config.arms):
-    said.append(
-      f"adapt.budget={adapt.budget:,} ends every finetuning before one may converge, after "
-      f"{least:,} steps (adapt.least, {CHUNK} adapt.patience)"
-    )
-  if warmup >= config.steps:
-    return said + [
-      (
-        f"the run ends at step {config.steps:,}, within adapt.warmup={warmup:,}: no alarm can "
-        "start anything"
-      )
-    ]
-  if warmup > config.onset and any(ARMS[arm].trigger.listens for arm in config.arms):
-    return said + [
-      f"onset {config.onset:,} lies within adapt.warmup={warmup:,}: an alarm before its end "
-      "starts nothing, and without a reward before the onset no stream "
-      "counts as affected or recovered; a later --onset or a smaller --adapt.warmup would do"
-    ]
-  return said
 
 
 def execute(
@@ -767,7 +630,7 @@ def execute(
   `save_every_s` seconds of work.
   """
   fresh = not pathlib.Path(out).exists()
-  state, out = tables.claim_folder(out, resume, overwrite), pathlib.Path(out)
+  state, out = folders.claim_folder(out, resume, overwrite), pathlib.Path(out)
   if state == "done":
     check_same(
       out, {k: v for k, v in identity(config).items() if k != "physics"}
@@ -817,7 +680,7 @@ def execute(
 
 def clear(out: pathlib.Path) -> None:
   """Removes an earlier run's own files, nothing else."""
-  for name in ("config.json", *tables.RESULTS):
+  for name in ("config.json", *folders.RESULTS):
     (out / name).unlink(missing_ok=True)
   for name in ("work", "checkpoints"):
     shutil.rmtree(out / name, ignore_errors=True)
@@ -829,70 +692,3 @@ def clear(out: pathlib.Path) -> None:
     for folder in (card.parent, card.parent.parent):
       if not any(folder.iterdir()):
         folder.rmdir()
-
-
-def identity(config: RunConfig) -> dict:
-  """What makes a run what it is, as config.json holds it: its settings, `changes`, what a preset's
-  name stood for when it began, the `threshold` that its detector takes from the board,
-  `oracle_stops` that its arms are told, and the SHA-256 of the `files` that robot, fault or
-  detector stand in.
-  """
-  found, told = threshold_of(config), stop_rule.told(config)
-  sources = {
-    name: plugins.file_of(name)
-    for name in (config.env, config.detector, *(change.fault for change in changes(config)))
-  }
-  files = {
-    name: hashlib.sha256(path.read_bytes()).hexdigest()
-    for name, path in sources.items()
-    if path is not None and path.is_file()
-  }
-  return json.loads(
-    json.dumps(
-      {
-        **dataclasses.asdict(config),
-        "changes": [dataclasses.asdict(change) for change in changes(config)],
-        **({"threshold": found._asdict()} if found else {}),
-        **({"oracle_stops": told} if told else {}),
-        **({"files": files} if files else {}),
-      }
-    )
-  )
-
-
-def differing(old: dict, values: dict) -> list[str]:
-  """Keys of `values` in which the run differs whose config.json holds `old`. A setting that did not
-  exist when it began counts as its default.
-  """
-  skip = ("git_commit", "machine", "python")
-  if isinstance(old.get("adapt"), dict):
-    old = old | {"adapt": {**dataclasses.asdict(AdaptConfig()), **old["adapt"]}}
-  default = {
-    f.name: f.default for f in dataclasses.fields(RunConfig)
-  }  # nor did `changes` always exist
-  changed = [
-    k
-    for k in values
-    if k not in skip
-    and old.get(k, default.get(k, values[k] if k == "changes" else None)) != values[k]
-  ]
-  return changed + ["threshold"] * ("threshold" in old and "threshold" not in values)
-
-
-def check_same(out: pathlib.Path, values: dict) -> None:
-  """Refuses to resume with other settings than the run began with."""
-  try:
-    old = tables.read_json(out / "config.json")
-  except FileError as e:
-    raise FileError(f"{e}; give --overwrite or another --out") from None
-  changed = differing(old, values)
-  if changed == ["threshold"]:
-    raise UserError(
-      f"--resume: {out} was begun when its detector {old.get('detector')} had another default "
-      "threshold than today; --overwrite begins anew"
-    )
-  if changed:
-    raise UserError(
-      f"--resume: {out} was begun with another {', '.join(changed)}; give the same settings or "
-      "--overwrite"
-    )

@@ -8,7 +8,6 @@ stream and step: a chunk that is lived again after a kill writes the same file a
 
 from __future__ import annotations
 
-import os
 import pathlib
 import time
 from typing import NamedTuple
@@ -21,8 +20,10 @@ from mjx_cl import faults as faults_lib
 from mjx_cl.adapt import phase as phase_lib
 from mjx_cl.adapt.arms import ARMS, never_stops
 from mjx_cl.errors import FileError, UserError
+from mjx_cl.io import arrays, folders
 from mjx_cl.io.interrupt import Interruptible
 from mjx_cl.rollout.scan import Rollout, nest, start
+from mjx_cl.training.episodes import Episodes
 
 ACTS = ("enc", "dyn", "pol")  # of the parameters: what Agent.act reads
 EPISODES = 5
@@ -112,38 +113,27 @@ class Snapshots:
     )
     if not len(wanted):
       return
-    arrays = {name: np.asarray(leaf) for name, leaf in _named({k: acting[k] for k in ACTS})}
+    weights = arrays.named({k: acting[k] for k in ACTS})
+    weights = {name: np.asarray(leaf) for name, leaf in weights.items()}
     for g in wanted:
       self._write(
         self._path(Snapshot(int(g), int(digest.since[g]), min(now, self.config.steps) - 1)),
-        {name: x[place[g]] for name, x in arrays.items()},
+        {name: x[place[g]] for name, x in weights.items()},
       )
 
   def _path(self, s: Snapshot) -> pathlib.Path:
     return self.folder / f"{s.stream:04d}-{s.step:09d}.npz"
 
-  def _write(self, path, arrays) -> None:
-    tmp = path.with_name(path.stem + ".tmp.npz")
-    try:
-      self.folder.mkdir(parents=True, exist_ok=True)
-      np.savez(tmp, **arrays)
-      os.replace(tmp, path)
-    except OSError as e:
-      tmp.unlink(missing_ok=True)
-      raise FileError(
-        f"cannot write in {self.folder}: {e.strerror or e}; the last checkpoint is intact"
-      ) from None
+  def _write(self, path: pathlib.Path, values: dict[str, np.ndarray]) -> None:
+    folders.make(self.folder)
+    arrays.write(path, values)
 
   def _read(self, s: Snapshot):
     path = self._path(s)
-    try:
-      with np.load(path, allow_pickle=False) as z:
-        arrays = [z[name] for name, _ in _named(self.like)]
-    except (OSError, ValueError, KeyError) as e:
-      raise FileError(f"cannot read snapshot {path}: {e}") from None
-    if [x.shape for x in arrays] != [x.shape for x in jax.tree.leaves(self.like)]:
+    stored, like = arrays.read(path), arrays.named(self.like)
+    if {k: x.shape for k, x in stored.items()} != {k: x.shape for k, x in like.items()}:
       raise FileError(f"snapshot {path} belongs to another size or robot")
-    return jax.tree.unflatten(jax.tree.structure(self.like), arrays)
+    return jax.tree.unflatten(jax.tree.structure(self.like), [stored[k] for k in like])
 
   def taken(self, trace, length: int) -> list[Snapshot]:
     """All snapshots of a run, from its trace: `phase` (steps, groups), `decision`, `since` (chunks,
@@ -201,8 +191,7 @@ class Snapshots:
         batch = wanted[first : first + size]
         path, part = self.folder / f"scores-{first:06d}.npz", None
         if path.exists():
-          with np.load(path, allow_pickle=False) as z:
-            part = {k: z[k] for k in z.files}
+          part = arrays.read(path)
         if part is None or part["of"].tolist() != [list(s) for s in batch]:
           begin = time.perf_counter()
           program = program or self._program()
@@ -257,22 +246,9 @@ class Snapshots:
     )
     severity = jnp.asarray([self.severities(s.since) for s in batch], jnp.float32)
     streams = begin(keys, jnp.asarray(targets[[s.stream for s in batch]], jnp.int32), severity)
-    total, steps = np.zeros((len(batch), EPISODES)), np.zeros((len(batch), EPISODES), int)
-    alive = np.ones((len(batch), EPISODES), bool)
-    while alive.any():
+    lived = Episodes((len(batch), EPISODES))
+    while lived.alive.any():
       streams, rows = rollout.chunk(params, streams, LENGTH)
-      done = np.asarray(rows.terminated | rows.truncated)
-      before = np.concatenate([~alive[None], done[:-1]])
-      counts = ~np.logical_or.accumulate(before, 0)  # up to the decision that ends the episode
-      total += (np.asarray(rows.reward, np.float64) * counts).sum(0)
-      steps += counts.sum(0) * self.repeat
-      alive &= ~done.any(0)
+      lived.add(rows)
       interrupt.check()
-    return total, steps
-
-
-def _named(tree):
-  """(name, leaf) of every leaf."""
-  return [
-    (jax.tree_util.keystr(path), leaf) for path, leaf in jax.tree_util.tree_leaves_with_path(tree)
-  ]
+    return lived.total, lived.steps * self.repeat

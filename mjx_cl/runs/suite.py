@@ -17,6 +17,7 @@ machines share a suite by `shard`, and `merge` takes over what others finished.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import itertools
@@ -30,11 +31,22 @@ import tomllib
 from collections.abc import Callable
 from typing import NamedTuple
 
-from mjx_cl.runs import merge
-from mjx_cl.io import tables
+import jax
+import jax.numpy as jnp
+
+from mjx_cl import detectors, envs, faults
 from mjx_cl.adapt.arms import ARMS, FOREVER, ONSET
 from mjx_cl.config import AdaptConfig, RunConfig, becomes, changes, kinds, replace
 from mjx_cl.errors import FileError, UserError
+from mjx_cl.io import folders, memory, tables
+from mjx_cl.render import figures
+from mjx_cl.rollout.order import Lanes
+from mjx_cl.runs import merge, run, workers
+from mjx_cl.runs.doubts import doubts, watching
+from mjx_cl.runs.identity import arm_agents
+from mjx_cl.runs.records import acts
+from mjx_cl.scoring import normalised_recovery, stop_rule, survival
+from mjx_cl.training import agents, needs
 
 SUITES = pathlib.Path(__file__).parent / "suites"
 PUBLISHED = (
@@ -243,9 +255,6 @@ def matmul_rate(seconds: float = 1.0) -> float:
   """FLOP/s of a dense float32 product of 2048 x 2048 matrices, the best of `seconds`; first calls,
   which compile, left out.
   """
-  import jax
-  import jax.numpy as jnp
-
   x = jnp.ones((2048, 2048), jnp.float32)
   dot = jax.jit(jnp.dot)
   dot(x, x).block_until_ready()
@@ -267,8 +276,6 @@ def finetunings(
   Args:
     seed: of the stream; None: the run's first. most: control steps after which it is told to end.
   """
-  from mjx_cl.runs.records import acts
-
   own, faulty = ARMS[arm], [change for change in changes(config) if change.fault != "none"]
   first = [config.onset] * (becomes(config) is not None)
   if not own.breaks:
@@ -305,9 +312,6 @@ class Robots:
   """What the parts of a plan share, each built once."""
 
   def __init__(self):
-    from mjx_cl.training import agents
-    from mjx_cl import envs
-
     self.make = functools.cache(envs.make)
     self.learner = functools.cache(
       lambda name, agent: agents.of(self.make(name, "auto"), agent).agent.config
@@ -321,17 +325,12 @@ def estimate(part: Part, rate: float, robots: Robots | None = None) -> Estimate:
   Raises:
     UserError, FileError for an agent or oracle stops that cannot be read, see `check`.
   """
-  from mjx_cl.io import memory
-  from mjx_cl.runs import run
-  from mjx_cl.rollout.order import Lanes
-  from mjx_cl.scoring import stop_rule
-
   c = part.config
   robots = robots or Robots()
   spec, trained = robots.make(c.env, "auto").spec, robots.learner(c.env, c.agent)
   batch, starts = c.adapt.batch or trained.batch, c.adapt.last_starts
   size = (
-    memory.parameters(trained.size, len(spec.obs), len(spec.act), trained.bins)[0] / 640_867
+    needs.parameters(trained.size, len(spec.obs), len(spec.act), trained.bins)[0] / 640_867
   )  # of size1m on a walker
   streams = len(c.arms) * c.seeds
   told = stop_rule.told(c)
@@ -351,7 +350,7 @@ def estimate(part: Part, rate: float, robots: Robots | None = None) -> Estimate:
     c.steps * (streams * WATCH_S * size + lanes * (ACT_S * size + physics))
     + updates * batch * trained.length * UPDATE_S * share * size
   )
-  need = memory.need(
+  need = needs.need(
     trained.size,
     len(spec.obs),
     len(spec.act),
@@ -377,30 +376,24 @@ def check(part: Part, robots: Robots | None = None) -> None:
   """Refuses, before the suite starts, names and values that only the registries know: fault,
   target, detector, agent.
   """
-  from mjx_cl import detectors, faults
-  from mjx_cl.runs import run
-  from mjx_cl.scoring import stop_rule
-
   c, robots = part.config, robots or Robots()
   try:
     detectors.make(c.detector, **c.settings)
     faults.build(changes(c), robots.make(becomes(c) or c.env, c.physics), c.onset)
     robots.learner(c.env, c.agent)
-    run.arm_agents(c, robots.make(c.env, c.physics))
+    arm_agents(c, robots.make(c.env, c.physics))
     stop_rule.told(c)
   except UserError as e:
-    raise UserError(f"part {part.name}: {e}") from None
+    raise type(e)(f"part {part.name}: {e}") from None
 
 
 def notes(parts) -> list[tuple[str, str]]:
-  """What `mjx-cl run` would say of these parts' settings before it starts (run.watching,
-  run.doubts), each with the parts that it holds for.
+  """What `mjx-cl run` would say of these parts' settings before it starts (doubts.py),
+  each with the parts that it holds for.
   """
-  from mjx_cl.runs import run
-
   which: dict[str, list[str]] = {}
   for part in parts:
-    for text in [*filter(None, [run.watching(part.config)]), *run.doubts(part.config)]:
+    for text in [*filter(None, [watching(part.config)]), *doubts(part.config)]:
       which.setdefault(text, []).append(part.name)
   return [
     (text, names[0] if len(names) == 1 else f"{names[0]} and {len(names) - 1} more")
@@ -497,9 +490,7 @@ def offers(
       except UserError as e:
         tell(f"note: {e}; {part.name} is not taken over from there")
     whole = [[folder] for folder, own in there if own == part_seeds(part)]
-    if (
-      sources := whole[0] if whole else merge.choose([folder for folder, _ in there], part.config)
-    ):
+    if sources := whole[0] if whole else merge.choose([folder for folder, _ in there], part.config):
       found[part.name] = sources
   return found
 
@@ -543,7 +534,7 @@ def publish(out, plan: Suite, to) -> list[str]:
     (to / part.name).mkdir(parents=True, exist_ok=True)
     for name in PUBLISHED:
       if (out / part.name / name).exists():
-        tables.atomic(
+        folders.atomic(
           to / part.name / name,
           lambda file, source=out / part.name / name: file.write(source.read_bytes()),
         )
@@ -620,19 +611,22 @@ def scores(folder) -> dict:
     without_floor: patience [chunks], as text -> the same without the floor of `least` control
       steps, so that the signals alone decide.
   """
-  from mjx_cl.scoring import normalised_recovery, stop_rule, survival
-
   config, rows = tables.read_json(folder / "config.json"), tables.read_rows(folder / "runs.parquet")
   arms, watched = config["arms"], survival.watched(rows, config["steps"])
   scored = normalised_recovery.rows(rows) if "none" in arms else []
-  out = {"normalised": normalised_recovery.summarise(scored) or None, "against_oracle": None, "recovery": {}}
+  out = {
+    "normalised": normalised_recovery.summarise(scored) or None,
+    "against_oracle": None,
+    "recovery": {},
+  }
   if scored and {"detector", "oracle"} <= set(arms):
     out["against_oracle"] = normalised_recovery.difference(scored, "detector", "oracle")
   if (folder / "signals.parquet").exists():
     try:
       out["ablation"] = stop_rule.ablated(stop_rule.ablation(folder))
       out["without_floor"] = {
-        str(n): stop_rule.ablated(stop_rule.ablation(folder, least=1, patience=n)) for n in PATIENCES
+        str(n): stop_rule.ablated(stop_rule.ablation(folder, least=1, patience=n))
+        for n in PATIENCES
       }
     except UserError as e:
       if isinstance(e, FileError):
@@ -714,8 +708,6 @@ def draw(out, plan: Suite, value: dict) -> list[pathlib.Path]:
   """OUT/recovery.png and OUT/ratio.png, as far as there is something to draw, from the rows of
   OUT's parts and what bench.json holds, `value`. Returns the files.
   """
-  from mjx_cl.render import figures
-
   points = [
     p
     for part in plan.parts
@@ -801,6 +793,12 @@ def write_plan(plan: Suite, out) -> None:
   )
 
 
+@contextlib.contextmanager
+def _silent():
+  """A display that shows nothing."""
+  yield lambda progress: None
+
+
 def execute(
   plan: Suite,
   out,
@@ -810,6 +808,7 @@ def execute(
   display=None,
   save_every_s: float = 60.0,
   jobs: int = 1,
+  worker: str = "",
 ) -> dict:
   """Runs the parts that are not finished, in order; one that was cut off goes on from its last
   checkpoint.
@@ -819,11 +818,10 @@ def execute(
       manager that gives run.execute's progress.
     jobs: parts side by side, see workers.py, the longest first. The last digits of a run depend on
       how many cores it has.
+    worker: module that such a process runs.
   Returns:
     bench.json's value.
   """
-  from mjx_cl.runs import run, workers
-
   out = pathlib.Path(out)
   write_plan(plan, out)
   todo = [p for p in parts if not finished(out, p)]
@@ -846,7 +844,7 @@ def execute(
         )
       tell(f"{name} finished, {len(over)} of {len(names)}{left}")
 
-    workers.together(out, names, min(jobs, len(names)), end, tell)
+    workers.together(worker, out, names, min(jobs, len(names)), end, tell)
     return collect(out, plan, known)
   spent, expected, known = 0.0, 0.0, {}
   for i, part in enumerate(todo):
@@ -856,7 +854,7 @@ def execute(
       tell(f"{part.name} ({i + 1} of {len(todo)}); about {round(left / 60) or 1} min left")
     begin = time.monotonic()
     begun = (out / part.name / "config.json").exists()
-    with display() as progress:
+    with (display or _silent)() as progress:
       run.execute(
         part.config, out / part.name, resume=begun, progress=progress, save_every_s=save_every_s
       )

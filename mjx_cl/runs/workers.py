@@ -1,9 +1,9 @@
 """Parts of a suite side by side, each in a process of its own on a share of the cores.
 
 One run does not keep several cores busy all the time: its programs are compiled on one core, and
-acting is one program for all streams. The parent starts `python -m mjx_cl.runs.workers OUT PART CORES`
-for each part; OUT/suite.json says what the part is. A worker saves and ends when its standard input
-closes, so that none outlives its parent.
+acting is one program for all streams. The parent starts `python -m MODULE OUT PART CORES` for each
+part; OUT/suite.json says what the part is. A worker saves and ends when its standard input closes,
+so that none outlives its parent.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ import threading
 import time
 from collections.abc import Callable
 
-from mjx_cl.io import tables
+import jax
+
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.io.interrupt import Interruptible
 from mjx_cl.io.runtime import cores
@@ -32,8 +33,6 @@ def number(asked: int | None, needs: list[int], space: int) -> int:
     UserError where the user's number is below 1, above the cores, or does not fit. On an
     accelerator, which each process would take whole, it is 1.
   """
-  import jax
-
   limit, fits = len(cores()) if jax.default_backend() == "cpu" else 1, 0
   for need in sorted(needs, reverse=True):
     space -= need
@@ -51,15 +50,25 @@ def number(asked: int | None, needs: list[int], space: int) -> int:
 
 
 class Worker:
-  """A running part. Attributes: name: of the part. share: its place among the shares of the cores.
-  last: line that it said last.
+  """A running part.
+
+  Attributes:
+    name: of the part.
+    share: its place among the shares of the cores.
+    last: line that it said last.
   """
 
   def __init__(
-    self, out: pathlib.Path, name: str, share: int, own: list[int], tell: Callable[[str], None]
+    self,
+    module: str,
+    out: pathlib.Path,
+    name: str,
+    share: int,
+    own: list[int],
+    tell: Callable[[str], None],
   ):
     self.name, self.share, self.last = name, share, ""
-    command = [sys.executable, "-m", "mjx_cl.runs.workers", str(out), name, ",".join(map(str, own))]
+    command = [sys.executable, "-m", module, str(out), name, ",".join(map(str, own))]
     # a session of its own: Ctrl-C reaches the parent alone, which then closes the input
     self.process = subprocess.Popen(
       command,
@@ -109,7 +118,8 @@ class Worker:
 
 
 def together(
-  out,
+  module: str,
+  out: str | os.PathLike,
   names: list[str],
   jobs: int,
   finished: Callable[[str], None],
@@ -118,7 +128,13 @@ def together(
   """Runs the parts `names` of OUT/suite.json, `jobs` at a time, in their order.
 
   Args:
+    module: what each process runs, see cli/worker.py.
+    out: folder of the suite.
+    names: of the parts.
+    jobs: how many at a time.
     finished: called with the name of each part as it ends.
+    tell: called with each line that a part says.
+
   Raises:
     UserError, FileError as soon as one fails; KeyboardInterrupt on a signal. Before either is
     raised the others have saved what they had lived and ended.
@@ -134,7 +150,7 @@ def together(
         free += [worker.share for worker in over]
         while waiting and free:
           share = free.pop(0)
-          running.append(Worker(out, waiting.pop(0), share, all_cores[share::jobs], tell))
+          running.append(Worker(module, out, waiting.pop(0), share, all_cores[share::jobs], tell))
         for worker in over:
           finished(worker.name)
         stop.check()
@@ -145,47 +161,3 @@ def together(
       worker.process.stdin.close()
     for worker in running:
       worker.process.wait()
-
-
-def main(arguments: list[str]) -> int:
-  """One part: OUT PART CORES (comma-separated); exit status 0, 1 (files), 2 (settings), 130
-  (stopped, saved).
-  """
-  out, name, own = arguments
-  if own and hasattr(os, "sched_setaffinity"):
-    os.sched_setaffinity(0, {int(core) for core in own.split(",")})  # before JAX counts its threads
-
-  def orphan():
-    import signal
-
-    os.read(0, 1)  # not sys.stdin, whose lock would still be held as the interpreter ends
-    os.dup2(
-      os.open(os.devnull, os.O_WRONLY),
-      2,
-      # where the parent died, nobody reads what is said, and saying it would be an error before the
-      # state is saved
-    )
-    os.kill(os.getpid(), signal.SIGTERM)
-
-  threading.Thread(target=orphan, daemon=True).start()
-  from mjx_cl.runs import suite, run
-  from mjx_cl.cli import app, display
-  from mjx_cl.io import runtime
-
-  def do():
-    runtime.setup()
-    folder = pathlib.Path(out)
-    values = tables.read_json(folder / "suite.json")["parts"][name]
-    with display.RunDisplay() as shown:
-      run.execute(
-        suite.config(name, values),
-        folder / name,
-        resume=(folder / name / "config.json").exists(),
-        progress=shown,
-      )
-
-  return app.attempt(do)
-
-
-if __name__ == "__main__":
-  sys.exit(main(sys.argv[1:]))

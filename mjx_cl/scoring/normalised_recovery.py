@@ -4,30 +4,12 @@
 
 from __future__ import annotations
 
-import json
-import pathlib
-
-from mjx_cl.adapt.arms import ARMS, NEVER, ONSET
-from mjx_cl.errors import FileError, UserError
+from mjx_cl.adapt.arms import ARMS, NEVER
 from mjx_cl.scoring import intervals
 
 # share of reward_pre that must lie between the reference and no adaptation; as `affected` asks for
 LEAST = 0.1
 HALF = 0.5  # of normalised recovery: where no arm reaches it, the change counts as unrecoverable
-SAME = (
-  "env",
-  "fault",
-  "target",
-  "severity",
-  "onset",
-  "duration",
-  "schedule",
-  "period",
-  "share",
-  "agent",
-  "physics",
-  "deterministic",
-)
 
 
 def normalise(
@@ -133,39 +115,3 @@ def difference(scored, method: str, other: str) -> dict:
     "difference_ci": ci,
     "holds_zero": None if ci is None or None in ci else ci[0] <= 0 <= ci[1],
   }
-
-
-def of_folders(folder, expert=None, least: float = LEAST) -> list[dict]:
-  """`rows` of a run folder, with the expert from another one (its first arm of true-onset trigger,
-  never parameters drawn anew).
-
-  Raises:
-    UserError where the two did not meet the same thing, or there is no such arm; FileError for a
-    folder that holds no finished run.
-  """
-  config, runs = _read(folder)
-  if expert is None:
-    return rows(runs, None, least)
-  theirs, others = _read(expert)
-  changed = [k for k in SAME if config.get(k) != theirs.get(k)]
-  if changed:
-    raise UserError(
-      f"{expert} met another {', '.join(changed)} than {folder}; an expert must meet the same"
-    )
-  arm = next((a for a in theirs["arms"] if ARMS[a].trigger is ONSET and not ARMS[a].fresh), None)
-  if arm is None:
-    raise UserError(f"{expert} holds no arm that starts at the true onset")
-  return rows(runs, [r for r in others if r["arm"] == arm], least)
-
-
-def _read(folder):
-  import pyarrow
-  import pyarrow.parquet
-
-  folder = pathlib.Path(folder)
-  try:
-    return json.loads((folder / "config.json").read_text()), pyarrow.parquet.read_table(
-      folder / "runs.parquet"
-    ).to_pylist()
-  except (OSError, ValueError, pyarrow.ArrowException) as e:
-    raise FileError(f"{folder} holds no finished run: {str(e).splitlines()[0]}") from None

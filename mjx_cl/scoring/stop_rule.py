@@ -11,12 +11,20 @@ from __future__ import annotations
 import json
 import pathlib
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+import pyarrow
+import pyarrow.parquet
 
+from mjx_cl.adapt import phase
 from mjx_cl.adapt.arms import ARMS, never_stops, stops
+from mjx_cl.adapt.convergence import SIGNALS
+from mjx_cl.adapt.phase import REASONS, START, STOP
+from mjx_cl.config import AdaptConfig
 from mjx_cl.errors import FileError, UserError
-from mjx_cl.io import tables
-from mjx_cl.scoring import intervals, normalised_recovery
+from mjx_cl.io import folders, tables
+from mjx_cl.scoring import events, intervals, normalised_recovery
 
 SHARE = 0.95  # of the best snapshot's reward, from which a stop is good enough
 HORIZON = 10_000  # control steps that the robot lives on with the weights of its stop
@@ -75,19 +83,19 @@ def at(age, reward, stop: int) -> float:
   return float(reward[max(0, int(np.searchsorted(age, stop, "right")) - 1)])
 
 
-def spans(events) -> list[dict]:
+def spans(happened: list[dict]) -> list[dict]:
   """Adaptations in events.parquet (rows in order): {stream, arm, seed, since (the control step of
   what started it), stop, outcome, reason}.
 
   outcome: converged, aborted, ended, or adapting, whose stop and reason are None.
   """
   out = []
-  for e in events:
+  for e in happened:
     if e["kind"] == "start":
       out.append(
         {k: e[k] for k in ("stream", "arm", "seed")}
         | {
-          "since": int(e["reason"].rsplit(" ", 1)[1]),
+          "since": e["since"],
           "stop": None,
           "outcome": "adapting",
           "reason": None,
@@ -115,7 +123,7 @@ def unrecoverable(runs) -> dict[int, bool | None]:
   }
 
 
-def rows(snapshots, events, runs, updates) -> list[dict]:
+def rows(snapshots, happened, runs, updates) -> list[dict]:
   """Every adaptation that the stop rule may end, against the snapshots of the same seed.
 
     oracle_stop_steps, own_stop_steps: control steps from the start of its adaptation to the oracle
@@ -129,13 +137,13 @@ def rows(snapshots, events, runs, updates) -> list[dict]:
   where it does not end, what rests on it is None.
 
   Args:
-    snapshots, events, runs: rows of the files of these names. updates: int (streams, steps), the
+    snapshots, happened, runs: rows of snapshots.parquet, events.parquet and runs.parquet. updates: int (streams, steps), the
       column of trace.parquet.
 
   Returns:
     rows with COLUMNS, sorted by stream.
   """
-  label, lived = unrecoverable(runs), spans(events)
+  label, lived = unrecoverable(runs), spans(happened)
   curves: dict[tuple, list] = {}
   for s in snapshots:
     curves.setdefault((s["stream"], s["step"] + 1 - s["since_start"]), []).append(s)
@@ -251,10 +259,11 @@ def summarise(judged) -> dict:
 
 def of_folder(folder) -> list[dict]:
   """`rows` of a finished run with snapshots."""
-  snapshots, events, runs = (_read(folder, name) for name in ("snapshots", "events", "runs"))
+  snapshots, runs = _read(folder, "snapshots"), _read(folder, "runs")
   columns = _table(folder, "trace", ["stream", "updates"])
   stream, updates = (columns[k].to_numpy() for k in ("stream", "updates"))
-  return rows(snapshots, events, runs, updates.reshape(len(np.unique(stream)), -1))
+  happened = events.read(pathlib.Path(folder) / "events.parquet").to_pylist()
+  return rows(snapshots, happened, runs, updates.reshape(len(np.unique(stream)), -1))
 
 
 # ---- the rule with a signal left out -------------------------------------------------------------
@@ -288,10 +297,6 @@ def ablation(folder, **rule) -> list[dict]:
       f"the stop rule has no {', '.join(sorted(set(rule) - set(RULE)))}; choose from: "
       f"{', '.join(RULE)}"
     )
-  from mjx_cl.adapt.convergence import SIGNALS
-  from mjx_cl.adapt.phase import REASONS, START, STOP
-  from mjx_cl.config import AdaptConfig
-
   try:
     config = AdaptConfig(
       **json.loads((pathlib.Path(folder) / "config.json").read_text())["adapt"] | rule
@@ -303,7 +308,7 @@ def ablation(folder, **rule) -> list[dict]:
     for s in _read(folder, "snapshots"):
       curves.setdefault((s["stream"], s["step"] + 1 - s["since_start"]), []).append(s)
   first: dict[int, dict] = {}
-  for span in spans(_read(folder, "events")):
+  for span in spans(events.read(pathlib.Path(folder) / "events.parquet").to_pylist()):
     if never_stops(ARMS[span["arm"]]):
       first.setdefault(span["stream"], span)
   if not first:
@@ -379,11 +384,6 @@ def _relive(own, since, names, config):
   """Stream -> decisions (1 + 6, chunks) of the phase machine: with all signals, then with each left
   out.
   """
-  import jax
-  import jax.numpy as jnp
-
-  from mjx_cl.adapt import phase
-
   number = lambda x: np.float32(np.nan if x is None else x)
   signals = np.array(
     [[[number(c[n]) for n in names] for c in chunks] for chunks in own.values()], np.float32
@@ -481,8 +481,9 @@ def told(config) -> dict[int, int]:
     raise FileError(f"stops: {folder} holds no run: {e}") from None
   if not isinstance(adapt := theirs.get("adapt"), dict):
     raise FileError(f"stops: {folder} holds no run: its config.json has no settings of adaptation")
-  differ = [k for k in SAME if k in theirs and theirs[k] != getattr(config, k)]
-  differ += [f"adapt.{k}" for k in LEARNS if k in adapt and adapt[k] != getattr(config.adapt, k)]
+  ours = {k: getattr(config, k) for k in SAME if k in theirs}
+  ours["adapt"] = {k: getattr(config.adapt, k) for k in LEARNS if k in adapt}
+  differ = folders.differing(theirs, ours, deep=True)
   if differ:
     raise UserError(
       f"stops: {folder} was run with another {', '.join(differ)}; its oracle stops are not "
@@ -513,9 +514,6 @@ def told(config) -> dict[int, int]:
 
 
 def _table(folder, name, columns=None):
-  import pyarrow
-  import pyarrow.parquet
-
   try:
     return pyarrow.parquet.read_table(pathlib.Path(folder) / f"{name}.parquet", columns=columns)
   except (OSError, pyarrow.ArrowException) as e:

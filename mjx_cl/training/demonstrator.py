@@ -13,15 +13,16 @@ import os
 import pathlib
 import sys
 import time
-import zipfile
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mjx_cl import envs
 from mjx_cl.envs.adapters import brax_env, brax_module
 from mjx_cl.errors import FileError
+from mjx_cl.io import arrays, folders, runtime
 
 
 class Policy(NamedTuple):
@@ -47,26 +48,21 @@ class Policy(NamedTuple):
 
 
 def save(path: str | os.PathLike, policy: Policy) -> None:
-  """Writes an .npz, to a temporary name first."""
-  path = pathlib.Path(path)
-  arrays = {"mean": policy.mean, "std": policy.std}
+  """Writes an .npz."""
+  named = {"mean": policy.mean, "std": policy.std}
   for i, (kernel, bias) in enumerate(policy.layers):
-    arrays |= {f"kernel{i}": kernel, f"bias{i}": bias}
-  tmp = path.with_suffix(".tmp.npz")
-  np.savez(tmp, **{k: np.asarray(v, np.float32) for k, v in arrays.items()})
-  os.replace(tmp, path)
+    named |= {f"kernel{i}": kernel, f"bias{i}": bias}
+  arrays.write(path, {k: np.asarray(v, np.float32) for k, v in named.items()})
 
 
 def load(path: str | os.PathLike) -> Policy:
   """Reads what `save` wrote."""
   try:
-    with np.load(path, allow_pickle=False) as z:
-      layers = tuple(
-        (jnp.asarray(z[f"kernel{i}"]), jnp.asarray(z[f"bias{i}"]))
-        for i in range(sum(k.startswith("kernel") for k in z))
-      )
-      return Policy(jnp.asarray(z["mean"]), jnp.asarray(z["std"]), layers)
-  except (OSError, KeyError, ValueError, zipfile.BadZipFile) as e:
+    z = {k: jnp.asarray(v) for k, v in arrays.read(path).items()}
+    count = sum(k.startswith("kernel") for k in z)
+    layers = tuple((z[f"kernel{i}"], z[f"bias{i}"]) for i in range(count))
+    return Policy(z["mean"], z["std"], layers)
+  except (FileError, KeyError, TypeError) as e:
     raise FileError(f"cannot read demonstrator {path}: {e}") from None
 
 
@@ -214,18 +210,16 @@ def train(
         "seconds": round(time.monotonic() - start, 1),
       }
     )
-    tmp = out / "curve.json.tmp"
-    tmp.write_text(json.dumps(rows, indent=1))
-    os.replace(tmp, out / "curve.json")
+    text = json.dumps(rows, indent=1)
+    folders.atomic(out / "curve.json", lambda file: file.write(text.encode()))
     progress(rows[-1])
 
   def on_params(step, _, params):
     from flax import serialization
 
     save(out / f"policy_{done + int(step):09d}.npz", _to_policy(params))
-    tmp = out / "latest.msgpack.tmp"
-    tmp.write_bytes(serialization.to_bytes(jax.device_get(params)))
-    os.replace(tmp, out / "latest.msgpack")
+    state = serialization.to_bytes(jax.device_get(params))
+    folders.atomic(out / "latest.msgpack", lambda file: file.write(state))
 
   ppo.train(
     environment=adapter,
@@ -249,9 +243,6 @@ def train(
 
 def main() -> None:
   """Python -m mjx_cl.training.demonstrator ENV --out DIR --steps N --seed N --resume"""
-  from mjx_cl import envs
-  from mjx_cl.io import runtime
-
   runtime.setup()
   parser = argparse.ArgumentParser(
     prog="python -m mjx_cl.training.demonstrator",

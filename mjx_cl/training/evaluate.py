@@ -9,6 +9,7 @@ import numpy as np
 from mjx_cl import faults
 from mjx_cl.rollout.scan import Rollout, nest, start
 from mjx_cl.scoring import intervals
+from mjx_cl.training.episodes import Episodes
 
 
 def evaluate(
@@ -78,26 +79,16 @@ def live(env, rollout, agent, params, episodes: int, seed: int, drive: bool = Fa
   streams = nest(lambda k: start(env, agent, rollout.fault, k), 0, 0)(keys)
   params = jax.tree.map(lambda x: x[None], params)
   measure = jax.jit(nest(env.measure, 0, 0)) if hasattr(env, "measure") else None
-  total, steps, alive, ended = (
-    np.zeros(episodes),
-    np.zeros(episodes),
-    np.ones(episodes, bool),
-    np.zeros(episodes, bool),
-  )
+  lived, steps = Episodes((1, episodes)), np.zeros(episodes)
   sums: dict[str, np.ndarray] = {}
-  while alive.any():
+  while lived.alive.any():
     streams, rows = rollout.chunk(
       params, streams, 50 if measure is None else 1, jnp.full((1, episodes), drive)
     )
-    reward, terminated, done = (
-      np.asarray(x)[:, 0] for x in (rows.reward, rows.terminated, rows.terminated | rows.truncated)
-    )
-    for r, t, d in zip(reward, terminated, done):
-      total += r * alive
-      ended |= t & alive
-      alive = alive & ~d
+    lived.add(rows)
     if measure is not None:
+      alive = lived.alive[0]
       steps += alive
       for name, value in measure(streams.env).items():
         sums[name] = sums.get(name, 0.0) + np.asarray(value)[0] * alive
-  return total, steps, sums, ended
+  return lived.total[0], steps, sums, lived.ended[0]

@@ -24,10 +24,10 @@ from mjx_cl.dreamer import replay as replay_lib
 from mjx_cl.dreamer.agent import CAUSES, EXPLODED, Agent, TrainState, Weights, culprit
 from mjx_cl.errors import FileError, UserError, choose
 from mjx_cl.faults import presets
-from mjx_cl.io import checkpoints, memory, runtime
+from mjx_cl.io import checkpoints, folders, runtime, tables
 from mjx_cl.io.interrupt import Interruptible
 from mjx_cl.rollout.scan import Rollout, Stream, nest, records, start
-from mjx_cl.training import demonstrator
+from mjx_cl.training import agents, demonstrator, episodes, evaluate, needs
 
 DEMONSTRATOR_STEPS = 8_000_000
 FAULT = 11  # folded into a stream's key for the draw of its faults
@@ -238,8 +238,6 @@ def check(env, dreamer: DreamerConfig, config: TrainConfig, agent_name: str | No
     UserError. Size, bins and obs_scale decide what weights mean, repeat what an action does; what
     else differs a training may change.
   """
-  from mjx_cl.training import agents
-
   for var in env.spec.act:
     if (var.low, var.high) != (-1, 1):
       raise UserError(
@@ -288,24 +286,6 @@ def scaled(env, dreamer: DreamerConfig) -> DreamerConfig:
   )
 
 
-class Returns:
-  """Returns of finished episodes, per stream, from chunks of rewards."""
-
-  def __init__(self, shape):
-    self.sums = np.zeros(shape)
-
-  def add(self, rows) -> list[tuple[tuple[int, int], float]]:
-    """Rows of a chunk -> [((group, member), return)] of the episodes that ended in it."""
-    reward, done = np.asarray(rows.reward), np.asarray(rows.terminated | rows.truncated)
-    ended = []
-    for r, d in zip(reward, done):
-      self.sums += r
-      for at in zip(*np.nonzero(d)):
-        ended.append((tuple(int(i) for i in at), float(self.sums[at])))
-        self.sums[at] = 0.0
-    return ended
-
-
 class Trainer:
   """Pretrains `seeds` agents on one environment.
 
@@ -333,7 +313,7 @@ class Trainer:
     spec = env.spec
     self.plain = Agent(dreamer, len(spec.obs), len(spec.act))
     self.mesh = seeds_mesh(seeds)
-    memory.check(
+    needs.check(
       dreamer.size,
       len(spec.obs),
       len(spec.act),
@@ -378,7 +358,7 @@ class Trainer:
     )
     replay = jax.tree.map(lambda x: jnp.broadcast_to(x, (seeds,) + x.shape).copy(), empty)
     self.state = self._place(Learner(train, streams, replay, key))
-    self.returns = Returns((seeds, config.envs))
+    self.returns = episodes.Returns((seeds, config.envs))
     self._add = jax.jit(jax.vmap(replay_lib.add), donate_argnums=0)
     self._redraw = jax.jit(nest(self._new_fault, 0, 0))
     self.checkpoints = checkpoints.Checkpoints(self.out / "checkpoints")
@@ -624,15 +604,11 @@ class Trainer:
       self.checkpoints.save(self.chunks, self.state, meta)
 
   def write_metrics(self) -> None:
-    import pyarrow
-    import pyarrow.parquet
-
+    """Writes OUT/metrics.parquet, a row a chunk."""
     if self.rows:
       names = sorted(set().union(*self.rows))
-      table = pyarrow.table({n: pyarrow.array([r.get(n) for r in self.rows]) for n in names})
-      tmp = self.out / "metrics.parquet.tmp"
-      pyarrow.parquet.write_table(table, tmp)
-      os.replace(tmp, self.out / "metrics.parquet")
+      columns = {n: [r.get(n) for r in self.rows] for n in names}
+      tables.write_table(self.out / "metrics.parquet", columns)
 
   def resume(self) -> None:
     """Goes on from the newest checkpoint.
@@ -641,8 +617,6 @@ class Trainer:
       FileError where no checkpoint can be read, or it or metrics.parquet is not a training's; the
       trainer is as before then.
     """
-    from mjx_cl.io import tables
-
     path = self.out / "metrics.parquet"
     rows = tables.read_arrow(path).to_pylist() if path.exists() else []
     state, meta = self.checkpoints.load(self.state)
@@ -694,9 +668,6 @@ def build(
   """A Trainer with its folder and config.json; trains the demonstrator first where
   `demonstrator_name` is `ppo`.
   """
-  from mjx_cl.io import tables
-  from mjx_cl.training import agents
-
   out = pathlib.Path(out)
   config = shown(config, out, demonstrator_name)
   if demonstrator_name == "ppo":
@@ -726,7 +697,7 @@ def build(
     "train": dataclasses.asdict(config),
     "started_from": agent_name,
   }
-  values = {"command": "train", "seeds": seeds, **trainer.about, **tables.provenance()}
+  values = {"command": "train", "seeds": seeds, **trainer.about, **runtime.provenance()}
   if resume and trainer.checkpoints.latest() is not None:
     trainer.resume()
     tables.write_json(out / "config.json", values)  # `updates` may have grown
@@ -808,7 +779,7 @@ def check_same(
       else names[0].name == names[1].name
     ):
       before[key] = now[key]
-  changed = [k for k in now if k != "updates" and before.get(k) != now[k]]
+  changed = folders.differing(before, now, ("updates",))
   if changed:
     raise UserError(
       f"--resume: {out} was begun with another {', '.join(changed)}; give the same settings, "
@@ -828,20 +799,15 @@ def clear(out: pathlib.Path) -> None:
     path.unlink()
 
 
-def export(trainer: Trainer, episodes: int = 20) -> dict:
+def export(trainer: Trainer, count: int = 20) -> dict:
   """Writes OUT/agent of the first seed that has not failed: weights, moments, counters, and the
   card with its returns. Returns the card.
   """
-  from mjx_cl.io import tables
-  from mjx_cl.training import agents, evaluate
-
   sound = min(set(range(trainer.seeds)) - set(trainer.failed))
   train = jax.tree.map(lambda x: jax.device_put(x[sound], jax.devices()[0]), trainer.state.train)
   scores = {
     "first_seed": 0,
-    **evaluate.evaluate(
-      trainer.env, trainer.plain, train.params, episodes, 0, trainer.config.repeat
-    ),
+    **evaluate.evaluate(trainer.env, trainer.plain, train.params, count, 0, trainer.config.repeat),
   }
   phases: dict[str, dict] = {}
   for row in trainer.rows:
@@ -864,7 +830,7 @@ def export(trainer: Trainer, episodes: int = 20) -> dict:
     "phases": phases,
     "demonstrator_return": trainer.expert_return or None,
     "eval": scores,
-    **tables.provenance(),
+    **runtime.provenance(),
   }
   agents.save(trainer.out / "agent", train, card)
   return card

@@ -16,6 +16,7 @@ import pyarrow.parquet
 import pytest
 import quick
 
+from mjx_cl.io import tables
 from mjx_cl import envs
 from mjx_cl.adapt import phase as phase_lib
 from mjx_cl.adapt.arms import ARMS, FOREVER
@@ -667,8 +668,8 @@ def lived(tiny, tmp_path_factory):
   }
   stops = agent.with_name("stops")
   stops.mkdir()
-  run.store.write_json(stops / "config.json", {"env": "walker", "onset": FAULT, "adapt": {}})
-  run.store.write_table(
+  tables.write_json(stops / "config.json", {"env": "walker", "onset": FAULT, "adapt": {}})
+  tables.write_table(
     stops / "snapshots.parquet",
     {"seed": [SEED] * 3, "since_start": [20, 148, 212], "reward_mean": [0.1, 0.99, 1.0]},
   )
@@ -690,7 +691,7 @@ def lived(tiny, tmp_path_factory):
       runner = run.Runner(config, out)
       out.mkdir(exist_ok=True)
       runner.open()
-      run.store.write_json(out / "config.json", runner.config_dict())
+      tables.write_json(out / "config.json", runner.config_dict())
       for _ in range(cut):
         runner.step()
       runner.save()
@@ -889,11 +890,11 @@ def test_an_arm_with_an_agent_of_its_own(lived):
   np.testing.assert_allclose(mine["reward"][:50], same["reward"][:50], atol=1e-3)
   assert np.abs(np.subtract(mine["reward"][:50], first["reward"][:50])).max() > 0.02
   assert (
-    "randomised" in {r["arm"] for r in normalised_recovery.of_folders(whole)}
-    and len({r["reward_none"] for r in normalised_recovery.of_folders(whole)}) == 1
+    "randomised" in {r["arm"] for r in normalised_recovery.rows(tables.read_rows(whole / "runs.parquet"))}
+    and len({r["reward_none"] for r in normalised_recovery.rows(tables.read_rows(whole / "runs.parquet"))}) == 1
   )
   assert (
-    normalised_recovery.of_folders(whole)[0]["reward_none"]
+    normalised_recovery.rows(tables.read_rows(whole / "runs.parquet"))[0]["reward_none"]
     == columns(whole, "runs", "none")["reward_final"][0]
   )
 

@@ -13,8 +13,7 @@ import pyarrow.parquet
 import pytest
 
 from mjx_cl.errors import FileError, UserError
-from mjx_cl.io import tables
-from mjx_cl.runs import workers
+from mjx_cl.io import folders, runtime, tables
 
 TABLE = {
   "a": np.array([1.5, np.nan, 3.0], np.float32),
@@ -81,8 +80,8 @@ def test_a_full_disk_leaves_the_earlier_file(tmp_path, monkeypatch, kind, where)
   if where == "rename":
     monkeypatch.setattr(os, "replace", full)
   else:
-    atomic = tables.atomic
-    monkeypatch.setattr(tables, "atomic", lambda path, write: atomic(path, half_written))
+    atomic = folders.atomic
+    monkeypatch.setattr(folders, "atomic", lambda path, write: atomic(path, half_written))
   with pytest.raises(FileError) as error:
     write(2)
   text = one_line(error)
@@ -417,7 +416,7 @@ def test_query_on_the_command_line(tree, capsys):
 
 
 def claim(out, resume=False, overwrite=False):
-  return tables.claim_folder(out, resume, overwrite)
+  return folders.claim_folder(out, resume, overwrite)
 
 
 @pytest.mark.parametrize("flags", [{}, {"resume": True}, {"overwrite": True}])
@@ -502,13 +501,13 @@ def test_json_that_is_no_object_is_one_line(tmp_path, text, says):
 
 
 def test_a_folder_is_probed_before_what_goes_there_is_computed(tmp_path):
-  tables.probe(tmp_path / "a/b")
+  folders.probe(tmp_path / "a/b")
   assert list((tmp_path / "a/b").iterdir()) == []
   (tmp_path / "file").write_text("")
   with pytest.raises(UserError, match="is a file"):
-    tables.probe(tmp_path / "file")
+    folders.probe(tmp_path / "file")
   with pytest.raises(FileError, match="another --out"):
-    tables.probe(tmp_path / "file/below")
+    folders.probe(tmp_path / "file/below")
 
 
 def test_claim_refuses_a_file_and_both_flags(tmp_path):
@@ -528,21 +527,21 @@ def test_claim_that_cannot_make_the_folder(tmp_path, monkeypatch):
 
 def test_a_long_process_names_the_commit_that_it_began_with(monkeypatch):
   """Commits may come while it runs, and it has loaded none of them."""
-  first = tables.provenance()["git_commit"]
+  first = runtime.provenance()["git_commit"]
   monkeypatch.setattr(
-    tables.subprocess, "run", lambda *a, **k: types.SimpleNamespace(stdout="another\n")
+    runtime.subprocess, "run", lambda *a, **k: types.SimpleNamespace(stdout="another\n")
   )
-  assert tables.provenance()["git_commit"] == first
-  tables._commit.cache_clear()
-  assert tables.provenance()["git_commit"] == "another"
-  tables._commit.cache_clear()
+  assert runtime.provenance()["git_commit"] == first
+  runtime._commit.cache_clear()
+  assert runtime.provenance()["git_commit"] == "another"
+  runtime._commit.cache_clear()
 
 
 def test_provenance_names_versions_and_machine():
   import jax
 
-  value = tables.provenance()
+  value = runtime.provenance()
   assert value["versions"]["jax"] == jax.__version__ and value["machine"]["cores"] == len(
-    workers.cores()
+    runtime.cores()
   )
   json.dumps(value, allow_nan=False)

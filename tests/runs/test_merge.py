@@ -15,7 +15,9 @@ from test_cli import mjx, refused  # noqa: F401  fixtures
 
 from mjx_cl.runs import suite as bench, records, merge
 from mjx_cl.io import tables
+from mjx_cl.config import RunConfig
 from mjx_cl.errors import FileError, UserError
+from mjx_cl.training import agents
 
 RESULTS = pathlib.Path(__file__).parents[2] / "results"
 RUNS = {
@@ -291,3 +293,20 @@ def test_bench_joins_and_publishes(mjx, refused, tmp_path):  # noqa: F811
     (arm, seed) for arm in ("oracle", "oracle-budget", "none") for seed in range(4)
   ]
   assert np.isfinite([r["reward_final"] for r in rows]).all()
+
+
+@pytest.mark.parametrize("broken", ["agent.npz", "card.json"])
+def test_a_broken_agent_is_said_and_no_agent_is_none(tmp_path, broken):
+  """Damage is no agent that was moved: nothing is known of how the run differs."""
+  config = RunConfig("walker", agent=str(tmp_path / "own"))
+  assert merge.cards(config) == {}
+  shutil.copytree(agents.HERE / "walker", tmp_path / "own")
+  assert merge.cards(config)["agent_card"]["env"] == "walker"
+  merge._cards.cache_clear()
+  file = tmp_path / "own" / broken
+  file.write_bytes(file.read_bytes()[:-100])
+  with pytest.raises(FileError, match=broken):
+    merge.cards(config)
+  part = bench.Part("x", config)
+  with pytest.raises(FileError, match=f"^part x: .*{broken}"):
+    bench.check(part)

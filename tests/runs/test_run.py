@@ -25,6 +25,7 @@ from mjx_cl.training import agents
 from mjx_cl.cli import app, commands
 from mjx_cl import envs
 from mjx_cl.render import figures
+from mjx_cl.scoring import events
 from mjx_cl.runs import run, workers
 from mjx_cl.io import tables
 from mjx_cl.config import AdaptConfig, RunConfig
@@ -187,7 +188,7 @@ def test_all_files_are_there_with_their_columns(whole):
     "value_loss",
     "updates",
   ]
-  assert {"stream", "step", "kind", "reason", "fault"} <= set(table(out, "events"))
+  assert list(table(out, "events")) == list(events.COLUMNS)
   assert {
     "arm",
     "onset",
@@ -574,7 +575,7 @@ def test_an_alarm_behind_the_last_step_starts_nothing(saved, tmp_path):
   )
   run.execute(config(128), tmp_path / "whole")
   events = table(tmp_path / "whole", "events")
-  (since,) = [int(r.split()[-1]) for k, r in zip(events["kind"], events["reason"]) if k == "start"]
+  (since,) = [s for k, s in zip(events["kind"], events["since"]) if k == "start"]
   assert since > 100
   run.execute(config(since), tmp_path / "cut")
   events, rows = table(tmp_path / "cut", "events"), table(tmp_path / "cut", "runs")

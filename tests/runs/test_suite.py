@@ -2,7 +2,6 @@
 merged.
 """
 
-import contextlib
 import dataclasses
 import json
 import pathlib
@@ -18,7 +17,7 @@ from test_transfer import agent, saved  # noqa: F401  fixtures: a tiny agent of 
 
 from mjx_cl.runs import suite as bench, merge, run
 from mjx_cl.render import figures
-from mjx_cl.io import tables
+from mjx_cl.io import folders, tables
 from mjx_cl.adapt.arms import ARMS, NEVER
 from mjx_cl.config import AdaptConfig, RunConfig
 from mjx_cl.errors import FileError, UserError
@@ -569,7 +568,7 @@ def test_an_agent_by_folder_is_read_anew_when_it_is_written_anew(saved, tmp_path
   config = RunConfig("car", agent=str(folder))
   first = merge.cards(config)["agent_card"]
   (folder / "card.json").write_text(json.dumps(first | {"seed": 5}))
-  assert merge.changed_keys(merge.cards(config)["agent_card"], first) == ["seed"]
+  assert folders.differing(merge.cards(config)["agent_card"], first, deep=True) == ["seed"]
 
 
 @pytest.mark.parametrize(
@@ -874,14 +873,7 @@ def test_the_time_left_follows_what_parts_took(tmp_path, monkeypatch):
 
   monkeypatch.setattr(run, "execute", lived)
   expected = {n: bench.Estimate(1, 1, 0.0, 600.0, 0) for n in "abc"}
-  bench.execute(
-    plan,
-    tmp_path,
-    plan.parts,
-    expected,
-    said.append,
-    lambda: contextlib.nullcontext(lambda p: None),
-  )
+  bench.execute(plan, tmp_path, plan.parts, expected, said.append)  # with no display
   assert [s.split("about ")[1] for s in said] == ["30 min left", "40 min left", "20 min left"]
 
 

@@ -82,7 +82,11 @@ def test_side_by_side_is_as_one_after_the_other(mjx, refused, mini, tmp_path, mo
   bench.write_plan(plan, tmp_path / "one")
   monkeypatch.setattr(workers, "cores", lambda: own[-1:])
   workers.together(
-    tmp_path / "one", [p.name for p in bench.pick(plan.parts, ("grip",))], 1, lambda name: None
+    WORKER,
+    tmp_path / "one",
+    [p.name for p in bench.pick(plan.parts, ("grip",))],
+    1,
+    lambda name: None,
   )
   bench.collect(tmp_path / "one", plan)
   one, two = (
@@ -100,6 +104,8 @@ def test_side_by_side_is_as_one_after_the_other(mjx, refused, mini, tmp_path, mo
     else:
       assert values == two[name], name
 
+
+WORKER = "mjx_cl.cli.worker"
 
 TWO = """import sys
 from mjx_cl.cli import app as cli
@@ -144,13 +150,13 @@ def test_one_that_fails_is_named_and_none_goes_on(long, tmp_path, monkeypatch):
   value["parts"]["healthy"]["agent"] = str(tmp_path / "nowhere")
   tables.write_json(tmp_path / "suite.json", value)
   with pytest.raises(UserError, match="^part healthy: no agent .*nowhere"):
-    workers.together(tmp_path, ["grip/severity=0.5", "healthy"], 2, ended.append)
+    workers.together(WORKER, tmp_path, ["grip/severity=0.5", "healthy"], 2, ended.append)
   assert ended == [] and not psutil.Process().children()
 
 
 def test_a_worker_that_is_killed_is_said(mini, tmp_path):  # noqa: F811
   bench.write_plan(bench.suite(str(mini)), tmp_path)
-  worker = workers.Worker(tmp_path, "healthy", 0, [], lambda text: None)
+  worker = workers.Worker(WORKER, tmp_path, "healthy", 0, [], lambda text: None)
   worker.process.kill()
   worker.process.wait()
   with pytest.raises(FileError, match="healthy was ended by signal 9.*the same command goes on"):

@@ -1,11 +1,7 @@
 """Normalised recovery by hand sums: five seeds, four arms."""
 
-import json
-
 import pytest
 
-from mjx_cl.errors import FileError, UserError
-from mjx_cl.io import tables
 from mjx_cl.scoring import normalised_recovery
 
 PRE = {0: 1.0, 1: 0.8, 2: 1.0, 3: 1.0, 4: None}
@@ -134,36 +130,3 @@ def test_aggregates_and_the_paired_difference():
     "difference_ci": None,
     "holds_zero": None,
   }
-
-
-def folder(at, runs, **config):
-  at.mkdir()
-  tables.write_table(at / "runs.parquet", {k: [r[k] for r in runs] for k in runs[0]})
-  (at / "config.json").write_text(
-    json.dumps(
-      {"env": "walker", "severity": 0.5, "arms": list(dict.fromkeys(r["arm"] for r in runs))}
-      | config
-    )
-  )
-  return at
-
-
-def test_from_folders(tmp_path):
-  own = folder(tmp_path / "own", run(), steps=25_000)
-  assert normalised_recovery.of_folders(own) == normalised_recovery.rows(run())
-  expert = folder(
-    tmp_path / "expert",
-    run({"always": FINAL["oracle"], "scratch": FINAL["oracle"], "oracle-budget": EXPERT}),
-    steps=55_000,
-  )  # an expert may take longer
-  assert by(normalised_recovery.of_folders(own, expert))["detector", 0][
-    "normalised"
-  ] == pytest.approx(0.625)
-  for name, runs, more, words in (
-    ("a", run(), {"severity": 0.7}, "another severity"),
-    ("b", run({"none": FINAL["none"]}), {}, "no arm that starts"),
-  ):
-    with pytest.raises(UserError, match=words):
-      normalised_recovery.of_folders(own, folder(tmp_path / name, runs, steps=25_000, **more))
-  with pytest.raises(FileError, match="no finished run"):
-    normalised_recovery.of_folders(tmp_path / "nowhere")

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import pathlib
 from typing import NamedTuple
 
@@ -21,6 +20,7 @@ from mjx_cl import envs
 from mjx_cl.config import DreamerConfig
 from mjx_cl.dreamer.agent import Agent, TrainState
 from mjx_cl.errors import FileError, UserError
+from mjx_cl.io import arrays, folders
 
 HERE = pathlib.Path(__file__).parent
 _HALF = "|bfloat16"  # suffix of a moment that is stored as the upper half of its float32
@@ -42,31 +42,22 @@ def shipped() -> list[str]:
   return sorted(p.parent.name for p in HERE.glob("*/card.json"))
 
 
-def _flatten(train: TrainState) -> dict[str, jax.Array]:
-  return {
-    jax.tree_util.keystr(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(train)
-  }
-
-
 def save(folder, train: TrainState, card: dict) -> None:
   """Writes an agent of one seed: parameters and counters in full, optimiser moments as bfloat16
   (they only steer step sizes).
   """
   folder = pathlib.Path(folder)
   folder.mkdir(parents=True, exist_ok=True)
-  arrays = {}
-  for name, leaf in _flatten(train).items():
+  stored = {}
+  for name, leaf in arrays.named(train).items():
     leaf = np.asarray(leaf)
     if name.startswith(".opt") and leaf.dtype == np.float32 and leaf.ndim:
-      arrays[name + _HALF] = leaf.astype(ml_dtypes.bfloat16).view(np.uint16)
+      stored[name + _HALF] = leaf.astype(ml_dtypes.bfloat16).view(np.uint16)
     else:
-      arrays[name] = leaf
-  tmp = folder / "agent.tmp.npz"
-  np.savez_compressed(tmp, **arrays)
-  os.replace(tmp, folder / "agent.npz")
-  tmp = folder / "card.json.tmp"
-  tmp.write_text(json.dumps(card, indent=1) + "\n")
-  os.replace(tmp, folder / "card.json")
+      stored[name] = leaf
+  arrays.write(folder / "agent.npz", stored, small=True)
+  text = json.dumps(card, indent=1) + "\n"
+  folders.atomic(folder / "card.json", lambda file: file.write(text.encode()))
 
 
 def of(env, path: str | None = None, **departures) -> Trained:
@@ -132,20 +123,11 @@ def load(
   config = dataclasses.replace(config, **{k: v for k, v in departures.items() if v is not None})
   agent = Agent(config, obs_size, act_size)
   like = jax.eval_shape(agent.init, jax.random.key(0))
-  try:
-    with np.load(folder / "agent.npz", allow_pickle=False) as z:
-      arrays = {k: z[k] for k in z.files}
-  except Exception as e:  # zipfile, zlib and numpy each raise their own kind for a truncated file
-    raise FileError(
-      f"cannot read {folder / 'agent.npz'}: "
-      f"{str(e).splitlines()[0] if str(e) else type(e).__name__}"
-    ) from None
-  leaves = []
-  for leaf_path, want in jax.tree_util.tree_leaves_with_path(like):
-    key = jax.tree_util.keystr(leaf_path)
-    value = arrays.get(key)
-    if value is None and key + _HALF in arrays:
-      value = arrays[key + _HALF].view(ml_dtypes.bfloat16).astype(np.float32)
+  stored, leaves = arrays.read(folder / "agent.npz"), []
+  for key, want in arrays.named(like).items():
+    value = stored.get(key)
+    if value is None and key + _HALF in stored:
+      value = stored[key + _HALF].view(ml_dtypes.bfloat16).astype(np.float32)
     if value is None or value.shape != want.shape:
       raise FileError(
         f"{folder / 'agent.npz'} does not fit size {config.size} with {obs_size} observations "

@@ -12,6 +12,7 @@ from mjx_cl.dreamer import replay
 from mjx_cl.dreamer.agent import Agent
 from mjx_cl.errors import UserError
 from mjx_cl.io import memory, runtime
+from mjx_cl.training import needs
 
 OBS, ACT = 24, 6
 
@@ -28,7 +29,7 @@ def bytes_of(tree):
 def test_need_is_what_is_allocated():
   dreamer = PRESETS["tiny"].dreamer
   agent, size = Agent(dreamer, OBS, ACT), Agent(dreamer, OBS, ACT).size
-  need = memory.need("tiny", OBS, ACT, 4 * 100, dreamer.bins)
+  need = needs.need("tiny", OBS, ACT, 4 * 100, dreamer.bins)
   empty = jax.eval_shape(lambda: replay.init(4, 100, OBS, ACT, size.deter, size.stoch))
   assert need.record == bytes_of(empty.data) // 400 and need.replay == bytes_of(empty.data)
   state = jax.eval_shape(agent.init, jax.random.key(0))
@@ -39,7 +40,7 @@ def test_need_is_what_is_allocated():
 
 def test_the_number_that_is_named_fits_and_the_next_does_not(monkeypatch):
   monkeypatch.setattr(memory, "free", lambda: int((memory.PROCESS + 200 * 2**20) / memory.MARGIN))
-  ask = lambda capacity: memory.check(
+  ask = lambda capacity: needs.check(
     "size1m", OBS, ACT, 8 * capacity, 3, ("capacity", lambda n: 8 * n)
   )
   with pytest.raises(
@@ -51,13 +52,13 @@ def test_the_number_that_is_named_fits_and_the_next_does_not(monkeypatch):
   ask(fits)
   with pytest.raises(UserError):
     ask(fits + 1)
-  assert ask(fits).replay == 8 * fits * memory.need("size1m", OBS, ACT, 1).record
+  assert ask(fits).replay == 8 * fits * needs.need("size1m", OBS, ACT, 1).record
 
 
 def test_weights_that_do_not_fit_are_said_so(monkeypatch):
   monkeypatch.setattr(memory, "free", lambda: 2**20)
   with pytest.raises(UserError, match="not even capacity=1 fits"):
-    memory.check("size12m", OBS, ACT, 10, 1, ("capacity", lambda n: n))
+    needs.check("size12m", OBS, ACT, 10, 1, ("capacity", lambda n: n))
 
 
 def test_an_accelerator_holds_weights_and_replays_alone(monkeypatch):
@@ -65,14 +66,14 @@ def test_an_accelerator_holds_weights_and_replays_alone(monkeypatch):
   monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
   assert memory.resident(2**30) == 2**30
   assert runtime.seeds_by() == "vmap"
-  need = memory.need("size1m", OBS, ACT, 1000)
+  need = needs.need("size1m", OBS, ACT, 1000)
   for short in (0, 2):  # all seeds are at work at once: twice the weights of each
     monkeypatch.setattr(
       memory,
       "free",
       lambda: int((3 * (2 * need.weights + need.replay) - short) / memory.MARGIN) + 1,
     )
-    ask = lambda: memory.check("size1m", OBS, ACT, 1000, 3, ("capacity", lambda n: n))
+    ask = lambda: needs.check("size1m", OBS, ACT, 1000, 3, ("capacity", lambda n: n))
     if short:
       with pytest.raises(UserError):
         ask()
@@ -80,21 +81,21 @@ def test_an_accelerator_holds_weights_and_replays_alone(monkeypatch):
       ask()
   monkeypatch.setattr(memory, "free", lambda: 200 * 2**20)
   with pytest.raises(UserError) as e:
-    memory.check("size1m", OBS, ACT, 10**7, 3, ("capacity", lambda n: n))
+    needs.check("size1m", OBS, ACT, 10**7, 3, ("capacity", lambda n: n))
   fits = int(re.search(r"capacity=([\d,]+) would fit", str(e.value))[1].replace(",", ""))
-  memory.check("size1m", OBS, ACT, fits, 3, ("capacity", lambda n: n))
+  needs.check("size1m", OBS, ACT, fits, 3, ("capacity", lambda n: n))
   with pytest.raises(UserError):
-    memory.check("size1m", OBS, ACT, fits + 1, 3, ("capacity", lambda n: n))
+    needs.check("size1m", OBS, ACT, fits + 1, 3, ("capacity", lambda n: n))
 
 
 def test_devices_share_the_seeds(monkeypatch):
-  need = memory.need("size1m", OBS, ACT, 1000)
+  need = needs.need("size1m", OBS, ACT, 1000)
   monkeypatch.setattr(
     memory, "free", lambda: int(memory.resident(need.total(2)) / memory.MARGIN) + 2
   )
-  memory.check("size1m", OBS, ACT, 1000, 4, ("capacity", lambda n: n), shards=2)
+  needs.check("size1m", OBS, ACT, 1000, 4, ("capacity", lambda n: n), shards=2)
   with pytest.raises(UserError):
-    memory.check("size1m", OBS, ACT, 1000, 4, ("capacity", lambda n: n))
+    needs.check("size1m", OBS, ACT, 1000, 4, ("capacity", lambda n: n))
 
 
 def test_trainer_and_runner_refuse_before_they_allocate(monkeypatch, short_walker, tmp_path):
@@ -175,8 +176,8 @@ def test_what_is_free_is_the_less_of_machine_and_container(monkeypatch):
 
 
 def test_what_is_held_already_need_not_be_free(monkeypatch):
-  need = memory.resident(memory.need("size1m", OBS, ACT, 1000).total(1))
-  ask = lambda: memory.check("size1m", OBS, ACT, 1000, 1, ("capacity", lambda n: n))
+  need = memory.resident(needs.need("size1m", OBS, ACT, 1000).total(1))
+  ask = lambda: needs.check("size1m", OBS, ACT, 1000, 1, ("capacity", lambda n: n))
   monkeypatch.setattr(memory, "free", lambda: int(0.5 * need / memory.MARGIN))
   with pytest.raises(UserError):
     ask()
@@ -187,9 +188,9 @@ def test_what_is_held_already_need_not_be_free(monkeypatch):
 
 
 def test_table_has_every_size():
-  table = memory.table()
+  table = needs.table()
   assert (
-    list(table) == list(memory.SIZES)
+    list(table) == list(needs.SIZES)
     and "640,867 parameters" in table["size1m"]
     and "1,208 bytes a record" in table["size1m"]
   )

@@ -1,0 +1,50 @@
+"""Arrays in .npz files: a tree's leaves by the names of their paths; nothing is ever unpickled."""
+
+from __future__ import annotations
+
+import os
+import zipfile
+import zlib
+from collections.abc import Mapping
+
+import jax
+import numpy as np
+
+from mjx_cl.errors import FileError
+from mjx_cl.io import folders
+
+
+def named(tree) -> dict[str, object]:
+  """Path -> leaf of a tree, in the order of its leaves."""
+  return {
+    jax.tree_util.keystr(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(tree)
+  }
+
+
+def write(path: str | os.PathLike, arrays: Mapping[str, object], small: bool = False) -> None:
+  """Writes arrays by name, whole or not at all.
+
+  Args:
+    path: of the .npz file.
+    arrays: name -> what NumPy makes an array of.
+    small: whether they are compressed.
+
+  Raises:
+    FileError where the disk is full or the folder refuses; what was at `path` stays.
+  """
+  save = np.savez_compressed if small else np.savez
+  folders.atomic(path, lambda file: save(file, **{k: np.asarray(v) for k, v in arrays.items()}))
+
+
+def read(path: str | os.PathLike) -> dict[str, np.ndarray]:
+  """Arrays of an .npz file by name.
+
+  Raises:
+    FileError where there is none or it is broken.
+  """
+  try:
+    with np.load(path, allow_pickle=False) as z:
+      return {k: z[k] for k in z.files}
+  except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error) as e:
+    why = (str(e).splitlines() or [""])[0] or type(e).__name__
+    raise FileError(f"cannot read {path}: {why}") from None

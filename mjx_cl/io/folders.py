@@ -1,0 +1,154 @@
+"""Folders of results: files written whole or not at all, and who may write where."""
+
+from __future__ import annotations
+
+import os
+import pathlib
+import re
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from typing import BinaryIO
+
+from mjx_cl.errors import FileError, UserError
+
+
+def atomic(path: str | os.PathLike, write: Callable[[BinaryIO], object]) -> None:
+  """Calls `write` with a binary file of a temporary name and renames it to `path`.
+
+  Raises:
+    FileError where the disk is full or the folder refuses; what was at `path` stays.
+  """
+  path = pathlib.Path(path)
+  tmp = path.with_name(path.name + ".tmp")
+  try:
+    with open(tmp, "wb") as file:
+      write(file)
+    os.replace(tmp, path)
+  except OSError as e:
+    tmp.unlink(missing_ok=True)
+    raise FileError(
+      f"cannot write {path}: {e.strerror or e}; what was there is unchanged"
+    ) from None
+
+
+def make(folder: pathlib.Path) -> None:
+  """Makes a folder, and those that it lies in; FileError where that is refused."""
+  try:
+    folder.mkdir(parents=True, exist_ok=True)
+  except OSError as e:
+    raise FileError(f"cannot make {folder}: {e.strerror}") from None
+
+
+def probe(out: str | os.PathLike) -> None:
+  """Makes the folder `out` and refuses one that cannot be written to, before what goes there is
+  computed. An empty folder that was not there is left.
+  """
+  if not str(out):
+    raise UserError("--out is a folder; got an empty name")
+  out = pathlib.Path(out)
+  if out.exists() and not out.is_dir():
+    raise UserError(f"--out {out} is a file")
+  try:
+    out.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryFile(dir=out):
+      pass
+  except OSError as e:
+    raise FileError(f"cannot write in {out}: {e.strerror or e}; give another --out") from None
+
+
+def differing(
+  old: Mapping,
+  new: Mapping,
+  skip: Sequence[str] = (),
+  defaults: Mapping | None = None,
+  deep: bool = False,
+) -> list[str]:
+  """In which settings two runs, trainings or agents differ.
+
+  Args:
+    old: what one of them says of itself.
+    new: what the other says; its keys count, in their order.
+    skip: keys that may differ.
+    defaults: what holds where `old` lacks a key; None where they lack it too.
+    deep: whether of a table in both its own keys are named, as `adapt.ratio`.
+  """
+  found = []
+  for key in (k for k in new if k not in skip):
+    before = old.get(key, (defaults or {}).get(key))
+    if deep and isinstance(before, Mapping) and isinstance(new[key], Mapping):
+      found += [f"{key}.{below}" for below in differing(before, new[key], deep=True)]
+    elif before != new[key]:
+      found.append(key)
+  return found
+
+
+# what a run or training leaves beside config.json
+RESULTS = (
+  "trace.parquet",
+  "events.parquet",
+  "runs.parquet",
+  "residuals.parquet",
+  "summary.json",
+  "figure.png",
+  "metrics.parquet",
+  "signals.parquet",
+  "snapshots.parquet",
+  "stop.parquet",
+)
+
+
+def _foreign(out: pathlib.Path) -> str | None:
+  """What a run or training would replace in a folder without config.json that is not one's own,
+  which was cut off while it began: its name, or None.
+  """
+  left = {
+    "work": r"checkpoints|snapshots|trace(-\d+|\.tmp)\.npz",
+    "work/checkpoints": r"\d.*",
+    "checkpoints": r"\d.*",
+  }
+  strange = [name for name in (*RESULTS, "agent") if (out / name).exists()]
+  strange += [
+    f"{folder}/{path.name}"
+    for folder, known in left.items()
+    for path in sorted((out / folder).glob("*"))
+    if not re.fullmatch(known, path.name)
+  ]
+  return strange[0] if strange else None
+
+
+def claim_folder(
+  out: str | os.PathLike, resume: bool, overwrite: bool, done_marker: str = "summary.json"
+) -> str:
+  """Decides what a command may do with --out.
+
+  Returns:
+    `new`, `resume` or `done` (a finished run that --resume finds).
+
+  Raises:
+    UserError where the folder holds another run and neither --resume nor --overwrite was given.
+  """
+  if not str(out):
+    raise UserError("--out is a folder; got an empty name")
+  out = pathlib.Path(out)
+  if out.exists() and not out.is_dir():
+    raise UserError(f"--out {out} is a file")
+  if resume and overwrite:
+    raise UserError("--resume and --overwrite exclude each other")
+  if (out / "config.json").exists():
+    if resume:
+      return "done" if (out / done_marker).exists() else "resume"
+    if not overwrite:
+      raise UserError(
+        f"{out} holds another run; give --resume to go on with it, --overwrite to replace it, "
+        "or another --out"
+      )
+  elif out.is_dir() and any(out.iterdir()):
+    if not (resume or overwrite):
+      raise UserError(f"{out} is not empty and holds no run of mjx-cl; give another --out")
+    if name := _foreign(out):
+      raise UserError(
+        f"{out} holds no config.json of mjx-cl, but {name}, which would be replaced; give "
+        "another --out"
+      )
+  make(out)
+  return "new"

@@ -1,0 +1,91 @@
+"""What a user is told before a run starts: its threshold, and what may not have been meant."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+
+from mjx_cl import detectors, envs
+from mjx_cl.adapt.arms import ARMS
+from mjx_cl.config import CHUNK, RunConfig, becomes, changes
+from mjx_cl.runs.identity import known_as
+from mjx_cl.runs.records import acts
+from mjx_cl.scoring import intervals
+
+
+def watching(config: RunConfig) -> str | None:
+  """The threshold that a detector has without having been given one, in a line; None where it was,
+  takes none, is one of the paper's rules or looks at nothing."""
+  name = detectors.split(config.detector)[0]
+  build = detectors.factory(config.detector)
+  if (
+    name in detectors.PAPER
+    or getattr(build, "reference", False)
+    or "threshold" in config.settings
+    or "threshold" not in detectors.known_settings(build)
+    or not any(ARMS[arm].trigger.listens for arm in config.arms)
+  ):
+    return None
+  robot = known_as(envs.make(config.env, config.physics))
+  found = detectors.calibrated(config.detector, robot, config.settings)
+  if found is None:
+    default = inspect.signature(build).parameters.get("threshold")
+    own = "its own default threshold" + (
+      f", {default.default:g}" if default and isinstance(default.default, (int, float)) else ""
+    )
+    return (
+      f"detector {config.detector} runs at {own}: none was found for {robot} with these "
+      "settings, and false alarms may be many; --set threshold=... "
+      "(`mjx-cl leaderboard` finds one)"
+    )
+  steps = found.arl0 * found.alarms
+  low, high = (steps / n for n in reversed(intervals.poisson(found.alarms)))
+  plain = {f.name: (f.default,) for f in dataclasses.fields(RunConfig)} | {
+    "env": (robot,),
+    "agent": (None, robot),
+  }
+  other = [
+    k
+    for k in ("env", "agent", "form", "actions", "deterministic")
+    if getattr(config, k) not in plain[k]
+  ]
+  return (
+    f"detector {config.detector} at threshold {found.value:.6g}, at which the shipped {robot} "
+    f"gave {found.alarms} false alarms in {steps:,.0f} healthy control steps, "
+    f"one in {found.arl0:,.0f} [{low:,.0f}, {high:,.0f}]"
+    + (f"; this run has another {' and '.join(other)}" if other else "")
+  )
+
+
+def doubts(config: RunConfig) -> list[str]:
+  """What a user may not have meant, one line each."""
+  adapt, warmup, said = config.adapt, config.adapt.warmup, []
+  if (
+    config.onset >= config.steps
+    and becomes(config) is None
+    and any(acts(change) for change in changes(config))
+  ):
+    said.append(
+      f"the run ends at step {config.steps:,}, before its fault at {config.onset:,}: no stream "
+      "meets it"
+    )
+  least = max(adapt.least, adapt.patience * CHUNK)
+  if adapt.budget < least and any(ARMS[arm].end.rule for arm in config.arms):
+    said.append(
+      f"adapt.budget={adapt.budget:,} ends every finetuning before one may converge, after "
+      f"{least:,} steps (adapt.least, {CHUNK} adapt.patience)"
+    )
+  if warmup >= config.steps:
+    return said + [
+      (
+        f"the run ends at step {config.steps:,}, within adapt.warmup={warmup:,}: no alarm can "
+        "start anything"
+      )
+    ]
+  if warmup > config.onset and any(ARMS[arm].trigger.listens for arm in config.arms):
+    return said + [
+      f"onset {config.onset:,} lies within adapt.warmup={warmup:,}: an alarm before its end "
+      "starts nothing, and without a reward before the onset no stream "
+      "counts as affected or recovered; a later --onset or a smaller --adapt.warmup would do"
+    ]
+  return said

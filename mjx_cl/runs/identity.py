@@ -1,0 +1,120 @@
+"""What makes a run what it is: its settings, agents and threshold, and whether a folder holds the same."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import pathlib
+
+from mjx_cl import detectors, envs
+from mjx_cl.adapt.arms import ARMS
+from mjx_cl.config import AdaptConfig, RunConfig, changes
+from mjx_cl.errors import FileError, UserError
+from mjx_cl.io import folders, plugins, tables
+from mjx_cl.scoring import stop_rule
+from mjx_cl.training import agents
+
+
+def arm_agents(config: RunConfig, env) -> dict[str, agents.Trained]:
+  """Arm -> its own agent, of the arms that bring one: the run's with the arm's word behind its
+  name, or beside the folder that --agent gives.
+
+  Raises:
+    UserError where there is no such agent, or it differs from the run's in size, obs_scale or
+    repeat.
+  """
+  out = {}
+  for arm in (a for a in config.arms if ARMS[a].agent):
+    trained = agents.of(env, config.agent)
+    given = config.agent and pathlib.Path(config.agent).exists()
+    name = f"{trained.path if given else pathlib.Path(trained.path).name}-{ARMS[arm].agent}"
+    try:
+      other = agents.of(env, name)
+    except UserError as e:
+      raise type(e)(f"arm {arm!r}: {e}") from None
+    same = lambda t: (t.agent.config.size, t.agent.config.obs_scale, int(t.card.get("repeat", 1)))
+    if same(other) != same(trained):
+      raise UserError(
+        f"arm {arm!r}: agent {name!r} differs from the run's in size, obs_scale or repeat"
+      )
+    out[arm] = other
+  return out
+
+
+def known_as(env) -> str:
+  """The robot whose agents and figures `env` takes: its own name, or that of the one that it is
+  another fidelity of.
+  """
+  return getattr(env, "agents_of", None) or env.spec.name
+
+
+def threshold_of(config: RunConfig) -> detectors.Threshold | None:
+  """The board's threshold that this run's detector has without having been given one; None where it
+  has another.
+  """
+  if "threshold" in config.settings or detectors.split(config.detector)[0] in detectors.PAPER:
+    return None
+  return detectors.calibrated(
+    config.detector, known_as(envs.make(config.env, config.physics)), config.settings
+  )
+
+
+def identity(config: RunConfig) -> dict:
+  """What makes a run what it is, as config.json holds it: its settings, `changes`, what a preset's
+  name stood for when it began, the `threshold` that its detector takes from the board,
+  `oracle_stops` that its arms are told, and the SHA-256 of the `files` that robot, fault or
+  detector stand in.
+  """
+  found, told = threshold_of(config), stop_rule.told(config)
+  sources = {
+    name: plugins.file_of(name)
+    for name in (config.env, config.detector, *(change.fault for change in changes(config)))
+  }
+  files = {
+    name: hashlib.sha256(path.read_bytes()).hexdigest()
+    for name, path in sources.items()
+    if path is not None and path.is_file()
+  }
+  return json.loads(
+    json.dumps(
+      {
+        **dataclasses.asdict(config),
+        "changes": [dataclasses.asdict(change) for change in changes(config)],
+        **({"threshold": found._asdict()} if found else {}),
+        **({"oracle_stops": told} if told else {}),
+        **({"files": files} if files else {}),
+      }
+    )
+  )
+
+
+def differing(old: dict, values: dict) -> list[str]:
+  """Keys of `values` in which the run differs whose config.json holds `old`. A setting that did not
+  exist when it began counts as its default.
+  """
+  if isinstance(old.get("adapt"), dict):
+    old = old | {"adapt": {**dataclasses.asdict(AdaptConfig()), **old["adapt"]}}
+  defaults = {f.name: f.default for f in dataclasses.fields(RunConfig)}
+  defaults["changes"] = values.get("changes")  # nor did they always exist
+  changed = folders.differing(old, values, ("git_commit", "machine", "python"), defaults)
+  return changed + ["threshold"] * ("threshold" in old and "threshold" not in values)
+
+
+def check_same(out: pathlib.Path, values: dict) -> None:
+  """Refuses to resume with other settings than the run began with."""
+  try:
+    old = tables.read_json(out / "config.json")
+  except FileError as e:
+    raise FileError(f"{e}; give --overwrite or another --out") from None
+  changed = differing(old, values)
+  if changed == ["threshold"]:
+    raise UserError(
+      f"--resume: {out} was begun when its detector {old.get('detector')} had another default "
+      "threshold than today; --overwrite begins anew"
+    )
+  if changed:
+    raise UserError(
+      f"--resume: {out} was begun with another {', '.join(changed)}; give the same settings or "
+      "--overwrite"
+    )

@@ -1,0 +1,53 @@
+"""Returns of episodes, summed on the host from the rows of chunks as the scan gives them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mjx_cl.rollout.scan import Row
+
+
+class Episodes:
+  """The first episode of each robot.
+
+  Attributes:
+    total: float64, the return so far.
+    steps: int, decisions.
+    ended: bool, by termination.
+    alive: bool, not over yet.
+  """
+
+  def __init__(self, shape: tuple[int, ...]):
+    self.total, self.steps = np.zeros(shape), np.zeros(shape, int)
+    self.ended, self.alive = np.zeros(shape, bool), np.ones(shape, bool)
+
+  def add(self, rows: Row) -> np.ndarray:
+    """Adds a chunk; which of its decisions belong to these episodes, bool (decisions, *shape)."""
+    reward, terminated = np.asarray(rows.reward), np.asarray(rows.terminated)
+    done = terminated | np.asarray(rows.truncated)
+    before = np.concatenate([~self.alive[None], done[:-1]])
+    lived = ~np.logical_or.accumulate(before, 0)  # up to the decision that ends the episode
+    for r, now in zip(reward, lived):
+      self.total += r * now
+    self.steps += lived.sum(0)
+    self.ended |= (terminated & lived).any(0)
+    self.alive &= ~done.any(0)
+    return lived
+
+
+class Returns:
+  """Returns of all episodes that end, per robot."""
+
+  def __init__(self, shape: tuple[int, ...]):
+    self.sums = np.zeros(shape)
+
+  def add(self, rows: Row) -> list[tuple[tuple[int, int], float]]:
+    """Rows of a chunk -> [((group, member), return)] of the episodes that ended in it."""
+    reward, done = np.asarray(rows.reward), np.asarray(rows.terminated | rows.truncated)
+    ended = []
+    for r, d in zip(reward, done):
+      self.sums += r
+      for at in zip(*np.nonzero(d)):
+        ended.append((tuple(int(i) for i in at), float(self.sums[at])))
+        self.sums[at] = 0.0
+    return ended
