@@ -20,6 +20,7 @@ from mjx_cl.config import AdaptConfig
 from mjx_cl.dreamer import replay as replay_lib
 from mjx_cl.dreamer.agent import Agent, Batch, TrainState, culprit
 from mjx_cl.errors import choose
+from mjx_cl.keys import OfAdaptation
 from mjx_cl.rollout.monitor import History, Monitor, unknown
 from mjx_cl.rollout.scan import records
 
@@ -29,9 +30,6 @@ BEHAVIOUR = {
   "slow",
   "range",
 }  # of a TrainState: what is no world model, moments under the same names
-# what a stream's key folds in for new parameters; chunks fold in the control step after them, which
-# is above 0
-FRESH = 0
 
 
 class Before(NamedTuple):
@@ -495,7 +493,7 @@ class Loop:
     def stream(g, state):
       def renew(_, state):
         train, acting = state
-        new = self.agent.init(jax.random.fold_in(keys[g], FRESH))
+        new = self.agent.init(jax.random.fold_in(keys[g], OfAdaptation.FRESH))
         return put(train, g, new), put(acting, g, new.params)
 
       return jax.lax.fori_loop(0, fresh[g].astype(jnp.int32), renew, state)

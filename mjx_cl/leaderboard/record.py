@@ -18,6 +18,7 @@ import numpy as np
 from mjx_cl.config import CHUNK
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.io import tables as store
+from mjx_cl.keys import OfSeed
 from mjx_cl.leaderboard.streams import COLUMNS, LATENT, META, SCHEMA, VERSION, Suite
 
 TILE = 16  # lanes are filled up to a multiple of it
@@ -29,7 +30,6 @@ MADE = (
   "machine",
 )  # of config.json: how a set was made
 HELD = "held.json"  # config.json of the set whose files are being replaced
-WATCH = 2_000  # what is folded into a lane's key for the monitor's draws
 
 
 class Lane(NamedTuple):
@@ -149,7 +149,7 @@ def _record(
   healthy = sum(lane.fault is None for lane in lanes_)
   watch, remember = jax.jit(monitor.update_each), jax.jit(monitor.remember)
   draws = jax.vmap(
-    lambda key, chunk: jax.random.fold_in(jax.random.fold_in(key, WATCH), chunk), (0, None)
+    lambda key, chunk: jax.random.fold_in(jax.random.fold_in(key, OfSeed.WATCH), chunk), (0, None)
   )
   history = monitor.init(1, len(lanes_))
   out: dict[str, list] = {c: [] for c in COLUMNS + ("episode", "terminated", "latent")}

@@ -46,6 +46,7 @@ from mjx_cl.config import CHUNK, AdaptConfig, RunConfig, becomes, changes
 from mjx_cl.dreamer.agent import CAUSES, EXPLODED
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.io.interrupt import Interruptible
+from mjx_cl.keys import OfSeed
 from mjx_cl.rollout.order import Lanes
 from mjx_cl.runs.records import Ledger, acts
 from mjx_cl.rollout.monitor import Monitor
@@ -186,7 +187,7 @@ class Runner:
     )
     self.breaks = np.asarray([ARMS[arm].breaks for arm, _ in self.labels])
     keys = jnp.stack([jax.random.key(seed) for _, seed in self.labels])[:, None]
-    self.keys = jax.vmap(lambda k: jax.random.fold_in(k, 7))(keys[:, 0])
+    self.keys = jax.vmap(lambda k: jax.random.fold_in(k, OfSeed.ADAPTATION))(keys[:, 0])
     trains = [
       self.others[arm].train if arm in self.others else self.trained.train for arm, _ in self.labels
     ]

@@ -22,6 +22,7 @@ from mjx_cl.adapt import phase as phase_lib
 from mjx_cl.adapt.arms import ARMS, never_stops
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.io.interrupt import Interruptible
+from mjx_cl.keys import OfSeed
 from mjx_cl.rollout.scan import Rollout, nest, start
 
 ACTS = ("enc", "dyn", "pol")  # of the parameters: what Agent.act reads
@@ -30,7 +31,6 @@ LIMIT_MIB = 2048  # of snapshots on the disk
 BATCH = 32  # snapshots evaluated side by side ...
 BATCH_MIB = 256  # ... unless their weights together are more
 LENGTH = 50  # decisions per call
-KEY = 9  # what a seed's key folds in for its episodes; a run folds in 7
 
 
 class Snapshot(NamedTuple):
@@ -250,7 +250,7 @@ class Snapshots:
     keys = jnp.stack(
       [
         jax.random.split(
-          jax.random.fold_in(jax.random.key(self.labels[s.stream][1]), KEY), EPISODES
+          jax.random.fold_in(jax.random.key(self.labels[s.stream][1]), OfSeed.SNAPSHOTS), EPISODES
         )
         for s in batch
       ]

@@ -19,13 +19,14 @@ import quick
 from mjx_cl import envs
 from mjx_cl.adapt import phase as phase_lib
 from mjx_cl.adapt.arms import ARMS, FOREVER
-from mjx_cl.adapt.loop import FRESH, WIDTH, Loop, choices
+from mjx_cl.adapt.loop import WIDTH, Loop, choices
 from mjx_cl.adapt.phase import ABORT_BUDGET, END, ENDED, START, STOP
 from mjx_cl.config import PRESETS, AdaptConfig, RunConfig
 from mjx_cl.detectors import Alarm, Detector
 from mjx_cl.dreamer.agent import Agent
 from mjx_cl.envs.walker import Walker
 from mjx_cl.errors import UserError
+from mjx_cl.keys import OfAdaptation
 from mjx_cl.rollout.monitor import Monitor
 from mjx_cl.rollout.scan import Row
 from mjx_cl.runs import run
@@ -472,7 +473,7 @@ def test_scratch_starts_from_fresh_parameters(story, same):
   begin, init = of(story.begin.train, "scratch"), jax.jit(story.loop.agent.init)
   assert same(of(story.states[2].train, "scratch"), begin)
   new = of(story.states[3].train, "scratch")
-  want = init(jax.random.fold_in(story.keys[NAMES.index("scratch")], FRESH))
+  want = init(jax.random.fold_in(story.keys[NAMES.index("scratch")], OfAdaptation.FRESH))
   jax.tree.map(
     lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-7), new, want
   )  # float32 of two programs
@@ -481,7 +482,7 @@ def test_scratch_starts_from_fresh_parameters(story, same):
     and new.updates == 0
     and begin.updates == 100
   )
-  other = init(jax.random.fold_in(story.keys[0], FRESH))
+  other = init(jax.random.fold_in(story.keys[0], OfAdaptation.FRESH))
   kernel = lambda state: max(jax.tree.leaves(state.params["enc"]), key=np.size)
   assert not np.allclose(kernel(new), kernel(other), atol=0.01) and not np.allclose(
     kernel(new), kernel(begin), atol=0.01
