@@ -37,11 +37,11 @@ from mjx_cl.training import agents
 from mjx_cl.io import checkpoints, memory, plugins, runtime, tables
 from mjx_cl import detectors, envs, faults
 from mjx_cl.dreamer import replay
-from mjx_cl.adapt import phase as phase_lib
+from mjx_cl.adapt import decide as phase_lib
 from mjx_cl.adapt.arms import ARMS, FOREVER, never_stops
-from mjx_cl.adapt.convergence import SIGNALS
+from mjx_cl.adapt.decide import SIGNALS
 from mjx_cl.adapt.blocks import Crew
-from mjx_cl.adapt.loop import Choices, Loop, LoopState, choices
+from mjx_cl.adapt.loop import Choices, Loop, LoopState, Programs, choices
 from mjx_cl.config import CHUNK, AdaptConfig, RunConfig, becomes, changes
 from mjx_cl.dreamer.agent import CAUSES, EXPLODED
 from mjx_cl.errors import FileError, UserError
@@ -102,7 +102,7 @@ class Runner:
   Another number of arms or seeds is another program, which rounds otherwise.
   """
 
-  def __init__(self, config: RunConfig, out):
+  def __init__(self, config: RunConfig, out, programs: Programs | None = None):
     self.config, self.out = config, pathlib.Path(out)
     self.env = envs.make(config.env, config.physics)
     self.other = (
@@ -182,6 +182,7 @@ class Runner:
         self.repeat,
         capacity=needs(config.steps),
         same=same,
+        programs=Programs() if programs is None else programs,
       ),
       self.groups,
     )
@@ -763,9 +764,10 @@ def execute(
   progress=lambda p: None,
   save_every_s: float = 60.0,
   tell=lambda text: None,
+  programs: Programs | None = None,
 ) -> dict:
   """Runs `config` into `out` and returns summary.json's value. A kill at any moment loses at most
-  `save_every_s` seconds of work.
+  `save_every_s` seconds of work. `programs`: compiled ones of this process that it may share.
   """
   fresh = not pathlib.Path(out).exists()
   state, out = tables.claim_folder(out, resume, overwrite), pathlib.Path(out)
@@ -776,7 +778,7 @@ def execute(
     return tables.read_json(out / "summary.json")
   try:
     runner = Runner(
-      config, out
+      config, out, programs
     )  # refuses wrong names and broken agents before anything of an earlier run is removed
   except UserError:
     if fresh and not any(out.iterdir()):

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_cl import faults as faults_lib
-from mjx_cl.adapt import phase as phase_lib
+from mjx_cl.adapt import decide as phase_lib
 from mjx_cl.adapt.arms import ARMS, never_stops
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.io.interrupt import Interruptible

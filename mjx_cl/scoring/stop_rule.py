@@ -264,7 +264,8 @@ def ablation(folder, **rule) -> list[dict]:
   """When the stop rule would have ended the first adaptation of each stream that never stops, had
   it not asked a signal to settle.
 
-  The phase machine of a run (adapt.phase) lives once more over the recorded chunk signals. A reward
+  The phase machine of a run (adapt.decide) lives once more over the recorded chunk signals. A
+  reward
   that is left out need not settle, but must still be accepted. Until the stop this is the life of
   arm `oracle` in the same seed, as far as both were rounded alike (run.Runner).
 
@@ -288,8 +289,7 @@ def ablation(folder, **rule) -> list[dict]:
       f"the stop rule has no {', '.join(sorted(set(rule) - set(RULE)))}; choose from: "
       f"{', '.join(RULE)}"
     )
-  from mjx_cl.adapt.convergence import SIGNALS
-  from mjx_cl.adapt.phase import REASONS, START, STOP
+  from mjx_cl.adapt.decide import REASONS, SIGNALS, START, STOP
   from mjx_cl.config import AdaptConfig
 
   try:
@@ -382,7 +382,7 @@ def _relive(own, since, names, config):
   import jax
   import jax.numpy as jnp
 
-  from mjx_cl.adapt import phase
+  from mjx_cl.adapt import decide
 
   number = lambda x: np.float32(np.nan if x is None else x)
   signals = np.array(
@@ -404,7 +404,7 @@ def _relive(own, since, names, config):
     def step(state, x):
       signals, posture, acceptance, now = x
       falls = (since >= now - length) & (since < now)
-      state, decision, _ = phase.update(
+      state, decision, _ = decide.update(
         state,
         signals,
         posture,
@@ -420,9 +420,9 @@ def _relive(own, since, names, config):
       )
       return state, decision
 
-    return jax.lax.scan(step, phase.init(config), (signals, posture, acceptance, jnp.asarray(now)))[
-      1
-    ]
+    return jax.lax.scan(
+      step, decide.init(config), (signals, posture, acceptance, jnp.asarray(now))
+    )[1]
 
   every = jax.vmap(jax.vmap(live, (None, None, None, None, 0)), (0, 0, 0, 0, None))
   decisions = jax.jit(every)(

@@ -17,10 +17,10 @@ import pytest
 import quick
 
 from mjx_cl import envs
-from mjx_cl.adapt import phase as phase_lib
+from mjx_cl.adapt import decide as phase_lib
 from mjx_cl.adapt.arms import ARMS, FOREVER
 from mjx_cl.adapt.loop import WIDTH, Loop, choices
-from mjx_cl.adapt.phase import ABORT_BUDGET, END, ENDED, START, STOP
+from mjx_cl.adapt.decide import ABORT_BUDGET, END, ENDED, START, STOP
 from mjx_cl.config import PRESETS, AdaptConfig, RunConfig
 from mjx_cl.detectors import Alarm, Detector
 from mjx_cl.dreamer.agent import Agent

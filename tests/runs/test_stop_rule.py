@@ -16,7 +16,7 @@ from mjx_cl.runs import suite, run, snapshots
 from mjx_cl import envs, faults
 from mjx_cl.io import tables
 from mjx_cl.keys import OfSeed
-from mjx_cl.adapt import phase as phase_lib
+from mjx_cl.adapt import decide as phase_lib
 from mjx_cl.adapt.arms import ARMS, never_stops, stops
 from mjx_cl.adapt.loop import Loop
 from mjx_cl.config import AdaptConfig, RunConfig

@@ -692,7 +692,7 @@ def test_publishing_a_part_keeps_the_others(mjx, refused, tmp_path):  # noqa: F8
   )
 
 
-def test_runs_of_one_kind_share_their_program(mini, tmp_path):  # noqa: F811
+def test_runs_of_one_kind_share_their_program(mini, tmp_path, programs):  # noqa: F811
   """Severity, seeds, length and the numbers of AdaptConfig are not in it; detector, form and
   learning rate are.
   """
@@ -717,11 +717,11 @@ def test_runs_of_one_kind_share_their_program(mini, tmp_path):  # noqa: F811
     unhashable.spec,
     unhashable.config,
     same=(["a list"],),
+    programs=programs,
   )
   assert own._program is not first  # what has no hash shares nothing
-  from mjx_cl.adapt import loop
-
-  assert len(loop._programs) <= loop.PROGRAMS
+  assert 1 < len(programs.kept) <= programs.most
+  assert run.Runner(part.config, tmp_path, type(programs)()).crew.loop._program is not first
 
 
 @pytest.mark.parametrize(
