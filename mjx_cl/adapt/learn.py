@@ -25,7 +25,8 @@ def fill(
   """`replay` of each stream with what came after the alarm and nothing else.
 
   Args:
-    begins: bool (groups,), an adaptation begins in the chunk. row: int32 (groups,), after which row.
+    begins: bool (groups,), an adaptation begins in the chunk.
+    row: int32 (groups,), after which row.
     adapting: bool (groups,), the chunk began within an adaptation.
   """
   where = lambda a, b: jnp.where(begins.reshape((-1,) + (1,) * (a.ndim - 1)), a, b)

@@ -1,5 +1,5 @@
-"""What happens to a chunk of rows, of every stream of a run, in one jitted program without callbacks:
-it is watched, decided upon and learnt from, and the weights that act next are chosen.
+"""What happens to a chunk of rows of every stream, in one jitted program without callbacks: it is
+watched, decided upon and learnt from, and the weights that act next are chosen.
 
 Streams are groups of one member: each has its own parameters. A stream that is not adapting costs
 no update.

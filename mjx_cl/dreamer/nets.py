@@ -137,21 +137,9 @@ def two_hot_bins(num: int = 255) -> np.ndarray:
   return np.concatenate([half, -half[:-1][::-1]])
 
 
-def two_hot(x: jax.Array, bins: jax.Array) -> jax.Array:
-  """Target distribution (..., bins) of x (...): weight on the two neighbouring bins, linear in raw
-  distance, ends clipped.
-  """
-  below = jnp.clip(jnp.searchsorted(bins, x, side="right") - 1, 0, len(bins) - 2)
-  low, high = bins[below], bins[below + 1]
-  weight = jnp.clip((x - low) / (high - low), 0.0, 1.0)
-  index = jnp.arange(len(bins))
-  return jnp.where(index == below[..., None], (1 - weight)[..., None], 0.0) + jnp.where(
-    index == below[..., None] + 1, weight[..., None], 0.0
-  )
-
-
 def two_hot_loss(logits: jax.Array, x: jax.Array, bins: jax.Array) -> jax.Array:
-  """Cross-entropy [nats] (...) of logits (..., bins) against the two-hot of x (...).
+  """Cross-entropy [nats] (...) of logits (..., bins) against the two-hot of x (...): weight on the
+  two neighbouring bins, linear in raw distance, ends clipped.
 
   Only the two weighted entries of log-softmax are read; the target is never built.
   """

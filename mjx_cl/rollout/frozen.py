@@ -1,4 +1,4 @@
-"""Residual streams of an agent that does not adapt: what detectors are calibrated and compared on."""
+"""Residual streams of an agent that does not adapt, on which detectors are calibrated and compared."""
 
 from __future__ import annotations
 

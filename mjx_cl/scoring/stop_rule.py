@@ -265,8 +265,7 @@ def ablation(folder, **rule) -> list[dict]:
   it not asked a signal to settle.
 
   The phase machine of a run (adapt.decide) lives once more over the recorded chunk signals. A
-  reward
-  that is left out need not settle, but must still be accepted. Until the stop this is the life of
+  reward that is left out need not settle, but must still be accepted. Until the stop this is the life of
   arm `oracle` in the same seed, as far as both were rounded alike (run.Runner).
 
   Args:
