@@ -136,17 +136,17 @@ def learn(
   )
 
 
-def take(tree, g):
+def take(tree: Any, g: jax.Array) -> Any:
   """Entry g of every leaf."""
   return jax.tree.map(lambda x: jax.lax.dynamic_index_in_dim(x, g, keepdims=False), tree)
 
 
-def put(tree, g, value):
+def put(tree: Any, g: jax.Array, value: Any) -> Any:
   """`tree` with `value` as entry g of every leaf."""
   return jax.tree.map(lambda x, v: jax.lax.dynamic_update_index_in_dim(x, v, g, 0), tree, value)
 
 
-def keep_behaviour(keep, before: TrainState, after: TrainState) -> TrainState:
+def keep_behaviour(keep: jax.Array, before: TrainState, after: TrainState) -> TrainState:
   """`after`, where `keep` (): with actor, critic, slow critic, range of the returns, and the
   moments of actor and critic as `before`.
 

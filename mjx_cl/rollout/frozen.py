@@ -1,4 +1,4 @@
-"""Residual streams of an agent that does not adapt, on which detectors are calibrated and compared."""
+"""Residual streams of an agent that does not adapt, for calibrating and comparing detectors."""
 
 from __future__ import annotations
 

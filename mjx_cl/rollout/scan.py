@@ -9,6 +9,7 @@ arriving. A reset touches neither the fault clock nor a detector.
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -121,7 +122,7 @@ def start(
   )
 
 
-def nest(function, in_axes_group, in_axes_member):
+def nest(function: Callable, in_axes_group, in_axes_member) -> Callable:
   """Vmap over groups, then over members."""
   return jax.vmap(jax.vmap(function, in_axes_member), in_axes_group)
 
@@ -297,12 +298,12 @@ class Rollout:
     return nest(one, (0, 0), (0, 0))(streams, done)
 
 
-def expand(mask, like):
+def expand(mask: jax.Array, like: jax.Array) -> jax.Array:
   """Appends axes to `mask` until it broadcasts against `like`."""
   return mask.reshape(mask.shape + (1,) * (like.ndim - mask.ndim))
 
 
-def records(rows: Row):
+def records(rows: Row) -> tuple[Record, jax.Array]:
   """Rows (T, groups, members) -> replay records (groups, members, 2 T) and which of them exist.
 
   Every decision gives a record; an episode's end gives one more, of the final observation, with
