@@ -35,7 +35,6 @@ def update():
 
 def digest():
   """Likewise, for the first stream of a run."""
-  import jax
   import jax.numpy as jnp
 
   from mjx_cl.adapt.blocks import cut

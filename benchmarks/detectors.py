@@ -19,7 +19,6 @@ from mjx_cl.io import runtime
 runtime.setup()
 
 import jax  # noqa: E402
-import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 
 from mjx_cl import detectors  # noqa: E402

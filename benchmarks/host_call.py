@@ -21,11 +21,11 @@ FORMS = ("by name", "pure_callback")
 
 
 def use(form: str) -> None:
-  from mjx_cl.physics import by_name
+  from mjx_cl.physics import host_call
 
   if form == "pure_callback":
-    by_name.registered = lambda: False
-  elif not by_name.registered():
+    host_call.registered = lambda: False
+  elif not host_call.registered():
     sys.exit("this jaxlib does not take the target; there is only one form")
 
 
@@ -34,12 +34,12 @@ def calls():
   import jax
   import jax.numpy as jnp
 
-  from mjx_cl.physics import by_name
+  from mjx_cl.physics import host_call
 
   x = jnp.zeros((40, 3), jnp.uint32)
   program = jax.jit(
     lambda x: jax.lax.fori_loop(
-      0, 2000, lambda i, x: jax.vmap(lambda x: by_name.call("nothing", "", 3, x))(x), x
+      0, 2000, lambda i, x: jax.vmap(lambda x: host_call.call("nothing", "", 3, x))(x), x
     )
   )
   return lambda: program(x).block_until_ready()
@@ -64,14 +64,14 @@ def measure(make, rounds: int) -> dict[str, float]:
   """Median seconds of each form, which take turns."""
   from physics import race  # the script beside this one
 
-  from mjx_cl.physics import by_name
+  from mjx_cl.physics import host_call
 
-  asked, programs = by_name.registered, {}
+  asked, programs = host_call.registered, {}
   for form in FORMS:
     use(form)
     programs[form] = make()
     programs[form]()
-    by_name.registered = asked
+    host_call.registered = asked
   return race(programs, rounds)
 
 
@@ -98,9 +98,9 @@ def main() -> None:
   from mjx_cl.io import runtime
 
   runtime.setup()
-  from mjx_cl.physics import by_name
+  from mjx_cl.physics import host_call
 
-  nothing = by_name.shared("nothing", lambda: lambda word, x: x)
+  nothing = host_call.shared("nothing", lambda: lambda word, x: x)
   rows = [
     {"name": f"a call, {form}", "value": 1e6 * s / 2000, "unit": "us"}
     for form, s in measure(calls, 15).items()

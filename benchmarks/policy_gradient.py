@@ -54,22 +54,16 @@ def streams_of(env, agent, groups: int, robots: int, seed: int):
   )
 
 
-def own_data(env, trained, robots: int, steps: int, jitter: float, seed: int = 1) -> replay.Replay:
-  """A replay of what the agent did in `steps` control steps; `jitter` as in TrainConfig, on half of
-  the robots.
-  """
+def own_data(env, trained, robots: int, steps: int, seed: int = 1) -> replay.Replay:
+  """A replay of what the agent did in `steps` control steps."""
   agent, size = trained.agent, trained.agent.size
   roll, streams = Rollout(env, agent, faults.none(env)), streams_of(env, agent, 1, robots, seed)
   held = replay.init(
     robots, 2 * steps, len(env.spec.obs), len(env.spec.act), size.deter, size.stoch
   )
   params, add = jax.tree.map(lambda x: x[None], trained.train.params), jax.jit(replay.add)
-  half = robots // 2
-  noise = np.concatenate([np.zeros(robots - half), jitter * np.arange(1, half + 1) / max(1, half)])[
-    None
-  ].astype(np.float32)
   for _ in range(-(-steps // CHUNK)):
-    streams, rows = roll.chunk(params, streams, CHUNK, jitter=noise)
+    streams, rows = roll.chunk(params, streams, CHUNK)
     held = add(held, *jax.tree.map(lambda x: x[0], records(rows)))
   return held
 
@@ -104,7 +98,7 @@ def measure(args) -> dict:
     len(env.spec.act),
   )
   train, params = trained.train, trained.train.params
-  held = own_data(env, trained, args.robots, args.records, args.jitter)
+  held = own_data(env, trained, args.robots, args.records)
   direction, signal = ascent(agent, train, held, args.batches)
 
   _, batch, _ = replay.sample(held, jax.random.key(5), agent.config.batch, agent.config.length + 1)
@@ -174,7 +168,6 @@ def measure(args) -> dict:
     "robots": args.robots,
     "steps": args.steps,
     "batches": args.batches,
-    "jitter": args.jitter,
     "signal_to_noise": signal,
     "slope": (at[args.size]["gain"] - at[-args.size]["gain"]) / 2,
     "rows": rows,
@@ -213,12 +206,6 @@ def parser() -> argparse.ArgumentParser:
   out.add_argument("--batches", type=int, default=48)
   out.add_argument(
     "--size", type=float, default=0.02, help="root mean square change of the policy's mean action"
-  )
-  out.add_argument(
-    "--jitter",
-    type=float,
-    default=0.0,
-    help="noise on the actions of half of the robots while collecting, as in training",
   )
   return out
 

@@ -37,17 +37,26 @@ def resident_gib() -> float:
     return 0.0
 
 
+@pytest.fixture(scope="session", autouse=True)
+def programs():
+  """All runs of a test process share their compiled programs, as the parts of a suite do."""
+  from mjx_cl.runs import run
+
+  kept = run.Programs()
+  with pytest.MonkeyPatch.context() as patch:
+    patch.setattr(run, "Programs", lambda: kept)
+    yield kept
+
+
 @pytest.fixture(scope="module", autouse=True)
-def forget():
+def forget(programs):
   """A module's compiled programs go with it once the process holds more than LIMIT GiB; session
   fixtures take theirs from the compile cache again.
   """
   yield
   if resident_gib() > LIMIT:
     jax.clear_caches()
-    from mjx_cl.adapt import loop
-
-    loop._programs.clear()
+    programs.kept.clear()
     gc.collect()
     runtime.give_back()
 

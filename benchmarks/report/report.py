@@ -1043,7 +1043,6 @@ def rollback(results: pathlib.Path) -> str:
   """Aborts that keep what was learnt beside aborts that take it back where it earned less, on the
   same seeds.
   """
-  from mjx_cl.scoring import intervals
 
   rows, folder = [], results / "rollback"
   plan, entries = (load(folder / name) for name in ("suite.json", "bench.json"))

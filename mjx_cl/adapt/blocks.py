@@ -161,7 +161,7 @@ def cut(tree, block: slice, axis: int):
 
 
 def glue(parts: list, later: tuple[str, ...]):
-  """Named tuples put together along axis 1 of the fields `later` and axis 0 of the others, NumPy."""
+  """Named tuples put together along axis 1 of the fields `later`, axis 0 of the others, NumPy."""
 
   def field(name):
     values = [getattr(part, name) for part in parts]

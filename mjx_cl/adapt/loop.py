@@ -1,5 +1,5 @@
-"""What happens to a chunk of rows: residuals, alarms, signals, phase, replay, updates. One jitted
-program without callbacks.
+"""What happens to a chunk of rows of every stream, in one jitted program without callbacks: it is
+watched, decided upon and learnt from, and the weights that act next are chosen.
 
 Streams are groups of one member: each has its own parameters. A stream that is not adapting costs
 no update.
@@ -7,57 +7,22 @@ no update.
 
 from __future__ import annotations
 
-from collections.abc import Hashable
+from collections.abc import Hashable, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
+from mjx_cl.adapt import act, decide, learn, watch
 from mjx_cl.adapt import arms as arms_lib
-from mjx_cl.adapt import phase as phase_lib
-from mjx_cl.adapt.convergence import SIGNALS
 from mjx_cl.config import AdaptConfig
+from mjx_cl.detectors.base import Detector
 from mjx_cl.dreamer import replay as replay_lib
-from mjx_cl.dreamer.agent import Agent, Batch, TrainState, culprit
+from mjx_cl.dreamer.agent import Agent, TrainState
 from mjx_cl.errors import choose
-from mjx_cl.rollout.monitor import History, Monitor, unknown
-from mjx_cl.rollout.scan import records
-
-BEHAVIOUR = {
-  "pol",
-  "val",
-  "slow",
-  "range",
-}  # of a TrainState: what is no world model, moments under the same names
-# what a stream's key folds in for new parameters; chunks fold in the control step after them, which
-# is above 0
-FRESH = 0
-
-
-class Before(NamedTuple):
-  """What an adaptation began with, and what that was worth; leading (groups,).
-
-      back  =  aborted  and  mean reward of the last `patience` chunks < mean reward of the chunks
-      between the alarm and the first update
-
-  The weights of before the adaptation are still at work while the replay fills (start_windows). The
-  two sides are earned at two times: under the same fault where a true alarm began the adaptation;
-  but one begun by a false alarm compares a healthy robot with one that may have broken since, which
-  favours going back, and so does a fault under which the reward goes on falling. Where an abort
-  comes before `patience` chunks have been lived, the mean is over those that have. A stream that is
-  aborted before its first update has nothing to take back. Moments, slow critic and range stay
-  those of the learner, which takes no other update.
-
-  Attributes:
-    params: the parameters that acted when the adaptation began. reward, chunks: float32, sum over
-      the chunks that they have lived since, and their number.
-    learnt: bool, an update has been taken since.
-  """
-
-  params: Any
-  reward: jax.Array
-  chunks: jax.Array
-  learnt: jax.Array
+from mjx_cl.rollout.monitor import History, Monitor, Residual, unknown
+from mjx_cl.rollout.scan import Row
+from mjx_cl.types import Spec
 
 
 class LoopState(NamedTuple):
@@ -82,18 +47,31 @@ class LoopState(NamedTuple):
   replay: replay_lib.Replay
   history: History
   detector: Any
-  phase: phase_lib.PhaseState
+  phase: decide.PhaseState
   past: Residual
   owed: jax.Array
   executed: jax.Array
-  before: Before | None = None
+  before: act.Before | None = None
 
 
 class Digest(NamedTuple):
-  """What the host logs of a chunk: rows (T, groups) and values (groups,). `failed`: index into
-  agent.CAUSES of what was at fault in an update, which changed nothing and was the stream's last;
-  -1: nothing. `back`: bool, an abort put the weights of before the adaptation back; None where no
-  arm does. `earned`, `earns`: mean reward a step that was judged by, see Before; None likewise.
+  """What the host logs of a chunk: rows (T, groups) and values (groups,).
+
+  Attributes:
+    residual: Residual of each row.
+    score: float32, the detector's, of each row.
+    fired: bool, alarms, of each row.
+    signals: float32 (groups, 6), in the order of decide.SIGNALS.
+    settled: bool (groups, 6), which of them have settled.
+    phase: int32, index into decide.PHASES after the chunk.
+    decision: int32, index into decide.REASONS.
+    since: int32, control step that the last adaptation counts from.
+    updates: int32, taken since the run began.
+    failed: int32, index into agent.CAUSES of what was at fault in an update, which changed nothing
+      and was the stream's last; -1: nothing.
+    back: bool, an abort put the weights of before the adaptation back; None where no arm does.
+    earned: float32, mean reward a step of those, see act.Before; None likewise.
+    earns: float32, of the weights that have learnt; None likewise.
   """
 
   residual: Residual
@@ -111,8 +89,7 @@ class Digest(NamedTuple):
   earns: jax.Array | None = None
 
 
-# Choices.at is padded to a multiple of it: arms with up to eight starts share a program, `periodic`
-# too
+# Choices.at is padded to a multiple of it: arms with up to eight starts share a program
 WIDTH = 8
 
 
@@ -120,10 +97,11 @@ class Choices(NamedTuple):
   """The arms of a run as arrays, leading (groups,); see arms.Arm.
 
   Attributes:
-    listens: bool, alarms are acted on. at: int32 (groups, K), control steps at which adaptation is
-      due, FOREVER: none; K is a multiple of WIDTH.
-    rule: bool, stop and abort rules are in force. limit: int32, most control steps of one
-      adaptation.
+    listens: bool, alarms are acted on.
+    at: int32 (groups, K), control steps at which adaptation is due, FOREVER: none; K is a multiple
+      of WIDTH.
+    rule: bool, stop and abort rules are in force.
+    limit: int32, most control steps of one adaptation.
     world_only: bool, actor and critic keep what they are. fresh: bool, every start draws new
       parameters; None: no arm of the run does, and the program goes without the drawing, a quarter
       of what there is to compile.
@@ -141,12 +119,18 @@ class Choices(NamedTuple):
 
 
 def choices(
-  labels, config: AdaptConfig, steps: int, onsets=None, stops: dict[int, int] | None = None
+  labels: Sequence[tuple[str, int]],
+  config: AdaptConfig,
+  steps: int,
+  onsets: Sequence[tuple[int, ...]] | None = None,
+  stops: dict[int, int] | None = None,
 ) -> Choices:
   """Choices of streams.
 
   Args:
-    labels: (arm, seed) of each. steps: of the run.
+    labels: (arm, seed) of each.
+    config: AdaptConfig.
+    steps: of the run.
     onsets: true onsets of each robot, unless its arm spares it, as control steps, FOREVER: not
       known yet; None: no faults.
     stops: seed -> control steps after which an arm that is told its oracle stop ends.
@@ -182,8 +166,27 @@ def choices(
   )
 
 
-_programs: dict[Hashable, Any] = {}  # see Loop's `same`; the newest last
-PROGRAMS = 8  # as many are kept: a compiled program takes memory
+class Programs:
+  """Compiled programs of Loops, for runs of one process that follow each other.
+
+  Args:
+    most: as many are kept, the newest: a compiled program takes memory.
+  """
+
+  def __init__(self, most: int = 8):
+    self.most = most
+    self.kept: dict[Hashable, Any] = {}  # the newest last
+
+  def share(self, key: Hashable, program):
+    """The program that is kept under `key`, else `program`, which is kept from now on."""
+    try:
+      program = self.kept.pop(key, program)
+    except TypeError:  # it holds a list, such as the spec of another package may
+      return program
+    self.kept[key] = program
+    while len(self.kept) > self.most:
+      del self.kept[next(iter(self.kept))]
+    return program
 
 
 class Loop:
@@ -191,12 +194,15 @@ class Loop:
 
   Args:
     agent: Agent whose config holds the learning rate of adaptation.
-    monitor, detector: what watches.
+    monitor: gives residuals.
+    detector: gives alarms.
     spec: of the environment (acceptance, posture).
+    config: AdaptConfig.
     repeat: control steps per decision.
     capacity: post-alarm records kept per stream.
-    same: stands for agent, monitor, detector and spec together; Loops of a process that give an
-      equal one share their compiled program. None, or what has no hash: its own.
+    same: stands for agent, monitor, detector and spec together; Loops that give an equal one share
+      their program in `programs`. None, or what has no hash: its own.
+    programs: of the process; None: the Loop's own alone.
 
   The numbers of `config` are arguments of the program, not constants in it: runs that differ in
   budget, ratio, average or rule share one compilation.
@@ -206,28 +212,19 @@ class Loop:
     self,
     agent: Agent,
     monitor: Monitor,
-    detector,
-    spec,
+    detector: Detector,
+    spec: Spec,
     config: AdaptConfig,
     repeat: int = 1,
     capacity: int = 20_480,
     same: Hashable | None = None,
+    programs: Programs | None = None,
   ):
     self.agent, self.monitor, self.detector, self.spec = agent, monitor, detector, spec
     self.config, self.repeat, self.capacity = config, repeat, capacity
     self._program = jax.jit(self._digest, donate_argnums=0)
-    if same is not None:
-      self._share((same, repeat))
-
-  def _share(self, key) -> None:
-    """Takes over the program of an equal Loop of this process, if it is still kept."""
-    try:
-      self._program = _programs.pop(key, self._program)
-    except TypeError:  # a spec of another package that holds a list
-      return
-    _programs[key] = self._program
-    while len(_programs) > PROGRAMS:
-      del _programs[next(iter(_programs))]
+    if same is not None and programs is not None:
+      self._program = programs.share((same, repeat), self._program)
 
   def init(self, train: TrainState, groups: int, rollback: bool = False) -> LoopState:
     """State before the first step; `train` is the shipped agent, the same for every stream.
@@ -250,11 +247,13 @@ class Loop:
       replay,
       self.monitor.init(groups, 1),
       spread(self.detector.init()),
-      spread(phase_lib.init(self.config)),
+      spread(decide.init(self.config)),
       unknown((rows, groups), a.obs_size),
       jnp.zeros(groups),
       jnp.zeros(groups, jnp.int32),
-      Before(spread(train.params), jnp.zeros(groups), jnp.zeros(groups), jnp.zeros(groups, bool))
+      act.Before(
+        spread(train.params), jnp.zeros(groups), jnp.zeros(groups), jnp.zeros(groups, bool)
+      )
       if rollback
       else None,
     )
@@ -263,13 +262,21 @@ class Loop:
     )  # a weak type would be a second trace, also of a run that goes on
 
   def digest(
-    self, state: LoopState, rows, now, choices: Choices, keys, acceptance=None
+    self,
+    state: LoopState,
+    rows: Row,
+    now: jax.Array,
+    choices: Choices,
+    keys: jax.Array,
+    acceptance: jax.Array | None = None,
   ) -> tuple[LoopState, Digest]:
     """One chunk, jitted; `state` is used up.
 
     Args:
-      rows: rollout.Row, leading (T, groups, 1). now: int32 (), control steps done after the chunk.
-        choices: of the streams.
+      state: before the chunk.
+      rows: leading (T, groups, 1).
+      now: int32 (), control steps done after the chunk.
+      choices: of the streams.
       keys: (groups,), each stream's own, so that what a stream draws does not depend on its
         neighbours.
       acceptance: float32 (groups,), of the robot that each stream has by now, where robots change;
@@ -280,306 +287,56 @@ class Loop:
     """
     return self._program(state, rows, now, choices, keys, acceptance, self.config)
 
-  def _digest(self, state, rows, now, choices, keys, acceptance, config):
+  def _digest(
+    self, state: LoopState, rows: Row, now, choices: Choices, keys, acceptance, config: AdaptConfig
+  ) -> tuple[LoopState, Digest]:
+    agent, was, length = self.agent, state.phase.phase, rows.reward.shape[0]
     split = jax.vmap(lambda key: jax.random.split(jax.random.fold_in(key, now), 3))(keys)
-    key_monitor, key_eval, key_update = split[:, 0], split[:, 1], split[:, 2]
-    length = rows.reward.shape[0]
-    before = state.history
-    history, residual = self.monitor.update(state.acting, state.history, rows, key_monitor)
-    residual = jax.tree.map(lambda x: x[:, :, 0], residual)
-    detector, alarms = jax.lax.scan(jax.vmap(self.detector.update), state.detector, residual)
-    past = jax.tree.map(lambda a, b: jnp.concatenate([a, b])[-a.shape[0] :], state.past, residual)
-
-    dyn, adv, value = self._evaluate(state.train, before, rows, key_eval)
-    reward = jnp.mean(rows.rewards, (0, 2, 3))
-    signals = jnp.stack(
-      [jnp.nanmean(residual.opr, 0), jnp.nanmean(residual.rpr, 0), reward, dyn, adv, value], -1
+    seen, history, detector, past = watch.watch(
+      agent, self.monitor, self.detector, self.spec, state, rows, split[:, :2]
     )
-    index, least_posture = self.spec.posture or (0, -jnp.inf)
-    posture = jnp.mean(rows.final_obs[:, :, 0, index], 0)
 
-    known = (
-      now - length * self.repeat + (jnp.arange(length) + 1) * self.repeat - 1
-    )  # control step at which each row is known
-    acted = alarms.fired & (known >= config.warmup)[:, None]
-    first = jnp.argmax(acted, 0)
-    alarm_step = known[first]
-    # a start that is due at step s is known before the step is taken, so that replay begins with
-    # its row
-    opened = now - length * self.repeat
-    falls = (choices.at >= jnp.maximum(opened, config.warmup)) & (choices.at < now)
-    due, at = jnp.any(falls, 1), jnp.min(jnp.where(falls, choices.at, now), 1)
-    first = jnp.where(due, -((opened - at) // self.repeat) - 1, first)
-    alarm_step = jnp.where(due, at, alarm_step)
+    begin = decide.starts(seen.fired, choices.at, now, self.repeat, config)
     if acceptance is None or config.acceptance is not None:
       acceptance = self.spec.acceptance if config.acceptance is None else config.acceptance
-    step = lambda *x: phase_lib.update(*x[:-3], config, *x[-3:])
-    was = state.phase.phase
-    phase, decision, ok = jax.vmap(
-      step, (0, 0, 0, 0, 0, None, 0, 0 if jnp.ndim(acceptance) else None, None, 0, 0, 0)
-    )(
-      state.phase,
-      signals,
-      posture,
-      jnp.any(acted, 0),
-      alarm_step,
-      now,
-      choices.listens,
-      acceptance,
-      least_posture,
-      due,
-      choices.rule,
-      choices.limit,
+    _, least = self.spec.posture or (0, -jnp.inf)
+    phase, decision, settled = decide.decide(
+      state.phase, seen.signals, seen.posture, begin, now, choices, acceptance, least, config
     )
+    begins = decision == decide.START
 
-    # replay holds what came after the alarm and nothing else
-    begins = decision == phase_lib.START
-    replay = jax.tree.map(
-      lambda a, b: jnp.where(begins.reshape((-1,) + (1,) * (a.ndim - 1)), a, b),
-      *self._counts(state.replay),
-    )
-    keep = jnp.where(
-      begins[None], jnp.arange(length)[:, None] > first[None], (was == phase_lib.ADAPTING)[None]
-    )
-    new, exist = records(rows)
-    exist = exist & jnp.repeat(keep.T, 2, axis=1)[:, None]
-    replay = jax.vmap(replay_lib.add)(
-      state.replay._replace(count=replay[0], queue=replay[1]), new, exist
-    )
-
-    c = self.agent.config
-    windows = jax.vmap(lambda r: replay_lib.windows(r, c.length + 1))(replay)
-    due = (phase.phase == phase_lib.ADAPTING) & (windows >= config.start_windows)
-    owed = jnp.where(due, state.owed + length * config.ratio / (c.batch * c.length), 0.0)
+    replay = learn.fill(state.replay, rows, begins, begin.row, was == decide.ADAPTING)
+    owed = learn.owing(agent, replay, phase.phase == decide.ADAPTING, state.owed, length, config)
     number = jnp.floor(owed + 1e-6).astype(jnp.int32)
     train, acting = state.train, state.acting
     if choices.fresh is not None:
-      train, acting = self._renew(train, acting, keys, begins & choices.fresh)
+      train, acting = learn.renew(agent, train, acting, keys, begins & choices.fresh)
     if config.fresh_moments:
-      fresh = jax.vmap(self.agent.optimizer.init)(train.params)
-      reset = lambda new, old: jnp.where(begins.reshape((-1,) + (1,) * (old.ndim - 1)), new, old)
-      train = train._replace(
-        opt=jax.lax.cond(
-          jnp.any(begins), lambda o: jax.tree.map(reset, fresh, o), lambda o: o, train.opt
-        )
-      )
+      train = learn.fresh_moments(agent, train, begins)
     counted = train.updates
-    train, replay, failed = self._learn(train, replay, key_update, number, choices.world_only)
+    train, replay, failed = learn.learn(
+      agent, train, replay, split[:, 2], number, choices.world_only
+    )
     taken = train.updates - counted
-
-    # a stream whose numbers fail is given up, whatever its phase, and acts on by what it had learnt
-    broken = (failed >= 0) | ~jnp.all(jnp.isfinite(signals[:, SIGNALS.index("dyn_loss") :]), 1)
-    decision = jnp.where(broken & (was != phase_lib.ABORTED), phase_lib.ABORT_NUMERIC, decision)
-    phase = phase._replace(phase=jnp.where(broken, phase_lib.ABORTED, phase.phase))
+    phase, decision = decide.give_up(phase, decision, was, failed, seen.signals)
 
     # the robot acts by a moving average of what it learns, and keeps it when it is done
-    rate = jnp.where(number > 0, config.average, 0.0)
-    ended = (was == phase_lib.ADAPTING) & (phase.phase != phase_lib.ADAPTING)
-    wide = lambda x, like: x.reshape((-1,) + (1,) * (like.ndim - 1))
-    acting = jax.tree.map(lambda a, p: a + wide(rate, a) * (p - a), acting, train.params)
-    back = earned = earns = None
-    old = state.before
-    if old is not None:
-      lived = (
-        was == phase_lib.ADAPTING
-      ) & ~old.learnt  # the chunk just lived is one of the old weights
-      reward_sum, chunks = old.reward + jnp.where(lived, reward, 0.0), old.chunks + lived
-      earned, earns = reward_sum / chunks, jnp.nanmean(phase.ring[:, :, SIGNALS.index("reward")], 1)
-      back = (
-        choices.rollback
-        & ended
-        & (phase.phase == phase_lib.ABORTED)
-        & old.learnt
-        & (earns < earned)
+    acting = act.follow(acting, train.params, number, config.average)
+    before, weighed = state.before, ()
+    if before is not None:
+      reward = seen.signals[:, decide.SIGNALS.index("reward")]
+      acting, before, weighed = act.put_back(
+        acting, before, phase, was, begins, reward, taken, choices.rollback
       )
-      acting = jax.tree.map(lambda a, b: jnp.where(wide(back, a), b, a), acting, old.params)
-      kept = jax.tree.map(lambda a, b: jnp.where(wide(begins, a), a, b), acting, old.params)
-      old = Before(
-        kept,
-        jnp.where(begins, 0.0, reward_sum),
-        jnp.where(begins, 0.0, chunks),
-        ~begins & (old.learnt | (taken > 0)),
-      )
-    train = train._replace(
-      params=jax.tree.map(lambda a, p: jnp.where(wide(ended, a), a, p), acting, train.params)
-    )
+    train = train._replace(params=act.choose(act.ended(was, phase), acting, train.params))
 
     # a stream that is done watches again, its reference refitted on the latest rows
-    over = (decision == phase_lib.STOP) | (decision == phase_lib.END)
-    detector = jax.lax.cond(jnp.any(over), self._refit, lambda d, p, s: d, detector, past, over)
+    over = (decision == decide.STOP) | (decision == decide.END)
+    refit = lambda d, p, s: watch.refit(self.detector, d, p, s)
+    detector = jax.lax.cond(jnp.any(over), refit, lambda d, p, s: d, detector, past, over)
+    executed = state.executed + taken
     state = LoopState(
-      train,
-      acting,
-      replay,
-      history,
-      detector,
-      phase,
-      past,
-      owed - number,
-      state.executed + taken,
-      old,
+      train, acting, replay, history, detector, phase, past, owed - number, executed, before
     )
-    return state, Digest(
-      residual,
-      alarms.score,
-      alarms.fired,
-      signals,
-      ok,
-      phase.phase,
-      decision,
-      phase.since,
-      state.executed,
-      failed,
-      back,
-      earned,
-      earns,
-    )
-
-  @staticmethod
-  def _counts(replay):
-    return (jnp.zeros_like(replay.count), jnp.zeros_like(replay.queue)), (
-      replay.count,
-      replay.queue,
-    )
-
-  def _evaluate(self, train: TrainState, before: History, rows, keys):
-    """Dynamics loss, advantage magnitude and value loss (groups,) on the chunk just lived, without
-    gradient.
-
-    The ring of recent data is the chunk itself with the last record before it as context, so an
-    alarm leaves nothing old in it.
-    """
-    join = lambda old, new: jnp.concatenate([old[-1:].astype(new.dtype), new])[:, :, 0].swapaxes(
-      0, 1
-    )[:, None]  # (groups, 1, 1 + T, ...)
-    done = rows.terminated | rows.truncated
-    deter, stoch, action = (
-      join(before.deter, rows.deter),
-      join(before.stoch, rows.stoch),
-      join(before.action, rows.action),
-    )
-    obs, reward, first = (
-      join(before.obs, rows.obs),
-      join(before.reward, rows.reward_in),
-      join(before.done, rows.first),
-    )
-    first = first.at[:, :, 0].set(True)
-    last = jnp.concatenate([first[:, :, 1:], jnp.zeros_like(first[:, :, :1])], 2)
-    terminal = jnp.concatenate(
-      [jnp.zeros_like(first[:, :, :1]), jnp.zeros_like(done[:, :, 0].T[:, None])], 2
-    )
-    batch = Batch(
-      obs,
-      action,
-      reward,
-      first,
-      last,
-      terminal,
-      deter,
-      stoch,
-      jnp.zeros_like(action),
-      jnp.zeros_like(first),
-    )
-
-    def one(train, batch, key):
-      metrics = self.agent.loss(train.params, train.slow, train.range, batch, key)[1][0]
-      return metrics["loss/dyn"], metrics["adv_mag"], metrics["loss/value"]
-
-    return jax.vmap(one)(train, batch, keys)
-
-  def _renew(self, train: TrainState, acting, keys, fresh):
-    """New parameters, moments and counters where `fresh` (groups,). Loops for the reason given in
-    `_learn`.
-    """
-
-    def stream(g, state):
-      def renew(_, state):
-        train, acting = state
-        new = self.agent.init(jax.random.fold_in(keys[g], FRESH))
-        return put(train, g, new), put(acting, g, new.params)
-
-      return jax.lax.fori_loop(0, fresh[g].astype(jnp.int32), renew, state)
-
-    return jax.lax.fori_loop(0, fresh.shape[0], stream, (train, acting))
-
-  def _learn(self, train: TrainState, replay, keys, number, world_only):
-    """`number` (groups,) updates for each stream. Nested loops with their own trip counts: the
-    carry is changed in place, so a stream without an update costs neither arithmetic nor a copy
-    (`vmap` would compute all, `lax.map` would copy all). All streams lie in one replay, of which an
-    update reads and writes its own windows: taken out of it, a stream's would be copied twice for
-    each update.
-    """
-    c = self.agent.config
-    shapes = jax.tree.map(lambda x: x.shape, replay)
-    together = jax.tree.map(
-      lambda x: x.reshape((-1,) + x.shape[2:]), replay
-    )  # (groups, 1, ..) -> (groups, ..)
-
-    def stream(g, state):
-      def update(state):
-        i, train, replay, _ = state
-        key_sample, key_update = jax.random.split(jax.random.fold_in(keys[g], i))
-        replay, data, address = replay_lib.sample(replay, key_sample, c.batch, c.length + 1, only=g)
-        before = take(train, g)
-        learnt, metrics, latents = self.agent.update(before, data, key_update)
-        return (
-          i + 1,
-          put(train, g, keep_behaviour(world_only[g], before, learnt)),
-          replay_lib.refresh(replay, address, latents),
-          culprit(metrics),
-        )
-
-      train, replay, failed = state
-      more = lambda state: (state[0] < number[g]) & (state[-1] < 0)
-      _, train, replay, bad = jax.lax.while_loop(
-        more, update, (jnp.int32(0), train, replay, jnp.int32(-1))
-      )
-      return train, replay, failed.at[g].set(bad)
-
-    train, together, failed = jax.lax.fori_loop(
-      0, number.shape[0], stream, (train, together, jnp.full(number.shape, -1, jnp.int32))
-    )
-    return (
-      train,
-      jax.tree.map(
-        lambda x, shape: x.reshape(shape),
-        together,
-        shapes,
-        is_leaf=lambda x: isinstance(x, jax.Array),
-      ),
-      failed,
-    )
-
-  def _refit(self, detector, past, stop):
-    fresh = jax.tree.map(
-      lambda x: jnp.broadcast_to(x, (stop.shape[0],) + x.shape), self.detector.init()
-    )
-    fresh, _ = jax.lax.scan(jax.vmap(self.detector.update), fresh, past)
-    return jax.tree.map(
-      lambda a, b: jnp.where(stop.reshape((-1,) + (1,) * (a.ndim - 1)), a, b), fresh, detector
-    )
-
-
-def take(tree, g):
-  """Entry g of every leaf."""
-  return jax.tree.map(lambda x: jax.lax.dynamic_index_in_dim(x, g, keepdims=False), tree)
-
-
-def put(tree, g, value):
-  """`tree` with `value` as entry g of every leaf."""
-  return jax.tree.map(lambda x, v: jax.lax.dynamic_update_index_in_dim(x, v, g, 0), tree, value)
-
-
-def keep_behaviour(keep, before: TrainState, after: TrainState) -> TrainState:
-  """`after`, where `keep` (): with actor, critic, slow critic, range of the returns, and the
-  moments of actor and critic as `before`.
-
-  Zero gradients alone would not do: momentum moves what has none. The value loss on replay still
-  shapes the features, as in every arm.
-  """
-
-  def one(path, old, new):
-    names = {getattr(part, "key", getattr(part, "name", None)) for part in path}
-    return jnp.where(keep, old, new) if names & BEHAVIOUR else new
-
-  return jax.tree_util.tree_map_with_path(one, before, after)
+    said = (phase.phase, decision, phase.since, executed, failed, *weighed)
+    return state, Digest(*seen[:4], settled, *said)

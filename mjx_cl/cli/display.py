@@ -187,7 +187,7 @@ class RunDisplay:
       self.live.stop()
 
   def __call__(self, p) -> None:
-    from mjx_cl.adapt.phase import PHASES
+    from mjx_cl.adapt.decide import PHASES
 
     now = time.monotonic()
     if self.first is None:

@@ -1,7 +1,6 @@
 """DreamerV3 as pure functions over one seed: `init`, `act`, `update`, `evaluate`, `open_loop`.
 
-Loss (all terms means over their elements; section numbers of the facts are the authors' code at
-e3f0224):
+Loss (all terms means over their elements), as in the authors' code (danijar/dreamerv3 at e3f0224):
   L = dyn + 0.1 rep + rec + rew + con + policy + value + 0.3 repval
 """
 

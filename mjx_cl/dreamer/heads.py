@@ -8,6 +8,7 @@ already (behaviour.py).
 from __future__ import annotations
 
 import flax.linen as nn
+import jax
 
 from mjx_cl.dreamer.nets import MLP, Linear, symlog
 
@@ -18,7 +19,7 @@ class Encoder(nn.Module):
   units: int
 
   @nn.compact
-  def __call__(self, obs):
+  def __call__(self, obs: jax.Array) -> jax.Array:
     return MLP(3, self.units, name="mlp")(symlog(obs))
 
 
@@ -29,7 +30,7 @@ class Decoder(nn.Module):
   obs: int
 
   @nn.compact
-  def __call__(self, deter, stoch):
+  def __call__(self, deter: jax.Array, stoch: jax.Array) -> jax.Array:
     return Linear(self.obs, name="out")(MLP(3, self.units, name="mlp")(stoch, deter))
 
 
@@ -44,7 +45,7 @@ class Head(nn.Module):
   outscale: float
 
   @nn.compact
-  def __call__(self, *features, pre=None):
+  def __call__(self, *features: jax.Array, pre: jax.Array | None = None) -> jax.Array:
     return Linear(self.out, self.outscale, name="out")(
       MLP(self.layers, self.units, name="mlp")(*features, pre=pre)
     )
@@ -57,6 +58,8 @@ class PolicyHead(nn.Module):
   act: int
 
   @nn.compact
-  def __call__(self, *features, pre=None):
+  def __call__(
+    self, *features: jax.Array, pre: jax.Array | None = None
+  ) -> tuple[jax.Array, jax.Array]:
     x = MLP(3, self.units, name="mlp")(*features, pre=pre)
     return Linear(self.act, 0.01, name="mean")(x), Linear(self.act, 0.01, name="std")(x)

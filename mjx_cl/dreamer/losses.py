@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 
-def lambda_return(r_t, c_t, v_t, lam: float):
+def lambda_return(r_t: jax.Array, c_t: jax.Array, v_t: jax.Array, lam: float) -> jax.Array:
   """Imagined returns (H, N) from reward, continue and value at states 1..H, each (H, N).
 
   R_i = r_{i+1} + c_{i+1} ((1 - lam) v_{i+1} + lam R_{i+1}),   i = H-1..0,   R_H = v_H;   c already
@@ -23,7 +23,14 @@ def lambda_return(r_t, c_t, v_t, lam: float):
   return jax.lax.scan(step, v_t[-1], (r_t, c_t, v_t), reverse=True)[1]
 
 
-def replay_return(r_t, terminal_t, last_t, boot_t, lam: float, discount: float):
+def replay_return(
+  r_t: jax.Array,
+  terminal_t: jax.Array,
+  last_t: jax.Array,
+  boot_t: jax.Array,
+  lam: float,
+  discount: float,
+) -> jax.Array:
   """Replay-value targets (T-1, N) from arrays over T replayed steps.
 
     G_{T-1} = b_{T-1};   G_t = r_{t+1} + (1 - terminal_{t+1}) discount [(1 - l_{t+1}) b_{t+1} +
@@ -43,7 +50,9 @@ def replay_return(r_t, terminal_t, last_t, boot_t, lam: float, discount: float):
   return jax.lax.scan(step, boot_t[-1], xs, reverse=True)[1]
 
 
-def update_range(low_high, returns, rate: float):
+def update_range(
+  low_high: jax.Array, returns: jax.Array, rate: float
+) -> tuple[jax.Array, jax.Array]:
   """Percentile normaliser: EMA (rate, from 0, no bias correction) of the 5th and 95th percentile of
   `returns`.
 

@@ -8,6 +8,7 @@ is Linear -> RMSNorm -> SiLU.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import flax
 import flax.linen as nn
@@ -16,24 +17,24 @@ import jax.numpy as jnp
 import numpy as np
 
 
-def symlog(x):
+def symlog(x: jax.Array) -> jax.Array:
   """sign(x) ln(1 + |x|), elementwise."""
   return jnp.sign(x) * jnp.log1p(jnp.abs(x))
 
 
-def symexp(x):
+def symexp(x: jax.Array) -> jax.Array:
   """sign(x) (exp|x| - 1), the inverse of `symlog`."""
   return jnp.sign(x) * jnp.expm1(jnp.abs(x))
 
 
-def in_a_row(draw, key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
+def in_a_row(draw: Callable, key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
   """`draw(key, shape)`, the same numbers, drawn as one row: loops over short axes are unrolled,
   which takes LLVM a second for every draw of an update.
   """
   return draw(key, (math.prod(shape),)).reshape(shape)
 
 
-def kernel_init(fan_in: int, outscale: float = 1.0):
+def kernel_init(fan_in: int, outscale: float = 1.0) -> Callable:
   """Initialiser with the deviation outscale sqrt(1 / fan_in); outscale 0 gives exact zeros."""
 
   def init(key, shape, dtype=jnp.float32):
@@ -49,7 +50,7 @@ def kernel_init(fan_in: int, outscale: float = 1.0):
   return init
 
 
-def parameter(module: nn.Module, name: str, init, shape: tuple[int, ...]) -> jax.Array:
+def parameter(module: nn.Module, name: str, init: Callable, shape: tuple[int, ...]) -> jax.Array:
   """`module.param(name, init, shape)`. Flax traces the initialiser at every use, to compare shapes:
   an eighth of an update's tracing. Here they are compared as they are.
   """
@@ -70,7 +71,7 @@ class Linear(nn.Module):
   outscale: float = 1.0
 
   @nn.compact
-  def __call__(self, *xs):
+  def __call__(self, *xs: jax.Array) -> jax.Array:
     fan_in = sum(x.shape[-1] for x in xs)
     kernel = parameter(self, "kernel", kernel_init(fan_in, self.outscale), (fan_in, self.units))
     bias = parameter(self, "bias", nn.initializers.zeros, (self.units,))
@@ -93,18 +94,18 @@ class Norm(nn.Module):
   """RMSNorm over the last axis: x g / sqrt(mean(x^2) + 1e-4), g initially 1."""
 
   @nn.compact
-  def __call__(self, x):
+  def __call__(self, x: jax.Array) -> jax.Array:
     gain = parameter(self, "gain", nn.initializers.ones, (x.shape[-1],))
     return x * jax.lax.rsqrt(mean_square(x) + 1e-4) * gain
 
 
 class Hidden(nn.Module):
-  """Linear -> RMSNorm -> SiLU. `pre`: the linear layer's output, where the caller has it already."""
+  """Linear -> RMSNorm -> SiLU. `pre`: the linear layer's output, where a caller has it already."""
 
   units: int
 
   @nn.compact
-  def __call__(self, *xs, pre=None):
+  def __call__(self, *xs: jax.Array, pre: jax.Array | None = None) -> jax.Array:
     return nn.silu(
       Norm(name="norm")(Linear(self.units, name="linear")(*xs) if pre is None else pre)
     )
@@ -119,7 +120,7 @@ class MLP(nn.Module):
   units: int
 
   @nn.compact
-  def __call__(self, *xs, pre=None):
+  def __call__(self, *xs: jax.Array, pre: jax.Array | None = None) -> jax.Array:
     for i in range(self.layers):
       xs, pre = (Hidden(self.units, name=f"hidden{i}")(*xs, pre=pre),), None
     return xs[0]
@@ -137,21 +138,9 @@ def two_hot_bins(num: int = 255) -> np.ndarray:
   return np.concatenate([half, -half[:-1][::-1]])
 
 
-def two_hot(x: jax.Array, bins: jax.Array) -> jax.Array:
-  """Target distribution (..., bins) of x (...): weight on the two neighbouring bins, linear in raw
-  distance, ends clipped.
-  """
-  below = jnp.clip(jnp.searchsorted(bins, x, side="right") - 1, 0, len(bins) - 2)
-  low, high = bins[below], bins[below + 1]
-  weight = jnp.clip((x - low) / (high - low), 0.0, 1.0)
-  index = jnp.arange(len(bins))
-  return jnp.where(index == below[..., None], (1 - weight)[..., None], 0.0) + jnp.where(
-    index == below[..., None] + 1, weight[..., None], 0.0
-  )
-
-
 def two_hot_loss(logits: jax.Array, x: jax.Array, bins: jax.Array) -> jax.Array:
-  """Cross-entropy [nats] (...) of logits (..., bins) against the two-hot of x (...).
+  """Cross-entropy [nats] (...) of logits (..., bins) against the two-hot of x (...): weight on the
+  two neighbouring bins, linear in raw distance, ends clipped.
 
   Only the two weighted entries of log-softmax are read; the target is never built.
   """

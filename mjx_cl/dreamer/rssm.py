@@ -16,12 +16,12 @@ from mjx_cl.sizes import Size
 UNIMIX = 0.01
 
 
-def dense_part(kernel, own: int):
+def dense_part(kernel: jax.Array, own: int) -> jax.Array:
   """The rows of a block kernel that meet the shared inputs, as one matrix (shared, blocks out)."""
   return kernel[:, own:].transpose(1, 0, 2).reshape(kernel.shape[1] - own, -1)
 
 
-def hoist(params) -> dict:
+def hoist(params: dict) -> dict:
   """Variables of an `RSSM` with the re-arranged kernel beside the parameters: a scan over the core
   then does not re-arrange it every step.
   """
@@ -44,7 +44,7 @@ class BlockLinear(nn.Module):
   units: int  # outputs per block
 
   @nn.compact
-  def __call__(self, x, shared=None):
+  def __call__(self, x: jax.Array, shared: jax.Array | None = None) -> jax.Array:
     blocks, rows, own = x.shape
     extra = 0 if shared is None else shared.shape[-1]
     kernel = parameter(
@@ -66,7 +66,7 @@ class BlockNorm(nn.Module):
   """RMSNorm over the whole concatenated vector of (blocks, rows, width)."""
 
   @nn.compact
-  def __call__(self, x):
+  def __call__(self, x: jax.Array) -> jax.Array:
     blocks, _, width = x.shape
     gain = parameter(self, "gain", nn.initializers.ones, (blocks * width,)).reshape(
       blocks, 1, width
@@ -74,7 +74,7 @@ class BlockNorm(nn.Module):
     return x * jax.lax.rsqrt(jnp.mean(mean_square(x), 0, keepdims=True) + 1e-4) * gain
 
 
-def clip_action(action):
+def clip_action(action: jax.Array) -> jax.Array:
   """A / sg(max(1, |a|)): outside [-1, 1] the bound, inside the identity."""
   return action / jax.lax.stop_gradient(jnp.maximum(1.0, jnp.abs(action)))
 
@@ -90,7 +90,7 @@ class RSSM(nn.Module):
 
   size: Size
 
-  def setup(self):
+  def setup(self) -> None:
     s = self.size
     self.in_deter, self.in_stoch, self.in_action = (
       Hidden(s.hidden, name=n) for n in ("in_deter", "in_stoch", "in_action")
@@ -113,12 +113,12 @@ class RSSM(nn.Module):
     deter = self.core(deter, stoch, action)
     return self.prior(deter), self.posterior(deter, tokens)
 
-  def cut(self, deter):
+  def cut(self, deter: jax.Array) -> jax.Array:
     """(N, D) -> (blocks, N, D / blocks), the layout in which the block-diagonal products run."""
     blocks = self.size.blocks
     return deter.reshape(deter.shape[0], blocks, -1).transpose(1, 0, 2)
 
-  def core(self, deter, stoch, action):
+  def core(self, deter: jax.Array, stoch: jax.Array, action: jax.Array) -> jax.Array:
     """Deter' (N, D)."""
     return join(self.core_cut(self.cut(deter), deter, stoch, action))
 
@@ -143,20 +143,20 @@ class RSSM(nn.Module):
     update = jax.nn.sigmoid(u - 1.0)
     return update * jnp.tanh(jax.nn.sigmoid(r) * c) + (1.0 - update) * chunks
 
-  def prior(self, deter):
+  def prior(self, deter: jax.Array) -> jax.Array:
     """Logits (N, stoch, classes) of p(z | deter)."""
     return self.prior_out(self.prior_mlp(deter)).reshape(
       deter.shape[:-1] + (self.size.stoch, self.size.classes)
     )
 
-  def posterior(self, deter, tokens):
+  def posterior(self, deter: jax.Array, tokens: jax.Array) -> jax.Array:
     """Logits (N, stoch, classes) of q(z | deter, tokens), tokens (N, units) from the encoder."""
     return self.post_out(self.post_hidden(deter, tokens)).reshape(
       deter.shape[:-1] + (self.size.stoch, self.size.classes)
     )
 
 
-def join(chunks):
+def join(chunks: jax.Array) -> jax.Array:
   """(blocks, N, width) -> (N, blocks width), the inverse of `RSSM.cut`."""
   return chunks.transpose(1, 0, 2).reshape(chunks.shape[1], -1)
 

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 
 from mjx_cl.errors import UserError
 from mjx_cl.faults import schedule
+from mjx_cl.keys import OfFaults
 from mjx_cl.types import Model
 
 
@@ -228,7 +229,7 @@ def drive(faults, injection: Injection, t: jax.Array, key: jax.Array, ports: Por
     (injection', ports', severity of each fault now, float32 (F,)).
   """
   faults = as_tuple(faults)
-  walk = schedule.walk(injection.plan, injection.walk, t, jax.random.fold_in(key, 10_000))
+  walk = schedule.walk(injection.plan, injection.walk, t, jax.random.fold_in(key, OfFaults.WALK))
   injection = injection._replace(walk=walk)
   severity = schedule.severity(injection.plan, walk, t) * jnp.asarray(
     [bool(f.owns) for f in faults], jnp.float32

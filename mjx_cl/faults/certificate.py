@@ -15,6 +15,7 @@ import numpy as np
 
 from mjx_cl import faults as faults_lib
 from mjx_cl.faults import presets, schedule
+from mjx_cl.keys import OfStep
 
 SEVERITIES = (0.0, 0.25, 0.5, 0.75, 1.0)
 AFTER = (1, 10, 100)  # control steps at which the size of the difference is reported
@@ -136,12 +137,12 @@ def live(env, faults: tuple, model, key: jax.Array, injection, signal: jax.Array
       faults,
       injection,
       t,
-      jax.random.fold_in(now, 1),
+      jax.random.fold_in(now, OfStep.FAULTS),
       faults_lib.Ports(model, ctrl=action, first=t == 0),
     )
     state, out = env.step(ports.model, state, ports.ctrl)
     injection, obs = faults_lib.sense(
-      faults, injection, t + 1, jax.random.fold_in(now, 4), model, out.final_obs
+      faults, injection, t + 1, jax.random.fold_in(now, OfStep.READING), model, out.final_obs
     )
     return (state, injection), (obs, out.reward, out.terminated)
 

@@ -25,6 +25,7 @@ from mjx_cl.detectors.combine import read
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.io import arrays, folders, runtime
 from mjx_cl.io import tables as store
+from mjx_cl.keys import OfSeed
 from mjx_cl.leaderboard.streams import COLUMNS, LATENT, META, SCHEMA, VERSION, Suite
 from mjx_cl.rollout.frozen import stream_keys
 from mjx_cl.rollout.monitor import Monitor, watched
@@ -40,7 +41,6 @@ MADE = (
   "machine",
 )  # of config.json: how a set was made
 HELD = "held.json"  # config.json of the set whose files are being replaced
-WATCH = 2_000  # what is folded into a lane's key for the monitor's draws
 
 
 class Lane(NamedTuple):
@@ -154,7 +154,7 @@ def _record(
   healthy = sum(lane.fault is None for lane in lanes_)
   watch, remember = jax.jit(monitor.update_each), jax.jit(monitor.remember)
   draws = jax.vmap(
-    lambda key, chunk: jax.random.fold_in(jax.random.fold_in(key, WATCH), chunk), (0, None)
+    lambda key, chunk: jax.random.fold_in(jax.random.fold_in(key, OfSeed.WATCH), chunk), (0, None)
   )
   history = monitor.init(1, len(lanes_))
   out: dict[str, list] = {c: [] for c in COLUMNS + ("episode", "terminated", "latent")}

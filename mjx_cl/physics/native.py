@@ -23,7 +23,7 @@ import mujoco
 import numpy as np
 
 from mjx_cl.errors import UserError
-from mjx_cl.physics import DERIVING, by_name
+from mjx_cl.physics import DERIVING, host_call
 
 
 def float64_bits(x: jax.Array) -> jax.Array:
@@ -116,12 +116,12 @@ class Native:
       lambda: Host(copy.copy(mj_model), substeps, self.outputs, law),
       identity(mj_model, substeps, self.outputs, law),
     )
-    self.host = by_name.shared(name, make)
+    self.host = host_call.shared(name, make)
     if getattr(self.host.law, "__globals__", None) is not getattr(
       law, "__globals__", None
     ):  # the same words in another module of the same name
       name = uuid.uuid4().hex
-      self.host = by_name.shared(name, make)
+      self.host = host_call.shared(name, make)
     self._name = name
     self._qpos_at = mujoco.mj_stateSize(mj_model, mujoco.mjtState.mjSTATE_TIME)
 
@@ -162,7 +162,7 @@ class Native:
     layout = json.dumps([(k, v.shape) for k, v in given.items()])
     bits = lambda x: jax.lax.bitcast_convert_type(x, jnp.uint32).reshape(-1)
     width = state.shape[0] + sum(int(np.prod(s)) for s in self.host.shapes.values())
-    out = by_name.call(
+    out = host_call.call(
       self._name, layout, width, jnp.concatenate([state] + [bits(v) for v in given.values()])
     )
     values, at = {}, state.shape[0]

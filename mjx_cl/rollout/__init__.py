@@ -1,1 +1,4 @@
-"""Robots, agents and faults in one scan: acting, residuals of the predictions, transfer to another robot."""
+"""Robots, agents and faults in one scan: acting, residuals of the predictions, transfers.
+
+Imports faults and dreamer, and what lies below them.
+"""

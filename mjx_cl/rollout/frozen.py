@@ -1,4 +1,4 @@
-"""Residual streams of an agent that does not adapt: what detectors are calibrated and compared on."""
+"""Residual streams of an agent that does not adapt, for calibrating and comparing detectors."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 
 from mjx_cl import faults as faults_lib
 from mjx_cl.config import CHUNK
+from mjx_cl.keys import OfSeed
 from mjx_cl.rollout.monitor import Monitor
 from mjx_cl.rollout.scan import Rollout, nest, start
 
@@ -17,7 +18,7 @@ def stream_keys(seeds, streams: int) -> jax.Array:
   one that `run` uses.
   """
   keys = [
-    jax.random.key(s) if i == 0 else jax.random.fold_in(jax.random.key(s), 1000 + i)
+    jax.random.key(s) if i == 0 else jax.random.fold_in(jax.random.key(s), OfSeed.FURTHER + i)
     for s in seeds
     for i in range(streams)
   ]

@@ -9,6 +9,7 @@ arriving. A reset touches neither the fault clock nor a detector.
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -17,6 +18,7 @@ import jax.numpy as jnp
 from mjx_cl import faults as faults_lib
 from mjx_cl.dreamer.agent import Carry
 from mjx_cl.dreamer.replay import Record
+from mjx_cl.keys import OfStep
 from mjx_cl.types import EnvState
 
 STRETCH = 16  # control steps under one random action, where a robot is shaken
@@ -90,21 +92,22 @@ def start(
     fault: Fault or tuple of F. severity, onset, duration, target: () or (F,). plan: in place of
       severity, onset and duration.
   """
+  t = jnp.int32(0)
   key_env, key_fault, key = jax.random.split(key, 3)
   injection = faults_lib.begin(
     fault, key_fault, faults_lib.plan(severity, onset, duration) if plan is None else plan, target
   )
   now, model = (
-    jax.random.fold_in(key, 0),
+    jax.random.fold_in(key, t),
     faults_lib.owned_model(faults_lib.as_tuple(fault), env.model),
   )
   ports = faults_lib.Ports(model, ctrl=jnp.zeros(len(env.spec.act)), first=True)
   _, ports, _ = faults_lib.drive(
-    fault, injection, jnp.int32(0), jax.random.fold_in(now, 1), ports
+    fault, injection, t, jax.random.fold_in(now, OfStep.FAULTS), ports
   )  # onset 0: the first episode is of the faulty robot
   env_state, obs = env.init(ports.model, key_env)
   injection, obs = faults_lib.sense(
-    fault, injection, jnp.int32(0), jax.random.fold_in(now, 5), model, obs, True
+    fault, injection, t, jax.random.fold_in(now, OfStep.FIRST_READING), model, obs, True
   )
   return Stream(
     env_state,
@@ -113,13 +116,13 @@ def start(
     jnp.float32(0),
     jnp.bool_(True),
     key,
-    jnp.int32(0),
+    t,
     jnp.int32(0),
     injection,
   )
 
 
-def nest(function, in_axes_group, in_axes_member):
+def nest(function: Callable, in_axes_group, in_axes_member) -> Callable:
   """Vmap over groups, then over members."""
   return jax.vmap(jax.vmap(function, in_axes_member), in_axes_group)
 
@@ -150,9 +153,9 @@ class Rollout:
     self.deterministic, self.expert, self.expert_noise = deterministic, expert, expert_noise
     self.chunk = functools.partial(jax.jit, static_argnames=("length",))(self._chunk)
 
-  def _decide(self, params, stream: Stream, drive, shake, jitter):
+  def _decide(self, params, stream: Stream, drive, shake):
     key = jax.random.fold_in(stream.key, stream.t)
-    key_act, key_expert = jax.random.split(jax.random.fold_in(key, 0))
+    key_act, key_expert = jax.random.split(jax.random.fold_in(key, OfStep.ACT))
     carry, action = self.agent.act(params, stream.agent, stream.obs, key_act, self.deterministic)
     demo, has_demo = jnp.zeros_like(action), jnp.bool_(False)
     if self.expert is not None:
@@ -162,13 +165,10 @@ class Rollout:
       carry = carry._replace(action=action)
     if shake is not None:
       key_stretch, key_push = jax.random.split(
-        jax.random.fold_in(jax.random.fold_in(stream.key, stream.t // STRETCH), 3)
+        jax.random.fold_in(jax.random.fold_in(stream.key, stream.t // STRETCH), OfStep.SHAKE)
       )
       push = jax.random.uniform(key_push, action.shape, minval=-1.0, maxval=1.0)
       action = jnp.where(jax.random.uniform(key_stretch) < shake, push, action)
-      carry = carry._replace(action=action)
-    if jitter is not None:
-      action = action + jitter * jax.random.normal(jax.random.fold_in(key, 1), action.shape)
       carry = carry._replace(action=action)
     return carry, action, demo, has_demo
 
@@ -178,7 +178,12 @@ class Rollout:
     injection, ports, severity = self._drive(stream, now, action)
     env_state, out = self.env.step(ports.model, stream.env, ports.ctrl)
     injection, obs = faults_lib.sense(
-      self.fault, injection, stream.t + 1, jax.random.fold_in(now, 4), self.model, out.final_obs
+      self.fault,
+      injection,
+      stream.t + 1,
+      jax.random.fold_in(now, OfStep.READING),
+      self.model,
+      out.final_obs,
     )
     out = out._replace(obs=obs, final_obs=obs)
     return (
@@ -190,10 +195,10 @@ class Rollout:
   def _drive(self, stream: Stream, now, action):
     ports = faults_lib.Ports(self.model, ctrl=action, first=stream.first)
     return faults_lib.drive(
-      self.fault, stream.injection, stream.t, jax.random.fold_in(now, 1), ports
+      self.fault, stream.injection, stream.t, jax.random.fold_in(now, OfStep.FAULTS), ports
     )
 
-  def _chunk(self, params, streams: Stream, length: int, drive=None, shake=None, jitter=None):
+  def _chunk(self, params, streams: Stream, length: int, drive=None, shake=None):
     """`length` decisions.
 
     Args:
@@ -202,20 +207,19 @@ class Rollout:
       drive: bool (groups, members), the expert acts; used only where there is one.
       shake: float32 (groups, members), probability that a stretch of STRETCH control steps is
         driven by one random action, uniform in [-1, 1], in place of the policy's; None: never.
-      jitter: float32 (groups, members), deviation of white noise on the action; None: none.
 
     Returns:
       (streams', Row with leading (length, groups, members)).
     """
     if drive is None:
       drive = jnp.zeros(streams.t.shape, bool)
-    disturbed = tuple(None if x is None else 0 for x in (shake, jitter))
-    decide = nest(self._decide, (0, 0, 0) + disturbed, (None, 0, 0) + disturbed)
+    shaken = None if shake is None else 0
+    decide = nest(self._decide, (0, 0, 0, shaken), (None, 0, 0, shaken))
     control = nest(self._control, (0, 0), (0, 0))
     params = jax.vmap(self.agent.prepare)(params)
 
     def step(streams: Stream, _):
-      carry, action, demo, has_demo = decide(params, streams, drive, shake, jitter)
+      carry, action, demo, has_demo = decide(params, streams, drive, shake)
       before = streams
       streams, out, severity = control(streams, action)
       rewards, severities = [out.reward], [severity]
@@ -270,9 +274,15 @@ class Rollout:
       _, ports, _ = self._drive(
         stream, now, jnp.zeros(len(self.env.spec.act))
       )  # a task that has changed draws its episodes otherwise
-      env_state, obs = self.env.init(ports.model, jax.random.fold_in(now, 2))
+      env_state, obs = self.env.init(ports.model, jax.random.fold_in(now, OfStep.EPISODE))
       injection, obs = faults_lib.sense(
-        self.fault, stream.injection, stream.t, jax.random.fold_in(now, 5), self.model, obs, True
+        self.fault,
+        stream.injection,
+        stream.t,
+        jax.random.fold_in(now, OfStep.FIRST_READING),
+        self.model,
+        obs,
+        True,
       )
       new = stream._replace(
         env=env_state,
@@ -288,12 +298,12 @@ class Rollout:
     return nest(one, (0, 0), (0, 0))(streams, done)
 
 
-def expand(mask, like):
+def expand(mask: jax.Array, like: jax.Array) -> jax.Array:
   """Appends axes to `mask` until it broadcasts against `like`."""
   return mask.reshape(mask.shape + (1,) * (like.ndim - mask.ndim))
 
 
-def records(rows: Row):
+def records(rows: Row) -> tuple[Record, jax.Array]:
   """Rows (T, groups, members) -> replay records (groups, members, 2 T) and which of them exist.
 
   Every decision gives a record; an episode's end gives one more, of the final observation, with

@@ -13,9 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mjx_cl.adapt import phase as phase_lib
+from mjx_cl.adapt import decide as phase_lib
 from mjx_cl.adapt.arms import ARMS, FOREVER, NEVER
-from mjx_cl.adapt.convergence import SIGNALS
+from mjx_cl.adapt.decide import SIGNALS
 from mjx_cl.config import AdaptConfig, RunConfig
 from mjx_cl.errors import FileError
 from mjx_cl.io import tables

@@ -30,17 +30,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_cl import detectors, envs, faults
-from mjx_cl.adapt import phase as phase_lib
+from mjx_cl.adapt import decide as phase_lib
 from mjx_cl.adapt.arms import ARMS, FOREVER, never_stops
 from mjx_cl.adapt.blocks import Crew
-from mjx_cl.adapt.convergence import SIGNALS
-from mjx_cl.adapt.loop import Choices, Loop, LoopState, choices
+from mjx_cl.adapt.decide import SIGNALS
+from mjx_cl.adapt.loop import Choices, Loop, LoopState, Programs, choices
 from mjx_cl.config import CHUNK, RunConfig, becomes, changes
 from mjx_cl.dreamer import replay
 from mjx_cl.dreamer.agent import CAUSES, EXPLODED
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.io import arrays, checkpoints, folders, runtime, tables
 from mjx_cl.io.interrupt import Interruptible
+from mjx_cl.keys import OfSeed
 from mjx_cl.render import figures
 from mjx_cl.rollout.monitor import Monitor
 from mjx_cl.rollout.order import Lanes
@@ -102,7 +103,7 @@ class Runner:
   Another number of arms or seeds is another program, which rounds otherwise.
   """
 
-  def __init__(self, config: RunConfig, out):
+  def __init__(self, config: RunConfig, out, programs: Programs | None = None):
     self.config, self.out = config, pathlib.Path(out)
     self.env = envs.make(config.env, config.physics)
     self.other = (
@@ -182,12 +183,13 @@ class Runner:
         self.repeat,
         capacity=needs(config.steps),
         same=same,
+        programs=Programs() if programs is None else programs,
       ),
       self.groups,
     )
     self.breaks = np.asarray([ARMS[arm].breaks for arm, _ in self.labels])
     keys = jnp.stack([jax.random.key(seed) for _, seed in self.labels])[:, None]
-    self.keys = jax.vmap(lambda k: jax.random.fold_in(k, 7))(keys[:, 0])
+    self.keys = jax.vmap(lambda k: jax.random.fold_in(k, OfSeed.ADAPTATION))(keys[:, 0])
     trains = [
       self.others[arm].train if arm in self.others else self.trained.train for arm, _ in self.labels
     ]
@@ -625,9 +627,10 @@ def execute(
   progress=lambda p: None,
   save_every_s: float = 60.0,
   tell=lambda text: None,
+  programs: Programs | None = None,
 ) -> dict:
   """Runs `config` into `out` and returns summary.json's value. A kill at any moment loses at most
-  `save_every_s` seconds of work.
+  `save_every_s` seconds of work. `programs`: compiled ones of this process that it may share.
   """
   fresh = not pathlib.Path(out).exists()
   state, out = folders.claim_folder(out, resume, overwrite), pathlib.Path(out)
@@ -638,7 +641,7 @@ def execute(
     return tables.read_json(out / "summary.json")
   try:
     runner = Runner(
-      config, out
+      config, out, programs
     )  # refuses wrong names and broken agents before anything of an earlier run is removed
   except UserError:
     if fresh and not any(out.iterdir()):

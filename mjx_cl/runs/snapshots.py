@@ -17,11 +17,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_cl import faults as faults_lib
-from mjx_cl.adapt import phase as phase_lib
+from mjx_cl.adapt import decide as phase_lib
 from mjx_cl.adapt.arms import ARMS, never_stops
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.io import arrays, folders
 from mjx_cl.io.interrupt import Interruptible
+from mjx_cl.keys import OfSeed
 from mjx_cl.rollout.scan import Rollout, nest, start
 from mjx_cl.training.episodes import Episodes
 
@@ -31,7 +32,6 @@ LIMIT_MIB = 2048  # of snapshots on the disk
 BATCH = 32  # snapshots evaluated side by side ...
 BATCH_MIB = 256  # ... unless their weights together are more
 LENGTH = 50  # decisions per call
-KEY = 9  # what a seed's key folds in for its episodes; a run folds in 7
 
 
 class Snapshot(NamedTuple):
@@ -239,7 +239,7 @@ class Snapshots:
     keys = jnp.stack(
       [
         jax.random.split(
-          jax.random.fold_in(jax.random.key(self.labels[s.stream][1]), KEY), EPISODES
+          jax.random.fold_in(jax.random.key(self.labels[s.stream][1]), OfSeed.SNAPSHOTS), EPISODES
         )
         for s in batch
       ]

@@ -846,7 +846,7 @@ def execute(
 
     workers.together(worker, out, names, min(jobs, len(names)), end, tell)
     return collect(out, plan, known)
-  spent, expected, known = 0.0, 0.0, {}
+  spent, expected, known, programs = 0.0, 0.0, {}, run.Programs()
   for i, part in enumerate(todo):
     guess = lambda p: estimates[p.name].seconds if estimates else 0.0
     if estimates:
@@ -856,7 +856,12 @@ def execute(
     begun = (out / part.name / "config.json").exists()
     with (display or _silent)() as progress:
       run.execute(
-        part.config, out / part.name, resume=begun, progress=progress, save_every_s=save_every_s
+        part.config,
+        out / part.name,
+        resume=begun,
+        progress=progress,
+        save_every_s=save_every_s,
+        programs=programs,
       )
     spent, expected = spent + time.monotonic() - begin, expected + guess(part)
     collect(out, plan, known)

@@ -2,7 +2,7 @@
 
 A row is an onset, alarm, start, stop, abort, rollback or repair (`kind`). `cause` says of an onset
 or repair what changes, of an alarm whether it is acted on or why not, of a start what triggered it.
-`decision` is that of the phase machine where the event is one (phase.DECISIONS), `since` the
+`decision` is that of the phase machine where the event is one (decide.DECISIONS), `since` the
 control step of what began the adaptation that it starts or ends, `chunk` the number of the chunk
 that `step` lies in. `reason` is for people.
 """
@@ -14,7 +14,7 @@ import pathlib
 
 import pyarrow
 
-from mjx_cl.adapt import phase
+from mjx_cl.adapt import decide
 from mjx_cl.config import CHUNK
 from mjx_cl.io import tables
 
@@ -67,7 +67,7 @@ def typed(events: list[dict], chunk_steps: int) -> list[dict]:
       begun[e["stream"]] = since
     elif kind in ("stop", "abort"):
       cause, since = None, begun.get(e["stream"])
-      decision = phase.DECISIONS[phase.REASONS.index(said)]
+      decision = decide.DECISIONS[decide.REASONS.index(said)]
     elif kind == "rollback":
       cause, since = None, begun.get(e["stream"])
     elif cause.startswith(("severity ", "after ")):  # of the only fault

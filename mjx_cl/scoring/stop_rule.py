@@ -17,10 +17,9 @@ import numpy as np
 import pyarrow
 import pyarrow.parquet
 
-from mjx_cl.adapt import phase
+from mjx_cl.adapt import decide
 from mjx_cl.adapt.arms import ARMS, never_stops, stops
-from mjx_cl.adapt.convergence import SIGNALS
-from mjx_cl.adapt.phase import REASONS, START, STOP
+from mjx_cl.adapt.decide import REASONS, SIGNALS, START, STOP
 from mjx_cl.config import AdaptConfig
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.io import folders, tables
@@ -273,8 +272,8 @@ def ablation(folder, **rule) -> list[dict]:
   """When the stop rule would have ended the first adaptation of each stream that never stops, had
   it not asked a signal to settle.
 
-  The phase machine of a run (adapt.phase) lives once more over the recorded chunk signals. A reward
-  that is left out need not settle, but must still be accepted. Until the stop this is the life of
+  The phase machine of a run (adapt.decide) lives once more over the recorded chunk signals. A
+  reward that is left out need not settle, but must still be accepted. Until the stop this is the life of
   arm `oracle` in the same seed, as far as both were rounded alike (run.Runner).
 
   Args:
@@ -404,7 +403,7 @@ def _relive(own, since, names, config):
     def step(state, x):
       signals, posture, acceptance, now = x
       falls = (since >= now - length) & (since < now)
-      state, decision, _ = phase.update(
+      state, decision, _ = decide.update(
         state,
         signals,
         posture,
@@ -420,9 +419,9 @@ def _relive(own, since, names, config):
       )
       return state, decision
 
-    return jax.lax.scan(step, phase.init(config), (signals, posture, acceptance, jnp.asarray(now)))[
-      1
-    ]
+    return jax.lax.scan(
+      step, decide.init(config), (signals, posture, acceptance, jnp.asarray(now))
+    )[1]
 
   every = jax.vmap(jax.vmap(live, (None, None, None, None, 0)), (0, 0, 0, 0, None))
   decisions = jax.jit(every)(

@@ -26,11 +26,11 @@ from mjx_cl.errors import FileError, UserError, choose
 from mjx_cl.faults import presets
 from mjx_cl.io import checkpoints, folders, runtime, tables
 from mjx_cl.io.interrupt import Interruptible
+from mjx_cl.keys import OfStream
 from mjx_cl.rollout.scan import Rollout, Stream, nest, records, start
 from mjx_cl.training import agents, demonstrator, episodes, evaluate, needs
 
 DEMONSTRATOR_STEPS = 8_000_000
-FAULT = 11  # folded into a stream's key for the draw of its faults
 
 
 class Learner(NamedTuple):
@@ -326,10 +326,10 @@ class Trainer:
     self.failed: dict[int, str] = {}  # seed -> the term that was not finite, and when
     fault, self.plan, self.target = faults_of(env, config)
     self.collect = {"pure": Rollout(env, self.plain, fault, config.repeat)}
-    if dreamer.anchor and (config.shake or config.jitter):
+    if dreamer.anchor and config.shake:
       raise UserError(
-        "anchor holds the policy to the actions taken; shake and jitter put random ones among "
-        "them: set both to 0"
+        "anchor holds the policy to the actions taken; shake puts random ones among them: set it "
+        "to 0"
       )
     self.learn = {"pure": make_learn(self.plain, dreamer.batch, dreamer.length, self.mesh)}
     if self.expert:
@@ -399,17 +399,6 @@ class Trainer:
     )
     return shake
 
-  def _jitter(self):
-    """Deviation of the noise on each robot's actions, or None."""
-    if not self.config.jitter:
-      return None
-    count = round(self.config.shake_share * self.config.envs)
-    jitter = np.zeros((self.seeds, self.config.envs), np.float32)
-    jitter[:, self.config.envs - count :] = (
-      self.config.jitter * np.arange(1, count + 1) / max(1, count)
-    )
-    return jitter
-
   def _weights(self) -> Weights:
     done, c = self.updates, self.config
     left = c.updates - done
@@ -448,7 +437,7 @@ class Trainer:
     if self.plan is not None:
       return self.plan
     return faults.plan(
-      self.config.severity * jax.random.uniform(jax.random.fold_in(key, FAULT))
+      self.config.severity * jax.random.uniform(jax.random.fold_in(key, OfStream.TRAINING_FAULT))
       if self.config.fault
       else 0.0
     )
@@ -457,7 +446,7 @@ class Trainer:
     """`stream` with another target and severity where its episode `ended`, so far as these are
     drawn: that follows from its key and its clock.
     """
-    key = jax.random.fold_in(jax.random.fold_in(stream.key, FAULT), stream.t)
+    key = jax.random.fold_in(jax.random.fold_in(stream.key, OfStream.TRAINING_FAULT), stream.t)
     fresh = faults.begin(self.fault, key, self._drawn(key), self.target)
     return stream._replace(
       injection=jax.tree.map(
@@ -470,16 +459,14 @@ class Trainer:
   def step(self) -> dict:
     """Collects one chunk, takes the updates that it pays for, returns a row of metrics."""
     begin = time.monotonic()
-    drive, shake, jitter = self._drive(), self._shake(), self._jitter()
+    drive, shake = self._drive(), self._shake()
     params, kept = self.state.train.params, records
     if self.mesh is not None:
       params = jax.device_put(params, jax.devices()[0])
       kept = lambda rows: jax.device_put(
         records(rows), jax.tree.leaves(self.state.replay)[0].sharding
       )
-    streams, rows = self.collect[self.phase].chunk(
-      params, self.state.streams, CHUNK, drive, shake, jitter
-    )
+    streams, rows = self.collect[self.phase].chunk(params, self.state.streams, CHUNK, drive, shake)
     if self.fault is not None:
       streams = self._redraw(streams, jnp.any(rows.terminated | rows.truncated, 0))
     cost = self.config.fall_cost if self.config.updates - self.updates > self.config.pure else 0.0
@@ -488,8 +475,7 @@ class Trainer:
     self.state = self.state._replace(streams=streams, replay=replay)
     expert_returns, own, each = [], [], {g: [] for g in range(self.seeds)}
     counts = ~drive  # robots that act as the agent would
-    for noise in (shake, jitter):
-      counts &= noise is None or noise == 0
+    counts &= shake is None or shake == 0
     for at, value in self.returns.add(rows):
       if drive[at]:
         expert_returns.append(value)

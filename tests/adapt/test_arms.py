@@ -16,17 +16,18 @@ import pyarrow.parquet
 import pytest
 import quick
 
-from mjx_cl.io import tables
 from mjx_cl import envs
-from mjx_cl.adapt import phase as phase_lib
+from mjx_cl.adapt import decide as phase_lib
 from mjx_cl.adapt.arms import ARMS, FOREVER
-from mjx_cl.adapt.loop import FRESH, WIDTH, Loop, choices
-from mjx_cl.adapt.phase import ABORT_BUDGET, END, ENDED, START, STOP
+from mjx_cl.adapt.decide import ABORT_BUDGET, END, ENDED, START, STOP
+from mjx_cl.adapt.loop import WIDTH, Loop, choices
 from mjx_cl.config import PRESETS, AdaptConfig, RunConfig
 from mjx_cl.detectors import Alarm, Detector
 from mjx_cl.dreamer.agent import Agent
 from mjx_cl.envs.walker import Walker
 from mjx_cl.errors import UserError
+from mjx_cl.io import tables
+from mjx_cl.keys import OfAdaptation
 from mjx_cl.rollout.monitor import Monitor
 from mjx_cl.rollout.scan import Row
 from mjx_cl.runs import run
@@ -473,7 +474,7 @@ def test_scratch_starts_from_fresh_parameters(story, same):
   begin, init = of(story.begin.train, "scratch"), jax.jit(story.loop.agent.init)
   assert same(of(story.states[2].train, "scratch"), begin)
   new = of(story.states[3].train, "scratch")
-  want = init(jax.random.fold_in(story.keys[NAMES.index("scratch")], FRESH))
+  want = init(jax.random.fold_in(story.keys[NAMES.index("scratch")], OfAdaptation.FRESH))
   jax.tree.map(
     lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-7), new, want
   )  # float32 of two programs
@@ -482,7 +483,7 @@ def test_scratch_starts_from_fresh_parameters(story, same):
     and new.updates == 0
     and begin.updates == 100
   )
-  other = init(jax.random.fold_in(story.keys[0], FRESH))
+  other = init(jax.random.fold_in(story.keys[0], OfAdaptation.FRESH))
   kernel = lambda state: max(jax.tree.leaves(state.params["enc"]), key=np.size)
   assert not np.allclose(kernel(new), kernel(other), atol=0.01) and not np.allclose(
     kernel(new), kernel(begin), atol=0.01
@@ -890,8 +891,12 @@ def test_an_arm_with_an_agent_of_its_own(lived):
   np.testing.assert_allclose(mine["reward"][:50], same["reward"][:50], atol=1e-3)
   assert np.abs(np.subtract(mine["reward"][:50], first["reward"][:50])).max() > 0.02
   assert (
-    "randomised" in {r["arm"] for r in normalised_recovery.rows(tables.read_rows(whole / "runs.parquet"))}
-    and len({r["reward_none"] for r in normalised_recovery.rows(tables.read_rows(whole / "runs.parquet"))}) == 1
+    "randomised"
+    in {r["arm"] for r in normalised_recovery.rows(tables.read_rows(whole / "runs.parquet"))}
+    and len(
+      {r["reward_none"] for r in normalised_recovery.rows(tables.read_rows(whole / "runs.parquet"))}
+    )
+    == 1
   )
   assert (
     normalised_recovery.rows(tables.read_rows(whole / "runs.parquet"))[0]["reward_none"]

@@ -12,11 +12,9 @@ import numpy as np
 import pytest
 import quick
 
-from mjx_cl.adapt import phase as phase_lib
+from mjx_cl.adapt import decide as phase_lib
 from mjx_cl.adapt.blocks import Crew, cut
-from mjx_cl.adapt.convergence import SIGNALS, settled
-from mjx_cl.adapt.loop import Loop, choices
-from mjx_cl.adapt.phase import (
+from mjx_cl.adapt.decide import (
   ABORT_BELOW,
   ABORT_BUDGET,
   ABORT_HOPELESS,
@@ -24,9 +22,12 @@ from mjx_cl.adapt.phase import (
   ADAPTING,
   CONVERGED,
   NOMINAL,
+  SIGNALS,
   START,
   STOP,
+  settled,
 )
+from mjx_cl.adapt.loop import Loop, choices
 from mjx_cl.config import PRESETS, AdaptConfig
 from mjx_cl.detectors import Alarm, Detector
 from mjx_cl.dreamer.agent import Agent

@@ -423,24 +423,24 @@ def test_host_call_measures_both_forms(monkeypatch):
   """Each form's program is made and traced in that form, and the next one finds things as they
   were.
   """
-  from mjx_cl.physics import by_name
+  from mjx_cl.physics import host_call
 
   monkeypatch.syspath_prepend(FOLDER)
-  bench, asked, ways = load("host_call"), by_name.registered, []
+  bench, asked, ways = load("host_call"), host_call.registered, []
 
   def make():
-    x, program = np.zeros(2, np.uint32), lambda x: by_name.call("nothing", "", 2, x)
+    x, program = np.zeros(2, np.uint32), lambda x: host_call.call("nothing", "", 2, x)
     ways.append("pure_callback" in str(jax.make_jaxpr(program)(x)))
     compiled = quick.jit(program)
     return lambda: compiled(x).block_until_ready()
 
-  nothing = by_name.shared("nothing", lambda: lambda word, x: x)
+  nothing = host_call.shared("nothing", lambda: lambda word, x: x)
   times = bench.measure(make, 1)
   assert (
     ways == [False, True]
     and list(times) == list(bench.FORMS)
     and min(times.values()) > 0
-    and by_name.registered is asked
+    and host_call.registered is asked
   )
   del nothing
 

@@ -17,7 +17,7 @@ import pytest
 
 from benchmarks.report import paper, report
 from mjx_cl.cli import app
-from mjx_cl.errors import FileError, UserError
+from mjx_cl.errors import FileError
 
 ROOT = pathlib.Path(__file__).parents[2]
 RESULTS = ROOT / "results"

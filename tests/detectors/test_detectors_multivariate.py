@@ -21,7 +21,7 @@ from mjx_cl.detectors.max_variables import corrected, max_variables
 from mjx_cl.detectors.mewma import mewma
 from mjx_cl.detectors.surprise import surprise
 from mjx_cl.errors import UserError
-from mjx_cl.rollout.monitor import GROUPS, LATENT, Residual, unknown
+from mjx_cl.rollout.monitor import GROUPS, LATENT, Residual
 
 FOUR = tuple(f"group_{k}" for k in range(4))
 

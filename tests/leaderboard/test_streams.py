@@ -2,11 +2,8 @@
 
 import pathlib
 import re
-import subprocess
-import sys
 
 import numpy as np
-import pandas as pd
 import pytest
 
 from mjx_cl import envs

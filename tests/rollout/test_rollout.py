@@ -300,29 +300,6 @@ def test_shaken_robots_follow_one_random_action_for_a_stretch(
   assert np.abs(quiet[:, ~still] - pushed).max() > 0.1
 
 
-def test_jitter_is_white_noise_on_the_action_of_its_robots(short_walker, tiny, tiny_params):
-  """Deviation 0 changes no bit; the first action differs by normal numbers of the deviation asked
-  for, others from step to step.
-  """
-  roll = Rollout(short_walker, tiny, faults.make("gear", short_walker))
-  begin = streams_of(short_walker, tiny, roll.fault, 2, 3)
-  jitter = np.array([[0, 0.25, 0.5], [0, 0.5, 0.5]], np.float32)
-  _, noisy = roll.chunk(tiny_params, begin, length=40, jitter=jitter)
-  _, calm = roll.chunk(tiny_params, begin, length=40, jitter=np.zeros((2, 3), np.float32))
-  noisy, calm = np.asarray(noisy.action), np.asarray(calm.action)
-  np.testing.assert_array_equal(noisy[:, jitter == 0], calm[:, jitter == 0])
-  first = (noisy - calm)[0]  # both saw the same observation: (2, 3, act)
-  double = first[0, 2] / 0.5
-  assert (
-    np.all(first[jitter > 0] != 0) and len(np.unique(first[jitter > 0])) == first[jitter > 0].size
-  )
-  assert 0.2 < double.std() < 3  # six normal numbers: outside with a probability below 1e-4
-  _, large = roll.chunk(tiny_params, begin, length=1, jitter=2 * jitter)
-  np.testing.assert_allclose(
-    np.asarray(large.action)[0] - calm[0], 2 * first, atol=1e-5
-  )  # float32 sums of numbers near 1
-
-
 def test_records_of_decisions_and_of_ends():
   rows = toy_rows()
   made, valid = records(rows)

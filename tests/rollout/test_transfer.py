@@ -23,7 +23,7 @@ from mjx_cl.faults.presets import SOCKS, SOCKS_GRIP, Change, Preset
 from mjx_cl.io import tables
 from mjx_cl.rollout import transfer as transfer_lib
 from mjx_cl.rollout.scan import Rollout, nest, start
-from mjx_cl.rollout.transfer import Moving, Transfer
+from mjx_cl.rollout.transfer import Transfer
 from mjx_cl.runs import certify, run
 from mjx_cl.training import agents
 

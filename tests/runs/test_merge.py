@@ -13,10 +13,11 @@ import pyarrow.parquet
 import pytest
 from test_cli import mjx, refused  # noqa: F401  fixtures
 
-from mjx_cl.runs import suite as bench, records, merge
-from mjx_cl.io import tables
 from mjx_cl.config import RunConfig
 from mjx_cl.errors import FileError, UserError
+from mjx_cl.io import tables
+from mjx_cl.runs import merge, records
+from mjx_cl.runs import suite as bench
 from mjx_cl.training import agents
 
 RESULTS = pathlib.Path(__file__).parents[2] / "results"

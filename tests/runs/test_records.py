@@ -8,10 +8,10 @@ import shutil
 
 import pytest
 
-from mjx_cl.runs import records
-from mjx_cl.io import tables
 from mjx_cl.config import RunConfig
 from mjx_cl.errors import FileError
+from mjx_cl.io import tables
+from mjx_cl.runs import records
 
 RESULTS = pathlib.Path(__file__).parents[2] / "results"
 

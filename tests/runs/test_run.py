@@ -21,18 +21,17 @@ import numpy as np
 import pyarrow.parquet
 import pytest
 
-from mjx_cl.training import agents
-from mjx_cl.cli import app, commands
 from mjx_cl import envs
-from mjx_cl.render import figures
-from mjx_cl.scoring import events
-from mjx_cl.runs import run, workers
-from mjx_cl.io import tables
+from mjx_cl.cli import app, commands
 from mjx_cl.config import AdaptConfig, RunConfig
 from mjx_cl.dreamer.agent import Agent
 from mjx_cl.envs.walker import Walker
 from mjx_cl.errors import FileError, UserError
-from mjx_cl.scoring import intervals
+from mjx_cl.io import tables
+from mjx_cl.render import figures
+from mjx_cl.runs import run, workers
+from mjx_cl.scoring import events, intervals
+from mjx_cl.training import agents
 
 STEPS, ONSET, EPISODE, SEEDS = 700, 300, 150, (3, 4)
 ENDS = [
@@ -950,6 +949,7 @@ def test_load_refuses_what_does_not_fit(saved, tmp_path):
 def test_eval_sums_the_rewards_of_one_episode_each(saved, short_walker, monkeypatch, capsys):
   """Episodes of 12 steps; the rollouts, lived again step by step in one chunk, give the sums."""
   import jax.numpy as jnp
+
   from mjx_cl import faults
   from mjx_cl.rollout.scan import Rollout, nest, start
 

@@ -13,13 +13,14 @@ import numpy as np
 import pyarrow.parquet
 import pytest
 
-from mjx_cl.training import agents, trainer as train
 from mjx_cl import envs
-from mjx_cl.runs import run
-from mjx_cl.io import tables
 from mjx_cl import physics as physics_lib
 from mjx_cl.config import CHUNK, PRESETS, AdaptConfig, RunConfig, replace
 from mjx_cl.dreamer.agent import Agent
+from mjx_cl.io import tables
+from mjx_cl.runs import run
+from mjx_cl.training import agents
+from mjx_cl.training import trainer as train
 from mjx_cl.types import EnvState, Model, Spec, Step, Var
 
 STEPS, ONSET, EPISODE, WARMUP, REPEAT = (

@@ -11,20 +11,20 @@ import numpy as np
 import pyarrow.parquet
 import pytest
 
-from mjx_cl.training import agents
-from mjx_cl.runs import suite, run, snapshots
 from mjx_cl import envs, faults
-from mjx_cl.io import tables
-from mjx_cl.adapt import phase as phase_lib
+from mjx_cl.adapt import decide as phase_lib
 from mjx_cl.adapt.arms import ARMS, never_stops, stops
 from mjx_cl.adapt.loop import Loop
 from mjx_cl.config import AdaptConfig, RunConfig
 from mjx_cl.envs.walker import Walker
 from mjx_cl.errors import FileError, UserError
+from mjx_cl.io import tables
+from mjx_cl.keys import OfSeed
 from mjx_cl.rollout.scan import Rollout, nest, start
-from mjx_cl.scoring import stop_rule
+from mjx_cl.runs import run, snapshots, suite
 from mjx_cl.runs.snapshots import Snapshots
-
+from mjx_cl.scoring import stop_rule
+from mjx_cl.training import agents
 
 # ---- by hand -------------------------------------------------------------------------------------
 
@@ -460,7 +460,7 @@ def test_each_is_evaluated_on_the_broken_robot_with_the_same_keys(lived, config)
   broken = faults.make("gear", env)
   rollout = Rollout(env, agent, broken)
   target = broken.targets.index(table(out, "runs")[3]["fault"].split(":")[1])
-  keys = jax.random.split(jax.random.fold_in(jax.random.key(SEED), snapshots.KEY), 5)
+  keys = jax.random.split(jax.random.fold_in(jax.random.key(SEED), OfSeed.SNAPSHOTS), 5)
 
   def returns(params, severity, key):
     stream = nest(lambda k: start(env, agent, broken, k, severity, 0, target=target), 0, 0)(

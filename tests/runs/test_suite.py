@@ -15,12 +15,13 @@ import pytest
 from test_cli import content, mjx, refused  # noqa: F401  fixtures
 from test_transfer import agent, saved  # noqa: F401  fixtures: a tiny agent of the car, whose programs hold no callback and are cached
 
-from mjx_cl.runs import suite as bench, merge, run
-from mjx_cl.render import figures
-from mjx_cl.io import folders, tables
 from mjx_cl.adapt.arms import ARMS, NEVER
 from mjx_cl.config import AdaptConfig, RunConfig
 from mjx_cl.errors import FileError, UserError
+from mjx_cl.io import folders, tables
+from mjx_cl.render import figures
+from mjx_cl.runs import merge, run
+from mjx_cl.runs import suite as bench
 from mjx_cl.scoring import stop_rule
 
 RESULTS = pathlib.Path(__file__).parents[2] / "results"
@@ -691,7 +692,7 @@ def test_publishing_a_part_keeps_the_others(mjx, refused, tmp_path):  # noqa: F8
   )
 
 
-def test_runs_of_one_kind_share_their_program(mini, tmp_path):  # noqa: F811
+def test_runs_of_one_kind_share_their_program(mini, tmp_path, programs):  # noqa: F811
   """Severity, seeds, length and the numbers of AdaptConfig are not in it; detector, form and
   learning rate are.
   """
@@ -716,11 +717,11 @@ def test_runs_of_one_kind_share_their_program(mini, tmp_path):  # noqa: F811
     unhashable.spec,
     unhashable.config,
     same=(["a list"],),
+    programs=programs,
   )
   assert own._program is not first  # what has no hash shares nothing
-  from mjx_cl.adapt import loop
-
-  assert len(loop._programs) <= loop.PROGRAMS
+  assert 1 < len(programs.kept) <= programs.most
+  assert run.Runner(part.config, tmp_path, type(programs)()).crew.loop._program is not first
 
 
 @pytest.mark.parametrize(

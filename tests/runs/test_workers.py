@@ -12,13 +12,15 @@ import numpy as np
 import psutil
 import pyarrow.parquet
 import pytest
-from test_suite import mini  # noqa: F401  a fixture
 from test_cli import mjx, refused  # noqa: F401  fixtures
+from test_suite import mini  # noqa: F401  a fixture
 from test_transfer import agent, saved  # noqa: F401  fixtures
 
-from mjx_cl.runs import suite as bench, run, workers
-from mjx_cl.io import checkpoints as checkpoint, memory, tables
 from mjx_cl.errors import FileError, UserError
+from mjx_cl.io import checkpoints as checkpoint
+from mjx_cl.io import memory, tables
+from mjx_cl.runs import run, workers
+from mjx_cl.runs import suite as bench
 
 GB = 2**30
 

@@ -10,6 +10,7 @@ from brax.envs import base
 
 from mjx_cl import faults
 from mjx_cl.envs.adapters.driven import join, worst
+from mjx_cl.keys import OfStep
 
 
 class BraxEnv(base.Env):
@@ -53,7 +54,7 @@ class BraxEnv(base.Env):
   def _control(self, state: base.State, action: jax.Array) -> tuple[Any, Any, dict[str, Any]]:
     first = state.pipeline_state.step == 0
     stream = state.info["stream"]._replace(env=state.pipeline_state, first=first)
-    now = jax.random.fold_in(jax.random.fold_in(stream.key, stream.t), 5)
+    now = jax.random.fold_in(jax.random.fold_in(stream.key, stream.t), OfStep.FIRST_READING)
     rollout = self.rollout
     renewed, _ = faults.sense(
       rollout.fault, stream.injection, stream.t, now, rollout.model, state.obs, True

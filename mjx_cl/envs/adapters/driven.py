@@ -16,6 +16,7 @@ from mjx_cl import envs, faults
 from mjx_cl.dreamer.agent import Carry
 from mjx_cl.errors import UserError
 from mjx_cl.faults import presets
+from mjx_cl.keys import OfStream
 from mjx_cl.rollout.scan import Rollout, Stream, expand, nest, start
 
 
@@ -209,7 +210,7 @@ class Robots:
   def _reset_where(self, streams: Stream, untouched: jax.Array) -> Stream:
     # a reset's draw folds in the clock alone, so that episodes are those of a rollout; a second
     # reset on the same clock must differ
-    other = nest(lambda key: jax.random.fold_in(key, 3), 0, 0)(streams.key)
+    other = nest(lambda key: jax.random.fold_in(key, OfStream.AGAIN), 0, 0)(streams.key)
     streams = streams._replace(key=jnp.where(untouched, other, streams.key))
     return self.rollout._reset(streams, jnp.ones_like(untouched))
 

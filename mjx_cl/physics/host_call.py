@@ -6,12 +6,11 @@ some 4 s for the walker's rollout. A call through XLA's foreign function interfa
 instead. `call` gives every program the one target `mjx_cl_host`, a C function pointer that ctypes
 makes of a Python function, and the name of the host function as an attribute. Names must say all
 that the function's results depend on: a program from the cache calls whatever this process has
-registered under the name that it was compiled with. A call also costs a fifth of a pure_callback's
-(results/host_call.json).
+registered under the name that it was compiled with. A call also costs a fifth of a pure_callback's.
 
-Struct layouts: xla/ffi/api/c_api.h (API 0.3), which jaxlib ships; XLA only appends to them, and
-asks for the version when the target is registered. Where that fails (another jaxlib), `call` is a
-pure_callback as before.
+Struct layouts: xla/ffi/api/c_api.h (API 0.3) of jaxlib TESTED. With any other version of jaxlib
+nothing is registered, and `call` is a jax.pure_callback: the same numbers, but such programs are
+compiled anew in every process.
 """
 
 from __future__ import annotations
@@ -23,9 +22,11 @@ import traceback
 import weakref
 
 import jax
+import jaxlib
 import numpy as np
 
 TARGET = "mjx_cl_host"
+TESTED = "0.9.2"  # the jaxlib whose struct layouts these are
 _METADATA, _EXECUTE, _INTERNAL = (
   1,
   3,
@@ -144,14 +145,18 @@ def _handler(pointer):
     return frame.api.contents.error_create(ctypes.byref(args))
 
 
-@functools.cache
 def registered() -> bool:
-  """Whether XLA has taken the target; asks once."""
+  """Whether XLA has taken the target; another jaxlib than TESTED is not asked."""
+  return jaxlib.__version__ == TESTED and _register()
+
+
+@functools.cache
+def _register() -> bool:
   new = ctypes.pythonapi.PyCapsule_New
   new.restype, new.argtypes = ctypes.py_object, [_P, ctypes.c_char_p, _P]
   try:
     jax.ffi.register_ffi_target(TARGET, new(ctypes.cast(_handler, _P), None, None), platform="cpu")
-  except Exception:  # whatever another jaxlib makes of it
+  except Exception:  # a platform that jaxlib was built otherwise for
     return False
   return True
 

@@ -17,7 +17,7 @@ import pytest
 import quick
 
 from mjx_cl import physics
-from mjx_cl.physics import by_name, native
+from mjx_cl.physics import host_call, native
 
 XML = """<mujoco><option timestep="0.02"/><worldbody><body><joint name="hinge" type="hinge" axis="0 1 0" damping="0.1"/>
 <geom type="capsule" fromto="0 0 0 0 0 -0.5" size="0.03"/></body></worldbody><actuator><motor name="hinge" joint="hinge" gear="{gear}" ctrlrange="-1 1"/></actuator></mujoco>"""
@@ -44,30 +44,45 @@ class Function:
 def way(request, monkeypatch):
   """Both forms of a call."""
   if not request.param:
-    monkeypatch.setattr(by_name, "registered", lambda: False)
+    monkeypatch.setattr(host_call, "registered", lambda: False)
   else:
-    assert by_name.registered()
+    assert host_call.registered()
 
 
 def test_a_batch_is_one_call(way):
-  function = by_name.shared("a batch", Function)
+  function = host_call.shared("a batch", Function)
   x = np.arange(12, dtype=np.uint32).reshape(2, 2, 3)
-  out = quick.jit(jax.vmap(jax.vmap(lambda x: by_name.call("a batch", "7", 2, x))))(x)
+  out = quick.jit(jax.vmap(jax.vmap(lambda x: host_call.call("a batch", "7", 2, x))))(x)
   np.testing.assert_array_equal(out, x[..., :2] + 7)
   assert function.shapes == [(2, 2, 3)]
 
 
+@pytest.mark.parametrize("version", ["0.9.1", "0.9.3", "0.10.2", "0.9.2.dev1"])
+def test_another_jaxlib_gets_a_pure_callback(version, monkeypatch):
+  """Whose memory layout nobody has looked at: no program calls by name, no target is registered."""
+  function, x = host_call.shared("another", Function), np.arange(3, dtype=np.uint32)
+  program = lambda: jax.jit(lambda x: host_call.call("another", "7", 2, x)).lower(x)
+  assert host_call.TARGET in program().as_text()
+  asked = []
+  monkeypatch.setattr(host_call, "_register", lambda: asked.append(1) or True)
+  monkeypatch.setattr(host_call.jaxlib, "__version__", version)
+  other = program()
+  assert host_call.TARGET not in other.as_text() and "callback" in other.as_text() and not asked
+  np.testing.assert_array_equal(other.compile()(x), x[:2] + 7)
+  assert function.shapes == [(3,)]
+
+
 def test_an_empty_batch_is_nothing(way):
-  function = by_name.shared("empty", Function)
-  assert quick.jit(jax.vmap(lambda x: by_name.call("empty", "7", 2, x)))(
+  function = host_call.shared("empty", Function)
+  assert quick.jit(jax.vmap(lambda x: host_call.call("empty", "7", 2, x)))(
     np.zeros((0, 3), np.uint32)
   ).shape == (0, 2)
   assert set(function.shapes) <= {(0, 3)}
 
 
 def test_an_exception_ends_the_program_with_its_text(way):
-  function = by_name.shared("raises", Function)
-  program = quick.jit(lambda x: by_name.call("raises", "bad", 2, x))
+  function = host_call.shared("raises", Function)
+  program = quick.jit(lambda x: host_call.call("raises", "bad", 2, x))
   for _ in range(2):
     with pytest.raises(jax.errors.JaxRuntimeError, match="a bad word"):
       program(jnp.zeros(3, jnp.uint32)).block_until_ready()
@@ -75,8 +90,8 @@ def test_an_exception_ends_the_program_with_its_text(way):
 
 
 def test_a_function_that_is_gone_is_named(way):
-  function = by_name.shared("gone", Function)
-  program = quick.jit(lambda x: by_name.call("gone", "1", 2, x))
+  function = host_call.shared("gone", Function)
+  program = quick.jit(lambda x: host_call.call("gone", "1", 2, x))
   np.testing.assert_array_equal(program(jnp.zeros(3, jnp.uint32)), [1, 1])
   del function
   gc.collect()
@@ -87,10 +102,10 @@ def test_a_function_that_is_gone_is_named(way):
 
 
 def test_a_name_is_made_once_and_freed():
-  one = by_name.shared("once", Function)
-  assert by_name.shared("once", lambda: pytest.fail("made twice")) is one
+  one = host_call.shared("once", Function)
+  assert host_call.shared("once", lambda: pytest.fail("made twice")) is one
   with pytest.raises(ValueError, match="without"):
-    by_name.shared("on|ce", Function)
+    host_call.shared("on|ce", Function)
 
 
 # ---- names of hosts ------------------------------------------------------------------------------

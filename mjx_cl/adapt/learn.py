@@ -1,0 +1,161 @@
+"""What a stream learns from: the replay of an adaptation, the updates that it pays for, and new
+parameters and moments.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from mjx_cl.config import AdaptConfig
+from mjx_cl.dreamer import replay as replay_lib
+from mjx_cl.dreamer.agent import Agent, TrainState, culprit
+from mjx_cl.dreamer.replay import Replay
+from mjx_cl.keys import OfAdaptation
+from mjx_cl.rollout.scan import Row, records
+
+BEHAVIOUR = {"pol", "val", "slow", "range"}  # of a TrainState: what is no world model
+
+
+def fill(
+  replay: Replay, rows: Row, begins: jax.Array, row: jax.Array, adapting: jax.Array
+) -> Replay:
+  """`replay` of each stream with what came after the alarm and nothing else.
+
+  Args:
+    begins: bool (groups,), an adaptation begins in the chunk.
+    row: int32 (groups,), after which row.
+    adapting: bool (groups,), the chunk began within an adaptation.
+  """
+  where = lambda a, b: jnp.where(begins.reshape((-1,) + (1,) * (a.ndim - 1)), a, b)
+  count = where(jnp.zeros_like(replay.count), replay.count)
+  queue = where(jnp.zeros_like(replay.queue), replay.queue)
+  length = rows.reward.shape[0]
+  keep = jnp.where(begins[None], jnp.arange(length)[:, None] > row[None], adapting[None])
+  new, exist = records(rows)
+  exist = exist & jnp.repeat(keep.T, 2, axis=1)[:, None]
+  return jax.vmap(replay_lib.add)(replay._replace(count=count, queue=queue), new, exist)
+
+
+def owing(
+  agent: Agent, replay: Replay, adapting: jax.Array, owed: jax.Array, rows: int, config: AdaptConfig
+) -> jax.Array:
+  """Updates that are due after a chunk of `rows`, float32 (groups,): `ratio` replayed records a
+  row, while an adaptation runs that has filled its replay; what is left of `owed` counts on.
+  """
+  c = agent.config
+  windows = jax.vmap(lambda r: replay_lib.windows(r, c.length + 1))(replay)
+  due = adapting & (windows >= config.start_windows)
+  return jnp.where(due, owed + rows * config.ratio / (c.batch * c.length), 0.0)
+
+
+def fresh_moments(agent: Agent, train: TrainState, begins: jax.Array) -> TrainState:
+  """The optimiser's moments and counters set back where an adaptation `begins` (groups,)."""
+  fresh = jax.vmap(agent.optimizer.init)(train.params)
+  reset = lambda new, old: jnp.where(begins.reshape((-1,) + (1,) * (old.ndim - 1)), new, old)
+  return train._replace(
+    opt=jax.lax.cond(
+      jnp.any(begins), lambda o: jax.tree.map(reset, fresh, o), lambda o: o, train.opt
+    )
+  )
+
+
+def renew(
+  agent: Agent, train: TrainState, acting, keys: jax.Array, fresh: jax.Array
+) -> tuple[TrainState, Any]:
+  """New parameters, moments and counters where `fresh` (groups,). Loops for the reason given in
+  `learn`.
+  """
+
+  def stream(g, state):
+    def anew(_, state):
+      train, acting = state
+      new = agent.init(jax.random.fold_in(keys[g], OfAdaptation.FRESH))
+      return put(train, g, new), put(acting, g, new.params)
+
+    return jax.lax.fori_loop(0, fresh[g].astype(jnp.int32), anew, state)
+
+  return jax.lax.fori_loop(0, fresh.shape[0], stream, (train, acting))
+
+
+def learn(
+  agent: Agent,
+  train: TrainState,
+  replay: Replay,
+  keys: jax.Array,
+  number: jax.Array,
+  world_only: jax.Array,
+) -> tuple[TrainState, Replay, jax.Array]:
+  """`number` (groups,) updates for each stream. Nested loops with their own trip counts: the
+  carry is changed in place, so a stream without an update costs neither arithmetic nor a copy
+  (`vmap` would compute all, `lax.map` would copy all). All streams lie in one replay, of which an
+  update reads and writes its own windows: taken out of it, a stream's would be copied twice for
+  each update.
+  """
+  c = agent.config
+  shapes = jax.tree.map(lambda x: x.shape, replay)
+  together = jax.tree.map(
+    lambda x: x.reshape((-1,) + x.shape[2:]), replay
+  )  # (groups, 1, ..) -> (groups, ..)
+
+  def stream(g, state):
+    def update(state):
+      i, train, replay, _ = state
+      key_sample, key_update = jax.random.split(jax.random.fold_in(keys[g], i))
+      replay, data, address = replay_lib.sample(replay, key_sample, c.batch, c.length + 1, only=g)
+      before = take(train, g)
+      learnt, metrics, latents = agent.update(before, data, key_update)
+      return (
+        i + 1,
+        put(train, g, keep_behaviour(world_only[g], before, learnt)),
+        replay_lib.refresh(replay, address, latents),
+        culprit(metrics),
+      )
+
+    train, replay, failed = state
+    more = lambda state: (state[0] < number[g]) & (state[-1] < 0)
+    _, train, replay, bad = jax.lax.while_loop(
+      more, update, (jnp.int32(0), train, replay, jnp.int32(-1))
+    )
+    return train, replay, failed.at[g].set(bad)
+
+  train, together, failed = jax.lax.fori_loop(
+    0, number.shape[0], stream, (train, together, jnp.full(number.shape, -1, jnp.int32))
+  )
+  return (
+    train,
+    jax.tree.map(
+      lambda x, shape: x.reshape(shape),
+      together,
+      shapes,
+      is_leaf=lambda x: isinstance(x, jax.Array),
+    ),
+    failed,
+  )
+
+
+def take(tree: Any, g: jax.Array) -> Any:
+  """Entry g of every leaf."""
+  return jax.tree.map(lambda x: jax.lax.dynamic_index_in_dim(x, g, keepdims=False), tree)
+
+
+def put(tree: Any, g: jax.Array, value: Any) -> Any:
+  """`tree` with `value` as entry g of every leaf."""
+  return jax.tree.map(lambda x, v: jax.lax.dynamic_update_index_in_dim(x, v, g, 0), tree, value)
+
+
+def keep_behaviour(keep: jax.Array, before: TrainState, after: TrainState) -> TrainState:
+  """`after`, where `keep` (): with actor, critic, slow critic, range of the returns, and the
+  moments of actor and critic as `before`.
+
+  Zero gradients alone would not do: momentum moves what has none. The value loss on replay still
+  shapes the features, as in every arm.
+  """
+
+  def one(path, old, new):
+    names = {getattr(part, "key", getattr(part, "name", None)) for part in path}
+    return jnp.where(keep, old, new) if names & BEHAVIOUR else new
+
+  return jax.tree_util.tree_map_with_path(one, before, after)

@@ -1,0 +1,121 @@
+"""What a chunk of rows says of a stream: residuals of the predictions, alarms, and the six signals
+that the stop rule reads.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from mjx_cl.detectors.base import Detector
+from mjx_cl.dreamer.agent import Agent, Batch, TrainState
+from mjx_cl.rollout.monitor import History, Monitor, Residual
+from mjx_cl.rollout.scan import Row
+from mjx_cl.types import Spec
+
+
+class Watched(NamedTuple):
+  """What was seen in a chunk.
+
+  Attributes:
+    residual: Residual, leading (T, groups).
+    score: float32 (T, groups), of the detector.
+    fired: bool (T, groups), alarms.
+    signals: float32 (groups, 6), in the order of decide.SIGNALS.
+    posture: float32 (groups,), mean posture.
+  """
+
+  residual: Residual
+  score: jax.Array
+  fired: jax.Array
+  signals: jax.Array
+  posture: jax.Array
+
+
+def watch(
+  agent: Agent, monitor: Monitor, detector: Detector, spec: Spec, state, rows: Row, keys: jax.Array
+) -> tuple[Watched, History, Any, Residual]:
+  """Looks at a chunk.
+
+  Args:
+    state: loop.LoopState before it.
+    rows: leading (T, groups, 1).
+    keys: (groups, 2), of the monitor and of the signals.
+
+  Returns:
+    (Watched, the monitor's history, the detector's state, the latest residuals) after the chunk.
+  """
+  history, residual = monitor.update(state.acting, state.history, rows, keys[:, 0])
+  residual = jax.tree.map(lambda x: x[:, :, 0], residual)
+  after, alarms = jax.lax.scan(jax.vmap(detector.update), state.detector, residual)
+  past = jax.tree.map(lambda a, b: jnp.concatenate([a, b])[-a.shape[0] :], state.past, residual)
+
+  # one set of weights gives all six signals: that which acts
+  acts = state.train._replace(params=state.acting)
+  dyn, adv, value = evaluate(agent, acts, state.history, rows, keys[:, 1])
+  reward = jnp.mean(rows.rewards, (0, 2, 3))
+  signals = jnp.stack(
+    [jnp.nanmean(residual.opr, 0), jnp.nanmean(residual.rpr, 0), reward, dyn, adv, value], -1
+  )
+  index, _ = spec.posture or (0, -jnp.inf)
+  posture = jnp.mean(rows.final_obs[:, :, 0, index], 0)
+  return Watched(residual, alarms.score, alarms.fired, signals, posture), history, after, past
+
+
+def evaluate(
+  agent: Agent, train: TrainState, before: History, rows: Row, keys: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+  """Dynamics loss, advantage magnitude and value loss (groups,) on the chunk just lived, without
+  gradient.
+
+  The ring of recent data is the chunk itself with the last record before it as context, so an
+  alarm leaves nothing old in it.
+  """
+  join = lambda old, new: jnp.concatenate([old[-1:].astype(new.dtype), new])[:, :, 0].swapaxes(
+    0, 1
+  )[:, None]  # (groups, 1, 1 + T, ...)
+  done = rows.terminated | rows.truncated
+  deter, stoch, action = (
+    join(before.deter, rows.deter),
+    join(before.stoch, rows.stoch),
+    join(before.action, rows.action),
+  )
+  obs, reward, first = (
+    join(before.obs, rows.obs),
+    join(before.reward, rows.reward_in),
+    join(before.done, rows.first),
+  )
+  first = first.at[:, :, 0].set(True)
+  last = jnp.concatenate([first[:, :, 1:], jnp.zeros_like(first[:, :, :1])], 2)
+  terminal = jnp.concatenate(
+    [jnp.zeros_like(first[:, :, :1]), jnp.zeros_like(done[:, :, 0].T[:, None])], 2
+  )
+  batch = Batch(
+    obs,
+    action,
+    reward,
+    first,
+    last,
+    terminal,
+    deter,
+    stoch,
+    jnp.zeros_like(action),
+    jnp.zeros_like(first),
+  )
+
+  def one(train, batch, key):
+    metrics = agent.loss(train.params, train.slow, train.range, batch, key)[1][0]
+    return metrics["loss/dyn"], metrics["adv_mag"], metrics["loss/value"]
+
+  return jax.vmap(one)(train, batch, keys)
+
+
+def refit(detector: Detector, state, past: Residual, over: jax.Array):
+  """`state` of the detector, where `over` (groups,): one that has seen the rows `past` alone."""
+  fresh = jax.tree.map(lambda x: jnp.broadcast_to(x, (over.shape[0],) + x.shape), detector.init())
+  fresh, _ = jax.lax.scan(jax.vmap(detector.update), fresh, past)
+  return jax.tree.map(
+    lambda a, b: jnp.where(over.reshape((-1,) + (1,) * (a.ndim - 1)), a, b), fresh, state
+  )
