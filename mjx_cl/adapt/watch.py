@@ -52,9 +52,7 @@ def watch(
   after, alarms = jax.lax.scan(jax.vmap(detector.update), state.detector, residual)
   past = jax.tree.map(lambda a, b: jnp.concatenate([a, b])[-a.shape[0] :], state.past, residual)
 
-  # one set of weights gives all six signals: that which acts
-  acts = state.train._replace(params=state.acting)
-  dyn, adv, value = evaluate(agent, acts, state.history, rows, keys[:, 1])
+  dyn, adv, value = evaluate(agent, state.train, state.history, rows, keys[:, 1])
   reward = jnp.mean(rows.rewards, (0, 2, 3))
   signals = jnp.stack(
     [jnp.nanmean(residual.opr, 0), jnp.nanmean(residual.rpr, 0), reward, dyn, adv, value], -1
