@@ -59,7 +59,7 @@ def forget():
 
 
 @pytest.fixture(autouse=True)
-def signals():
+def at_a_terminal():
   """Ctrl-C and SIGTERM act as they do at a terminal, here and in the processes that a test starts:
   a shell ignores SIGINT for what it starts in the background. Handlers of a test end with it.
   """
