@@ -5,12 +5,18 @@ programs that are costly to compile.
 import gc
 import os
 import pathlib
+import signal
 import tempfile
 import threading
 
 os.environ.setdefault(
   "MJX_CL_CACHE", str(pathlib.Path(tempfile.gettempdir()) / "mjx_cl_tests_cache")
-)  # shared by all runs and processes
+)  # shared by all runs and processes; XLA keys what it holds by the flags below
+# LLVM leaves programs as they are: nearly all of the tests' time is compiling, two fifths of it with
+# this. Flags of one's own come later and win; processes that tests start inherit it.
+os.environ["XLA_FLAGS"] = (
+  f"--xla_backend_optimization_level=0 {os.environ.get('XLA_FLAGS', '')}".rstrip()
+)
 
 from mjx_cl.io import runtime  # noqa: E402
 
@@ -59,6 +65,20 @@ def forget(programs):
     programs.kept.clear()
     gc.collect()
     runtime.give_back()
+
+
+@pytest.fixture(autouse=True)
+def at_a_terminal():
+  """Ctrl-C and SIGTERM act as they do at a terminal, here and in the processes that a test starts:
+  a shell ignores SIGINT for what it starts in the background. Handlers of a test end with it.
+  """
+  own = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
+  before = {number: signal.signal(number, handler) for number, handler in own.items()}
+  mask = signal.pthread_sigmask(signal.SIG_UNBLOCK, own)
+  yield
+  for number, handler in before.items():
+    signal.signal(number, handler)
+  signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
 @pytest.fixture(scope="session")

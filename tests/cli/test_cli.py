@@ -32,7 +32,6 @@ from mjx_cl.training import agents
 @pytest.fixture
 def mjx(capsys):
   """mjx(*argv): (exit code, standard output, standard error) of `mjx-cl` in this process."""
-  before = signal.getsignal(signal.SIGTERM)
 
   def call(*argv):
     capsys.readouterr()
@@ -42,8 +41,7 @@ def mjx(capsys):
       code = e.code or 0
     return code, *capsys.readouterr()
 
-  yield call
-  signal.signal(signal.SIGTERM, before)
+  return call
 
 
 @pytest.fixture
@@ -84,7 +82,7 @@ def test_help_imports_nothing_heavy(argv):
     [sys.executable, "-X", "importtime", "-m", "mjx_cl", *argv],
     capture_output=True,
     text=True,
-    timeout=120,
+    timeout=1200,
   )
   imported = {
     line.split("|")[-1].strip()
@@ -166,7 +164,7 @@ def test_standard_output_is_clean_where_mjx_is_loaded():
     "print(json.dumps(env.physics.name))"
   )
   process = subprocess.run(
-    [sys.executable, "-c", code], capture_output=True, text=True, timeout=300
+    [sys.executable, "-c", code], capture_output=True, text=True, timeout=1200
   )
   assert process.returncode == 0 and process.stdout == '"mjx"\n', process.stderr
 
@@ -569,25 +567,21 @@ import sys, threading, time, os, signal
 from mjx_cl.cli import app as cli, commands
 from mjx_cl.io.interrupt import Interruptible
 def slow():
-  time.sleep(30)
+  time.sleep(300)
   print("late")
 def do(args):
   with Interruptible():
     threading.Thread(target=slow).start()
     for _ in range(2):
       os.kill(os.getpid(), signal.SIGINT)
-    time.sleep(20)
+    time.sleep(200)
 cli.DO[cli.Doctor] = do
 sys.argv = ["mjx-cl", "doctor"]
 sys.exit(cli.main())
 """
-  # a shell ignores it for what it starts in the background
-  signal_off = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
   begin = time.monotonic()
-  out = subprocess.run(
-    [sys.executable, "-c", signal_off + code], capture_output=True, text=True, timeout=60
-  )
-  assert out.returncode == 130 and time.monotonic() - begin < 25  # the thread sleeps for 30 s
+  out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=1200)
+  assert out.returncode == 130 and time.monotonic() - begin < 250  # the thread sleeps for 300 s
   assert (
     out.stderr.splitlines() == ["mjx-cl: stopping after this chunk, saving", "mjx-cl: interrupted"]
     and "late" not in out.stdout

@@ -108,7 +108,7 @@ def test_too_many_open_files_lose_no_checkpoint(folder):
     env=os.environ | {"JAX_PLATFORMS": "cpu"},
     capture_output=True,
     text=True,
-    timeout=120,
+    timeout=1200,
   )
   assert (
     done.stdout.startswith("cannot read checkpoint 2 in ")

@@ -398,7 +398,7 @@ def test_help_imports_nothing_heavy():
     [sys.executable, "-X", "importtime", "-m", "mjx_cl", "render", "--help"],
     capture_output=True,
     text=True,
-    timeout=120,
+    timeout=1200,
   )
   imported = {
     line.split("|")[-1].strip()

@@ -482,7 +482,8 @@ def test_each_is_evaluated_on_the_broken_robot_with_the_same_keys(lived, config)
       sum(got) / (5 * EPISODE)
     )
   healthy = [returns(acted["files"][639], 0.0, k) for k in keys]
-  assert np.abs(np.subtract(healthy, want)).min() > 0.1 and np.ptp(want) > 0.1
+  # four times what is allowed above: neither the healthy robot nor one key for all would pass
+  assert np.abs(np.subtract(healthy, want)).max() > 0.2 and np.ptp(want) > 0.2
 
 
 def test_the_stop_is_scored_from_the_files(lived):

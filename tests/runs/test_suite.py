@@ -18,7 +18,7 @@ from test_transfer import agent, saved  # noqa: F401  fixtures: a tiny agent of 
 from mjx_cl.adapt.arms import ARMS, NEVER
 from mjx_cl.config import AdaptConfig, RunConfig
 from mjx_cl.errors import FileError, UserError
-from mjx_cl.io import folders, tables
+from mjx_cl.io import folders, memory, tables
 from mjx_cl.render import figures
 from mjx_cl.runs import merge, run
 from mjx_cl.runs import suite as bench
@@ -429,6 +429,7 @@ def test_shards_are_a_partition():
 
 def test_parts_run_once_go_on_and_merge(mjx, refused, mini, tmp_path, monkeypatch):  # noqa: F811
   out, other, begun = tmp_path / "out", tmp_path / "other", []
+  monkeypatch.setattr(memory, "free", lambda: 2**36)  # a busy machine would refuse, with 2
   init = run.Runner.__init__
   monkeypatch.setattr(
     run.Runner,

@@ -365,9 +365,9 @@ def test_a_row_takes_5_ms():
   alarm, score = np.zeros((4000, 10), bool), noise(4000, 0, 10).astype(np.float32)
   seconds = []
   for _ in range(5):
-    begin = time.perf_counter()
+    begin = time.thread_time()
     metrics.row(alarm, score, 2000, alarm, score, 0.025, 1000)
-    seconds.append(time.perf_counter() - begin)
+    seconds.append(time.thread_time() - begin)
   assert min(seconds) < 0.05
 
 

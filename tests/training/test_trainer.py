@@ -946,7 +946,7 @@ def test_kill_during_a_save_keeps_the_last_good_checkpoint(saved, same):
     "JAX_PLATFORMS": "cpu",
   }
   done = subprocess.run(
-    [sys.executable, "-c", CHILD, str(saved)], env=env, capture_output=True, text=True, timeout=120
+    [sys.executable, "-c", CHILD, str(saved)], env=env, capture_output=True, text=True, timeout=1200
   )
   assert done.returncode == 9, done.stderr
   left = [p.name for p in saved.iterdir() if p.name not in ("1", "2")]
