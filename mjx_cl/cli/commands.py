@@ -26,7 +26,7 @@ from mjx_cl.cli.display import (
   show,
   summary_text,
 )
-from mjx_cl.config import ARMS, PRESETS, RunConfig, TrainConfig, check_seeds, finite, replace
+from mjx_cl.config import PRESETS, RunConfig, TrainConfig, check_seeds, finite, replace
 from mjx_cl.errors import FileError, UserError, choose
 
 if TYPE_CHECKING:
@@ -709,6 +709,7 @@ def do_report(args: Report) -> None:
 
 def do_list(args: List) -> None:
   from mjx_cl import detectors, envs, faults
+  from mjx_cl.adapt.arms import ARMS
   from mjx_cl.faults import presets
   from mjx_cl.io import memory
   from mjx_cl.leaderboard import streams

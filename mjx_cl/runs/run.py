@@ -42,15 +42,17 @@ from mjx_cl.adapt.arms import ARMS, FOREVER, never_stops
 from mjx_cl.adapt.convergence import SIGNALS
 from mjx_cl.adapt.blocks import Crew
 from mjx_cl.adapt.loop import Choices, Loop, LoopState, choices
-from mjx_cl.config import CHUNK, AdaptConfig, RunConfig, becomes, changes
+from mjx_cl.config import CHUNK, AdaptConfig, RunConfig
 from mjx_cl.dreamer.agent import CAUSES, EXPLODED
 from mjx_cl.errors import FileError, UserError
+from mjx_cl.faults.presets import becomes, changes
 from mjx_cl.io.interrupt import Interruptible
 from mjx_cl.rollout.order import Lanes
 from mjx_cl.runs.records import Ledger, acts
 from mjx_cl.rollout.monitor import Monitor
 from mjx_cl.rollout.scan import Rollout, Stream, nest, start
 from mjx_cl.scoring import special, stop_rule
+from mjx_cl.runs.settings import check
 from mjx_cl.runs.snapshots import Snapshots
 from mjx_cl.rollout.transfer import Moving, Transfer
 
@@ -102,7 +104,8 @@ class Runner:
   """
 
   def __init__(self, config: RunConfig, out):
-    self.config, self.out = config, pathlib.Path(out)
+    self.config = config = check(config)
+    self.out = pathlib.Path(out)
     self.env = envs.make(config.env, config.physics)
     self.other = (
       envs.make(becomes(config), config.physics) if becomes(config) else None
@@ -766,7 +769,7 @@ def execute(
   """Runs `config` into `out` and returns summary.json's value. A kill at any moment loses at most
   `save_every_s` seconds of work.
   """
-  fresh = not pathlib.Path(out).exists()
+  config, fresh = check(config), not pathlib.Path(out).exists()
   state, out = tables.claim_folder(out, resume, overwrite), pathlib.Path(out)
   if state == "done":
     check_same(

@@ -30,11 +30,12 @@ import tomllib
 from collections.abc import Callable
 from typing import NamedTuple
 
-from mjx_cl.runs import merge
+from mjx_cl.runs import merge, settings
 from mjx_cl.io import tables
 from mjx_cl.adapt.arms import ARMS, FOREVER, ONSET
-from mjx_cl.config import AdaptConfig, RunConfig, becomes, changes, kinds, replace
+from mjx_cl.config import AdaptConfig, RunConfig, kinds, replace
 from mjx_cl.errors import FileError, UserError
+from mjx_cl.faults.presets import becomes, changes
 
 SUITES = pathlib.Path(__file__).parent / "suites"
 PUBLISHED = (
@@ -222,7 +223,7 @@ def config(where: str, values: dict) -> RunConfig:
       values["adapt"] = replace(AdaptConfig(), **values["adapt"])
     if "arms" in values:
       values["arms"] = tuple(values["arms"])
-    return RunConfig(**values)
+    return settings.check(RunConfig(**values))
   except UserError as e:
     raise UserError(f"{where}: {e}") from None
   except TypeError as e:

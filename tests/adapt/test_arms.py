@@ -28,7 +28,7 @@ from mjx_cl.envs.walker import Walker
 from mjx_cl.errors import UserError
 from mjx_cl.rollout.monitor import Monitor
 from mjx_cl.rollout.scan import Row
-from mjx_cl.runs import run
+from mjx_cl.runs import run, settings
 from mjx_cl.scoring import normalised_recovery, recovery
 from mjx_cl.training import agents
 
@@ -138,7 +138,7 @@ def test_bad_settings_are_refused():
       "oracle-budget, oracle-stop, periodic"
     ),
   ):
-    RunConfig("walker", arms=("orcale",))
+    settings.check(RunConfig("walker", arms=("orcale",)))
 
 
 # ---- phase machine -------------------------------------------------------------------------------

@@ -20,7 +20,8 @@ from test_run import saved  # noqa: F401  a fixture
 import mjx_cl
 from mjx_cl import detectors, envs, faults
 from mjx_cl.cli import app
-from mjx_cl.config import ARMS, PRESETS
+from mjx_cl.adapt.arms import ARMS
+from mjx_cl.config import PRESETS
 from mjx_cl.errors import FileError
 from mjx_cl.faults import presets
 from mjx_cl.io import tables as store

@@ -12,7 +12,7 @@ import pyarrow.parquet
 import pytest
 
 from mjx_cl.training import agents
-from mjx_cl.runs import suite, run, snapshots
+from mjx_cl.runs import run, settings, snapshots, suite
 from mjx_cl import envs, faults
 from mjx_cl.io import tables
 from mjx_cl.adapt import phase as phase_lib
@@ -702,7 +702,7 @@ def test_leaving_out_the_signal_that_holds_up_the_stop(tmp_path):
 
 def test_bad_settings_are_refused(config, folder, monkeypatch):
   with pytest.raises(UserError, match="needs an arm that never stops by itself: oracle-budget"):
-    RunConfig("walker", snapshots=1000)
+    settings.check(RunConfig("walker", snapshots=1000))
   with pytest.raises(UserError, match="snapshots must lie in 0"):
     RunConfig("walker", arms=("oracle-budget",), snapshots=-1)
   monkeypatch.setattr(snapshots, "LIMIT_MIB", 1)
