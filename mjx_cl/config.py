@@ -67,6 +67,13 @@ def whole(config, *names: str, most: int = FOREVER - 1) -> None:
       raise UserError(f"{name} must be a whole number in 0..{most:,}; got {value}")
 
 
+def named(fault: str) -> bool:
+  """Whether this names a preset (robot/name) and not a fault; a fault may stand in a file,
+  path/to/file.py:name.
+  """
+  return "/" in fault and ":" not in fault
+
+
 def check_seeds(first: int, count: int = 1, name: str = "seed") -> None:
   """Raises unless `count` seeds from `first` on are whole numbers from 0 to 2,147,483,647, as files
   hold them.

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from mjx_cl.config import FOREVER, RunConfig
+from mjx_cl.config import FOREVER, RunConfig, named
 from mjx_cl.errors import UserError
 
 SCHEDULES = {
@@ -205,13 +205,6 @@ for _level, _damping, _grip in (("easy", 0.05, 0.2), ("medium", 0.25, 0.5), ("ha
     ),
   }
 # lengths of limbs are excluded: MuJoCo calls a change of geom_size at run time unsafe
-
-
-def named(fault: str) -> bool:
-  """Whether this names a preset (robot/name) and not a fault; a fault may stand in a file,
-  path/to/file.py:name.
-  """
-  return "/" in fault and ":" not in fault
 
 
 def find(name: str, env_name: str) -> Preset:
