@@ -43,10 +43,11 @@ import optax  # noqa: E402
 
 from mjx_cl import envs, faults
 from mjx_cl.cli import app
-from mjx_cl.config import RunConfig, becomes, changes  # noqa: E402
+from mjx_cl.config import RunConfig  # noqa: E402
 from mjx_cl.dreamer.agent import Carry  # noqa: E402
 from mjx_cl.envs.adapters import brax_module  # noqa: E402
 from mjx_cl.errors import FileError, UserError  # noqa: E402
+from mjx_cl.faults.presets import becomes, changes  # noqa: E402
 from mjx_cl.io import tables  # noqa: E402
 from mjx_cl.rollout.scan import Rollout, nest, start  # noqa: E402
 from mjx_cl.scoring import intervals, normalised_recovery, recovery  # noqa: E402

@@ -9,14 +9,13 @@ import math
 import numbers
 from dataclasses import dataclass, field
 
-from mjx_cl.adapt.arms import ARMS, never_stops
 from mjx_cl.errors import UserError, choose
-from mjx_cl.faults import presets
 from mjx_cl.sizes import SIZES
 
 # decisions between two rounds of updates, of a training as of a run, where the stop rule looks as
 # often
 CHUNK = 64
+FOREVER = 2**31 - 1  # control steps that no run outlasts
 
 
 def positive(config, *names: str) -> None:
@@ -60,12 +59,19 @@ def kinds(where: str, annotations: dict[str, str], values: dict, before: str = "
       )
 
 
-def whole(config, *names: str, most: int = presets.FOREVER - 1) -> None:
+def whole(config, *names: str, most: int = FOREVER - 1) -> None:
   """Raises unless every named field is a whole number of at least 0 and at most `most`."""
   for name in names:
     value = getattr(config, name)
     if not (isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= most):
       raise UserError(f"{name} must be a whole number in 0..{most:,}; got {value}")
+
+
+def named(fault: str) -> bool:
+  """Whether this names a preset (robot/name) and not a fault; a fault may stand in a file,
+  path/to/file.py:name.
+  """
+  return "/" in fault and ":" not in fault
 
 
 def check_seeds(first: int, count: int = 1, name: str = "seed") -> None:
@@ -266,8 +272,6 @@ class TrainConfig:
       "repeat",
       *(("episode",) if self.episode is not None else ()),
     )
-    if self.fault is not None and presets.named(self.fault) and self.severity != 1.0:
-      raise UserError(f"preset {self.fault!r} brings its own severity; leave severity out")
     fraction(self, "demo_share", "clone_until", "shake", "shake_share", "severity")
     positive(self, "clone_std")
     not_below_0(
@@ -475,76 +479,19 @@ class RunConfig:
   residuals: bool = False
 
   def __post_init__(self):
-    last = self.steps
-    changes(self)  # refuses what does not fit together
-    if becomes(self):
-      last = (
-        presets.FOREVER - 1 - max(c.after for c in changes(self))
-      )  # later than the last step: it never happens
-    elif self.severity is None and not presets.named(self.fault):
-      object.__setattr__(self, "severity", 0.5)
     positive(self, "steps", "seeds")
-    if self.steps >= presets.FOREVER:
-      raise UserError(f"steps must be below {presets.FOREVER:,} control steps; got {self.steps}")
+    if self.steps >= FOREVER:
+      raise UserError(f"steps must be below {FOREVER:,} control steps; got {self.steps}")
     check_seeds(self.first_seed, self.seeds, "first_seed")
     finite(self.settings, "settings of the detector")
     if self.agent == "":
       raise UserError("agent is a shipped name or a folder; got an empty name")
-    if not 0 <= self.onset <= last:
-      raise UserError(
-        f"onset must lie in 0..{'steps=' if last == self.steps else ''}{last}; got {self.onset}"
-      )
-    for arm in self.arms:
-      choose("arm", arm, ARMS)
     if not self.arms or len(set(self.arms)) != len(self.arms):
       raise UserError(f"name each arm once; got {', '.join(self.arms) or 'none'}")
     if self.physics not in ("auto", "native", "mjx"):
       raise UserError(f"unknown physics {self.physics!r}; choose from: auto, native, mjx")
-    if not 0 <= self.snapshots < 2**31 - 1:
+    if not 0 <= self.snapshots < FOREVER:
       raise UserError(f"snapshots must lie in 0..2,147,483,646 control steps; got {self.snapshots}")
-    if self.snapshots and not any(never_stops(ARMS[arm]) for arm in self.arms):
-      endless = ", ".join(name for name, arm in ARMS.items() if never_stops(arm))
-      raise UserError(
-        f"snapshots={self.snapshots} needs an arm that never stops by itself: {endless}"
-      )
-    told = [arm for arm in self.arms if ARMS[arm].end.told]
-    if told and not self.stops:
-      raise UserError(
-        f"arm {told[0]!r} needs stops: the folder of a run of the same seeds with arm "
-        "oracle-budget and snapshots, which finds their oracle stops"
-      )
-    if self.stops and not told:
-      raise UserError(
-        f"stops={self.stops} needs an arm that ends there: "
-        f"{', '.join(name for name, arm in ARMS.items() if arm.end.told)}"
-      )
-    moments = {c.after for c in changes(self)} | ({0} if becomes(self) else set())
-    if told and len(moments) > 1:
-      raise UserError(
-        f"arm {told[0]!r} takes a robot that changes once; {self.fault!r} changes it "
-        f"{len(moments)} times"
-      )
-
-
-def becomes(config: RunConfig) -> str | None:
-  """The environment that the robot of a run becomes, None: stays what it is."""
-  return presets.find(config.fault, config.env).becomes if presets.named(config.fault) else None
-
-
-def changes(config: RunConfig) -> tuple[presets.Change, ...]:
-  """The faults of a run, with its duration where the preset leaves it open; of a robot that becomes
-  another one, those of that other one.
-  """
-  return presets.resolve(
-    config.env,
-    config.fault,
-    config.target,
-    config.severity,
-    config.duration,
-    config.schedule,
-    config.period,
-    config.share,
-  )
 
 
 @dataclass(frozen=True)

@@ -18,9 +18,8 @@ from typing import NamedTuple
 
 from benchmarks.report import paper
 from benchmarks.report.paper import number, span
-from mjx_cl.config import CHUNK
+from mjx_cl.config import CHUNK, named
 from mjx_cl.errors import FileError, UserError
-from mjx_cl.faults import presets
 from mjx_cl.io import folders
 from mjx_cl.sizes import SIZES
 
@@ -1055,7 +1054,7 @@ def rollback(results: pathlib.Path) -> str:
     one = plan["parts"][part]
     name = (
       f"`{one['env']}`, `{one['fault']}`"
-      + ("" if presets.named(one["fault"]) else f" {one['severity']:g}")
+      + ("" if named(one["fault"]) else f" {one['severity']:g}")
       + f", {len(seeds)} seeds"
     )
     for k, (arm, summary) in enumerate(entry["arms"].items()):
@@ -1326,7 +1325,7 @@ def full(results: pathlib.Path) -> str:
     rows.append(
       (
         f"`{one['env']}`" if one["env"] != last else "",
-        f"`{one['fault']}`" + ("" if presets.named(one["fault"]) else f" {one['severity']:g}"),
+        f"`{one['fault']}`" + ("" if named(one["fault"]) else f" {one['severity']:g}"),
         f"{own['affected']} of {own['seeds']}",
         str(own["false_alarm_streams"]),
         alarmed(own),

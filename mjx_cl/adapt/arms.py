@@ -11,9 +11,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from mjx_cl.config import FOREVER
 from mjx_cl.errors import UserError
-
-FOREVER = 2**31 - 1  # steps that no run outlasts
 
 
 @dataclass(frozen=True)

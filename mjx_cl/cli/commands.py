@@ -5,6 +5,7 @@ of that name in cli.py), computes, and prints through display.py.
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import json
 import math
 import os
@@ -12,6 +13,7 @@ import pathlib
 import re
 import sys
 import time
+import types
 from typing import TYPE_CHECKING
 
 from mjx_cl.cli.display import (
@@ -26,7 +28,7 @@ from mjx_cl.cli.display import (
   show,
   summary_text,
 )
-from mjx_cl.config import ARMS, PRESETS, RunConfig, TrainConfig, check_seeds, finite, replace
+from mjx_cl.config import PRESETS, RunConfig, TrainConfig, check_seeds, finite, replace
 from mjx_cl.errors import FileError, UserError, choose
 
 if TYPE_CHECKING:
@@ -662,8 +664,24 @@ def do_query(args: Query) -> None:
   show(table)
 
 
+def _writer() -> types.ModuleType:
+  """The program beside a checkout's package that writes its documents' numbers.
+
+  Raises:
+    UserError where the package stands elsewhere.
+  """
+  checkout = pathlib.Path(__file__).parents[2]
+  if not (checkout / "benchmarks" / "report" / "report.py").is_file():
+    raise UserError(
+      "report writes the documents of a checkout of mjx_cl; this package is installed without one"
+    )
+  if str(checkout) not in sys.path:
+    sys.path.append(str(checkout))
+  return importlib.import_module("benchmarks.report.report")
+
+
 def do_report(args: Report) -> None:
-  from benchmarks.report import report
+  report = _writer()
 
   pages = args.page or [str(p) for p in report.pages()] or ["README.md"]
   found = {
@@ -711,6 +729,7 @@ def do_report(args: Report) -> None:
 
 def do_list(args: List) -> None:
   from mjx_cl import detectors, envs, faults
+  from mjx_cl.adapt.arms import ARMS
   from mjx_cl.faults import presets
   from mjx_cl.leaderboard import streams
   from mjx_cl.runs import suite as bench

@@ -9,9 +9,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+from mjx_cl.config import FOREVER, RunConfig, named
 from mjx_cl.errors import UserError
-
-FOREVER = 2**31 - 1  # control steps that no run outlasts
 
 SCHEDULES = {
   "abrupt": "from the onset on in full",
@@ -208,13 +207,6 @@ for _level, _damping, _grip in (("easy", 0.05, 0.2), ("medium", 0.25, 0.5), ("ha
 # lengths of limbs are excluded: MuJoCo calls a change of geom_size at run time unsafe
 
 
-def named(fault: str) -> bool:
-  """Whether this names a preset (robot/name) and not a fault; a fault may stand in a file,
-  path/to/file.py:name.
-  """
-  return "/" in fault and ":" not in fault
-
-
 def find(name: str, env_name: str) -> Preset:
   """The preset `name` for a robot; `any/...` fits every robot. A robot of one's own may take that
   of a shipped one, from which it may be derived: whether it has what the faults act on, and the
@@ -274,7 +266,14 @@ def resolve(
   if not named(fault):
     return (
       Change(
-        fault, target, 0.5 if severity is None else severity, 0, duration, schedule, period, share
+        fault,
+        target,
+        Change.severity if severity is None else severity,
+        0,
+        duration,
+        schedule,
+        period,
+        share,
       ),
     )
   preset = find(fault, env_name)
@@ -294,4 +293,25 @@ def resolve(
     return preset.then or (Change("none"),)
   return tuple(
     replace(c, duration=duration if c.duration is None else c.duration) for c in preset.changes
+  )
+
+
+def becomes(config: RunConfig) -> str | None:
+  """The environment that the robot of a run becomes, None: stays what it is."""
+  return find(config.fault, config.env).becomes if named(config.fault) else None
+
+
+def changes(config: RunConfig) -> tuple[Change, ...]:
+  """The faults of a run, with its duration where the preset leaves it open; of a robot that becomes
+  another one, those of that other one.
+  """
+  return resolve(
+    config.env,
+    config.fault,
+    config.target,
+    config.severity,
+    config.duration,
+    config.schedule,
+    config.period,
+    config.share,
   )

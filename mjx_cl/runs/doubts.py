@@ -7,7 +7,8 @@ import inspect
 
 from mjx_cl import detectors, envs
 from mjx_cl.adapt.arms import ARMS
-from mjx_cl.config import CHUNK, RunConfig, becomes, changes
+from mjx_cl.config import CHUNK, RunConfig
+from mjx_cl.faults.presets import becomes, changes
 from mjx_cl.runs.identity import known_as
 from mjx_cl.runs.records import acts
 from mjx_cl.scoring import intervals

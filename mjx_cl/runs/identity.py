@@ -9,8 +9,9 @@ import pathlib
 
 from mjx_cl import detectors, envs
 from mjx_cl.adapt.arms import ARMS
-from mjx_cl.config import AdaptConfig, RunConfig, changes
+from mjx_cl.config import AdaptConfig, RunConfig
 from mjx_cl.errors import FileError, UserError
+from mjx_cl.faults.presets import changes
 from mjx_cl.io import folders, plugins, tables
 from mjx_cl.scoring import stop_rule
 from mjx_cl.training import agents

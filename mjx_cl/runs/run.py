@@ -35,10 +35,11 @@ from mjx_cl.adapt.arms import ARMS, FOREVER, never_stops
 from mjx_cl.adapt.blocks import Crew
 from mjx_cl.adapt.decide import SIGNALS
 from mjx_cl.adapt.loop import Choices, Loop, LoopState, Programs, choices
-from mjx_cl.config import CHUNK, RunConfig, becomes, changes
+from mjx_cl.config import CHUNK, RunConfig
 from mjx_cl.dreamer import replay
 from mjx_cl.dreamer.agent import CAUSES, EXPLODED
 from mjx_cl.errors import FileError, UserError
+from mjx_cl.faults.presets import becomes, changes
 from mjx_cl.io import arrays, checkpoints, folders, runtime, tables
 from mjx_cl.io.interrupt import Interruptible
 from mjx_cl.keys import OfSeed
@@ -50,6 +51,7 @@ from mjx_cl.rollout.transfer import Moving, Transfer
 from mjx_cl.runs.doubts import doubts, watching
 from mjx_cl.runs.identity import arm_agents, check_same, identity, known_as, threshold_of
 from mjx_cl.runs.records import Ledger, acts
+from mjx_cl.runs.settings import check
 from mjx_cl.runs.snapshots import Snapshots
 from mjx_cl.scoring import events as event_table
 from mjx_cl.scoring import stop_rule
@@ -104,7 +106,8 @@ class Runner:
   """
 
   def __init__(self, config: RunConfig, out, programs: Programs | None = None):
-    self.config, self.out = config, pathlib.Path(out)
+    self.config = config = check(config)
+    self.out = pathlib.Path(out)
     self.env = envs.make(config.env, config.physics)
     self.other = (
       envs.make(becomes(config), config.physics) if becomes(config) else None
@@ -632,7 +635,7 @@ def execute(
   """Runs `config` into `out` and returns summary.json's value. A kill at any moment loses at most
   `save_every_s` seconds of work. `programs`: compiled ones of this process that it may share.
   """
-  fresh = not pathlib.Path(out).exists()
+  config, fresh = check(config), not pathlib.Path(out).exists()
   state, out = folders.claim_folder(out, resume, overwrite), pathlib.Path(out)
   if state == "done":
     check_same(

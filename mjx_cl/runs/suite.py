@@ -36,12 +36,13 @@ import jax.numpy as jnp
 
 from mjx_cl import detectors, envs, faults
 from mjx_cl.adapt.arms import ARMS, FOREVER, ONSET
-from mjx_cl.config import AdaptConfig, RunConfig, becomes, changes, kinds, replace
+from mjx_cl.config import AdaptConfig, RunConfig, kinds, replace
 from mjx_cl.errors import FileError, UserError
+from mjx_cl.faults.presets import becomes, changes
 from mjx_cl.io import folders, memory, tables
 from mjx_cl.render import figures
 from mjx_cl.rollout.order import Lanes
-from mjx_cl.runs import merge, run, workers
+from mjx_cl.runs import merge, run, settings, workers
 from mjx_cl.runs.doubts import doubts, watching
 from mjx_cl.runs.identity import arm_agents
 from mjx_cl.runs.records import acts
@@ -234,7 +235,7 @@ def config(where: str, values: dict) -> RunConfig:
       values["adapt"] = replace(AdaptConfig(), **values["adapt"])
     if "arms" in values:
       values["arms"] = tuple(values["arms"])
-    return RunConfig(**values)
+    return settings.check(RunConfig(**values))
   except UserError as e:
     raise UserError(f"{where}: {e}") from None
   except TypeError as e:

@@ -221,6 +221,8 @@ def faults_of(env, config: TrainConfig):
   """
   if config.fault is None or not presets.named(config.fault):
     return faults.make(config.fault or "none", env), None, -1
+  if config.severity != 1.0:
+    raise UserError(f"preset {config.fault!r} brings its own severity; leave severity out")
   changes = presets.resolve(env.spec.name, config.fault)
   if presets.find(config.fault, env.spec.name).becomes:
     raise UserError(

@@ -30,7 +30,7 @@ from mjx_cl.io import tables
 from mjx_cl.keys import OfAdaptation
 from mjx_cl.rollout.monitor import Monitor
 from mjx_cl.rollout.scan import Row
-from mjx_cl.runs import run
+from mjx_cl.runs import run, settings
 from mjx_cl.scoring import normalised_recovery, recovery
 from mjx_cl.training import agents
 
@@ -140,7 +140,7 @@ def test_bad_settings_are_refused():
       "oracle-budget, oracle-stop, periodic"
     ),
   ):
-    RunConfig("walker", arms=("orcale",))
+    settings.check(RunConfig("walker", arms=("orcale",)))
 
 
 # ---- phase machine -------------------------------------------------------------------------------

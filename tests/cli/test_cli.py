@@ -19,8 +19,9 @@ from test_run import saved  # noqa: F401  a fixture
 
 import mjx_cl
 from mjx_cl import detectors, envs, faults
-from mjx_cl.cli import app
-from mjx_cl.config import ARMS, PRESETS
+from mjx_cl.adapt.arms import ARMS
+from mjx_cl.cli import app, commands
+from mjx_cl.config import PRESETS
 from mjx_cl.errors import FileError
 from mjx_cl.faults import presets
 from mjx_cl.io import tables as store
@@ -194,6 +195,11 @@ def test_query(mjx, refused, tmp_path):
   ]
   assert "runs" in refused(2, "query", tmp_path, "select y from runs")
   assert "no .parquet" in refused(2, "query", tmp_path / "none", "select 1")
+
+
+def test_report_elsewhere_than_in_a_checkout_is_one_line(refused, tmp_path, monkeypatch):
+  monkeypatch.setattr(commands, "__file__", str(tmp_path / "mjx_cl" / "cli" / "commands.py"))
+  assert "checkout" in refused(2, "report", "--check")
 
 
 # ---- bad arguments -------------------------------------------------------------------------------

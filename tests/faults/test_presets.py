@@ -9,12 +9,12 @@ import jax
 import numpy as np
 import pytest
 
-from mjx_cl import config, envs, faults
+from mjx_cl import envs, faults
 from mjx_cl.config import RunConfig
 from mjx_cl.errors import UserError
 from mjx_cl.faults import presets
 from mjx_cl.faults.presets import PRESETS, SOCKS_GRIP, Change
-from mjx_cl.runs import run
+from mjx_cl.runs import run, settings
 
 
 @pytest.fixture(scope="module")
@@ -105,7 +105,7 @@ def test_delays_of_the_levels_are_3_6_9_steps():
 
 def test_run_takes_a_preset_and_refuses_what_contradicts_it():
   c = RunConfig("walker", fault="any/all-easy", duration=50)
-  assert [x.fault for x in config.changes(c)] == [
+  assert [x.fault for x in presets.changes(c)] == [
     "delay",
     "command_delay",
     "noise",
@@ -113,11 +113,11 @@ def test_run_takes_a_preset_and_refuses_what_contradicts_it():
     "dropout_burst",
     "freeze_burst",
   ]
-  assert all(x.duration == 50 for x in config.changes(c))
-  assert config.changes(RunConfig("walker"))[0] == Change("gear", None, 0.5)
-  assert config.changes(RunConfig("walker", severity=0.25, schedule="ramp", period=9))[0] == Change(
-    "gear", None, 0.25, schedule="ramp", period=9
-  )
+  assert all(x.duration == 50 for x in presets.changes(c))
+  assert presets.changes(RunConfig("walker"))[0] == Change("gear", None, 0.5)
+  assert presets.changes(RunConfig("walker", severity=0.25, schedule="ramp", period=9))[
+    0
+  ] == Change("gear", None, 0.25, schedule="ramp", period=9)
   for kw, words in (
     ({"fault": "any/all-easy", "severity": 0.3}, "brings its own severity"),
     ({"fault": "walker/nothing"}, "walker/gear-half"),
@@ -130,7 +130,7 @@ def test_run_takes_a_preset_and_refuses_what_contradicts_it():
     ({"share": 1.5}, "share"),
   ):
     with pytest.raises(UserError, match=words):
-      RunConfig("walker", **kw)
+      settings.check(RunConfig("walker", **kw))
 
 
 def test_names_are_found_for_the_robot_that_asks():

@@ -503,9 +503,10 @@ def test_robot_and_fault_of_a_file(tmp_path, capsys, tiny):
   """
   import dataclasses
 
-  from mjx_cl.config import RunConfig, changes
+  from mjx_cl.config import RunConfig
+  from mjx_cl.faults.presets import changes
   from mjx_cl.io import tables
-  from mjx_cl.runs import certify, run
+  from mjx_cl.runs import certify, run, settings
   from mjx_cl.training import agents
 
   (tmp_path / "mine.py").write_text(PLUG + "class Bare: pass\nrepr = repr\n")
@@ -537,14 +538,16 @@ def test_robot_and_fault_of_a_file(tmp_path, capsys, tiny):
     )
   )
 
-  config = RunConfig(
-    robot,
-    fault=broken,
-    steps=256,
-    onset=128,
-    seeds=1,
-    agent=str(tmp_path / "agent"),
-    detector=f"{tmp_path}/mine.py:level@rpr",
+  config = settings.check(
+    RunConfig(
+      robot,
+      fault=broken,
+      steps=256,
+      onset=128,
+      seeds=1,
+      agent=str(tmp_path / "agent"),
+      detector=f"{tmp_path}/mine.py:level@rpr",
+    )
   )
   assert (
     config.severity == 0.5 and changes(config)[0].fault == broken

@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow.parquet
 import pytest
 
-from mjx_cl import config, envs, faults
+from mjx_cl import envs, faults
 from mjx_cl.config import PRESETS, AdaptConfig, RunConfig
 from mjx_cl.dreamer.agent import Agent
 from mjx_cl.envs.car import Car
@@ -24,7 +24,7 @@ from mjx_cl.io import tables
 from mjx_cl.rollout import transfer as transfer_lib
 from mjx_cl.rollout.scan import Rollout, nest, start
 from mjx_cl.rollout.transfer import Transfer
-from mjx_cl.runs import certify, run
+from mjx_cl.runs import certify, run, settings
 from mjx_cl.training import agents
 
 EPISODE, SEEDS, ONSET, CHUNK, CHUNKS = 50, 5, 70, 64, 5
@@ -332,12 +332,12 @@ def test_presets_with_a_change_of_robots():
 def test_config():
   late = RunConfig("car", fault="car/sim-to-real", onset=900, steps=300)
   assert (
-    config.becomes(late) == "car_real"
-    and config.becomes(RunConfig("car")) is None
-    and config.becomes(RunConfig("car_real", fault="car/socks")) is None
+    presets.becomes(late) == "car_real"
+    and presets.becomes(RunConfig("car")) is None
+    and presets.becomes(RunConfig("car_real", fault="car/socks")) is None
   )
-  assert [c.fault for c in config.changes(late)] == ["none"]
-  assert config.changes(RunConfig("car", fault="car/transfer-then-socks")) == (
+  assert [c.fault for c in presets.changes(late)] == ["none"]
+  assert presets.changes(RunConfig("car", fault="car/transfer-then-socks")) == (
     Change("friction", "rear", SOCKS, 42_000),
   )
   for kw, words in (
@@ -350,7 +350,7 @@ def test_config():
     ({"env": "walker"}, "of robot 'car'"),
   ):
     with pytest.raises(UserError, match=words) as e:
-      RunConfig(**{"env": "car", "fault": "car/sim-to-real"} | kw)
+      settings.check(RunConfig(**{"env": "car", "fault": "car/sim-to-real"} | kw))
     assert "\n" not in str(e.value)
 
 

@@ -21,7 +21,7 @@ from mjx_cl.errors import FileError, UserError
 from mjx_cl.io import tables
 from mjx_cl.keys import OfSeed
 from mjx_cl.rollout.scan import Rollout, nest, start
-from mjx_cl.runs import run, snapshots, suite
+from mjx_cl.runs import run, settings, snapshots, suite
 from mjx_cl.runs.snapshots import Snapshots
 from mjx_cl.scoring import stop_rule
 from mjx_cl.training import agents
@@ -704,7 +704,7 @@ def test_leaving_out_the_signal_that_holds_up_the_stop(tmp_path):
 
 def test_bad_settings_are_refused(config, folder, monkeypatch):
   with pytest.raises(UserError, match="needs an arm that never stops by itself: oracle-budget"):
-    RunConfig("walker", snapshots=1000)
+    settings.check(RunConfig("walker", snapshots=1000))
   with pytest.raises(UserError, match="snapshots must lie in 0"):
     RunConfig("walker", arms=("oracle-budget",), snapshots=-1)
   monkeypatch.setattr(snapshots, "LIMIT_MIB", 1)
