@@ -290,7 +290,7 @@ def test_a_fault_without_anything_to_act_on_is_refused(short_walker):
   assert set(faults.available(short_walker)) == set(ON_WALKER)
 
 
-def test_a_fault_that_writes_what_it_does_not_own_is_refused(short_walker):
+def test_what_a_map_returns_beside_its_own_leaves_is_refused(short_walker):
   """Whatever a third party's fault returns, leaves it does not own cannot be reached."""
   bad = faults.fault(
     "bad",
