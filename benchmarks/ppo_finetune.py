@@ -376,7 +376,10 @@ def parser() -> argparse.ArgumentParser:
   out.add_argument(
     "--policy",
     required=True,
-    help="folder that `python -m mjx_cl.training.demonstrator ENV` or benchmarks/ppo_walker.py --out wrote",
+    help=(
+      "folder that `python -m mjx_cl.training.demonstrator ENV` or benchmarks/ppo_walker.py "
+      "--out wrote"
+    ),
   )
   out.add_argument("--fault", default="walker/gear-half", help="fault or preset")
   out.add_argument("--onset", type=int, default=5000)

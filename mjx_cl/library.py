@@ -1,5 +1,5 @@
-"""What `import mjx_cl` offers beside `setup`: robots, faults, detectors and agents by name, one run of
-the whole loop, a detector's score on the recorded streams.
+"""What `import mjx_cl` offers beside `setup`: robots, faults, detectors and agents by name, one run
+of the whole loop, a detector's score on the recorded streams.
 """
 
 from __future__ import annotations
@@ -46,7 +46,8 @@ def run(
   overwrite: bool = False,
   **settings: Any,
 ) -> dict[str, Any]:
-  """Lives the whole loop, as `mjx-cl run` does: fault, alarm, finetuning, stop; arms x seeds streams.
+  """Lives the whole loop, as `mjx-cl run` does: fault, alarm, finetuning, stop; arms x seeds
+  streams.
 
   Args:
     env: robot.

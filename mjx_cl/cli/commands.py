@@ -69,6 +69,7 @@ def settings(pairs: tuple[str, ...]) -> dict:
 
 
 def do_run(args: Run) -> None:
+  """Lives the loop and prints its table."""
   config = RunConfig(
     env=args.env,
     fault=args.fault,
@@ -110,6 +111,7 @@ def do_run(args: Run) -> None:
 
 
 def do_bench(args: Bench) -> None:
+  """Runs, plans, merges or publishes a suite."""
   from mjx_cl.io import memory
   from mjx_cl.runs import suite as bench
   from mjx_cl.runs import workers
@@ -205,6 +207,7 @@ def do_bench(args: Bench) -> None:
 
 
 def do_train(args: Train) -> None:
+  """Trains agents."""
   preset = choose("preset", args.preset, PRESETS)
   names = {f.name for f in dataclasses.fields(TrainConfig)}
   changes = settings(args.set)
@@ -292,6 +295,7 @@ def do_train(args: Train) -> None:
 
 
 def do_eval(args: Eval) -> None:
+  """Prints what an agent returns."""
   if not 1 <= args.episodes <= MOST_EPISODES:
     raise UserError(
       f"episodes must lie in 1..{MOST_EPISODES:,}, which are lived side by side; got "
@@ -338,6 +342,7 @@ def do_eval(args: Eval) -> None:
 
 
 def do_certify(args: Certify) -> None:
+  """Certifies faults."""
   if not 0 <= args.episodes <= MOST_EPISODES:
     raise UserError(f"episodes must lie in 0..{MOST_EPISODES:,}; got {args.episodes}")
   from mjx_cl import envs
@@ -368,6 +373,7 @@ def do_certify(args: Certify) -> None:
 
 
 def do_record(args: Record) -> None:
+  """Records a suite of streams."""
   from mjx_cl.io import folders
   from mjx_cl.leaderboard import record, streams
 
@@ -403,6 +409,7 @@ def do_record(args: Record) -> None:
 
 
 def do_leaderboard(args: Leaderboard) -> None:
+  """Scores detectors on recorded streams, or exports the streams."""
   from mjx_cl.io import folders, runtime
   from mjx_cl.leaderboard import score, streams, submissions
 
@@ -535,6 +542,7 @@ def do_leaderboard(args: Leaderboard) -> None:
 
 
 def do_plot(args: Plot) -> None:
+  """Draws the figure of a run anew."""
   from mjx_cl.render import figures as plots
 
   if not os.path.exists(os.path.join(args.folder, "trace.parquet")):
@@ -543,6 +551,7 @@ def do_plot(args: Plot) -> None:
 
 
 def do_render(args: Render) -> None:
+  """Films an agent."""
   from mjx_cl import envs
   from mjx_cl.envs import adapters
   from mjx_cl.render import pictures
@@ -598,6 +607,7 @@ def do_render(args: Render) -> None:
 
 
 def do_detect(args: Detect) -> None:
+  """Watches a log."""
   from mjx_cl.logs import detect
 
   out = None if args.out is None else detect.claim(args.out, args.overwrite)
@@ -640,6 +650,7 @@ def do_detect(args: Detect) -> None:
 
 
 def do_query(args: Query) -> None:
+  """Answers SQL, or names the views."""
   from mjx_cl.io import tables as store
 
   *folder, sql = args.words or (None,)
@@ -681,6 +692,7 @@ def _writer() -> types.ModuleType:
 
 
 def do_report(args: Report) -> None:
+  """Writes the documents' numbers anew."""
   report = _writer()
 
   pages = args.page or [str(p) for p in report.pages()] or ["README.md"]
@@ -728,6 +740,7 @@ def do_report(args: Report) -> None:
 
 
 def do_list(args: List) -> None:
+  """Prints the names that other commands take."""
   from mjx_cl import detectors, envs, faults
   from mjx_cl.adapt.arms import ARMS
   from mjx_cl.faults import presets
@@ -767,6 +780,7 @@ def do_list(args: List) -> None:
 
 
 def do_doctor(args: Doctor) -> None:
+  """Prints what the machine offers."""
   from mjx_cl.cli import doctor
 
   rows = doctor.report()

@@ -187,6 +187,7 @@ class RunDisplay:
       self.live.stop()
 
   def __call__(self, p) -> None:
+    """Shows how far a run is, every few seconds."""
     from mjx_cl.adapt.decide import PHASES
 
     now = time.monotonic()
@@ -258,6 +259,7 @@ class TrainDisplay:
       self.bar.stop()
 
   def __call__(self, row: dict) -> None:
+    """Shows how far a training is, every few seconds."""
     now = time.monotonic()
     if row["return"] is not None:
       self.recent = (self.recent + [row["return"]])[-5:]

@@ -258,7 +258,9 @@ def known_settings(build) -> list[str]:
 
 
 def _pure(name: str, factory):
-  """`factory`, held to giving Detectors; a class in plain Python is told where it can go instead."""
+  """`factory`, held to giving Detectors; a class in plain Python is told where it can go
+  instead.
+  """
 
   @functools.wraps(factory)
   def build(*args, **settings):

@@ -1,4 +1,6 @@
-"""Bayesian online change point detection on one residual: how long ago did the present level begin?"""
+"""Bayesian online change point detection on one residual: how long ago did the present
+level begin?
+"""
 
 from __future__ import annotations
 

@@ -24,9 +24,10 @@ def is_channel(name: str) -> bool:
 
 
 def read(channel: str, residual: Residual) -> jax.Array:
-  """One number of a monitor.Residual, or of rows of them with leading axes: `opr`, `rpr`, `reward`, `surprise`, `group_0` .. `group_7`,
-  or `variable_0` and so on, the residual of a single observation variable. Unknown values are nan.
-  UserError for a variable that the residual does not hold.
+  """One number of a monitor.Residual, or of rows of them with leading axes: `opr`, `rpr`, `reward`,
+  `surprise`, `group_0` .. `group_7`, or `variable_0` and so on, the residual of a single
+  observation variable. Unknown values are nan. UserError for a variable that the residual does not
+  hold.
   """
   if channel.startswith("group_"):
     return residual.groups[..., int(channel[6:])]

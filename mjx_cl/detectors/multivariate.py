@@ -96,7 +96,9 @@ def restart(state: Trail, fired: jax.Array) -> Trail:
 
 
 class Standing(NamedTuple):
-  """Attributes: trail: Trail. warm: base.Warm of the trailing mean, mean and squares float32 (p,)."""
+  """Attributes: trail: Trail. warm: base.Warm of the trailing mean, mean and squares
+  float32 (p,).
+  """
 
   trail: Trail
   warm: Warm

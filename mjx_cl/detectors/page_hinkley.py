@@ -1,4 +1,6 @@
-"""The Page-Hinkley test: cumulative deviations from the running mean, against their extreme so far."""
+"""The Page-Hinkley test: cumulative deviations from the running mean, against their
+extreme so far.
+"""
 
 from __future__ import annotations
 

@@ -20,6 +20,7 @@ class Encoder(nn.Module):
 
   @nn.compact
   def __call__(self, obs: jax.Array) -> jax.Array:
+    """Tokens of an observation, from symlog(obs)."""
     return MLP(3, self.units, name="mlp")(symlog(obs))
 
 
@@ -31,6 +32,7 @@ class Decoder(nn.Module):
 
   @nn.compact
   def __call__(self, deter: jax.Array, stoch: jax.Array) -> jax.Array:
+    """Observation in symlog units, from both parts of the latent."""
     return Linear(self.obs, name="out")(MLP(3, self.units, name="mlp")(stoch, deter))
 
 
@@ -46,6 +48,7 @@ class Head(nn.Module):
 
   @nn.compact
   def __call__(self, *features: jax.Array, pre: jax.Array | None = None) -> jax.Array:
+    """Output of the head; `pre`: what its first layer gives, where that is known already."""
     return Linear(self.out, self.outscale, name="out")(
       MLP(self.layers, self.units, name="mlp")(*features, pre=pre)
     )

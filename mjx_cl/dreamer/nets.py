@@ -72,6 +72,7 @@ class Linear(nn.Module):
 
   @nn.compact
   def __call__(self, *xs: jax.Array) -> jax.Array:
+    """Kernel times the inputs side by side, plus bias."""
     fan_in = sum(x.shape[-1] for x in xs)
     kernel = parameter(self, "kernel", kernel_init(fan_in, self.outscale), (fan_in, self.units))
     bias = parameter(self, "bias", nn.initializers.zeros, (self.units,))
@@ -95,6 +96,7 @@ class Norm(nn.Module):
 
   @nn.compact
   def __call__(self, x: jax.Array) -> jax.Array:
+    """The input over its root mean square, times the gain."""
     gain = parameter(self, "gain", nn.initializers.ones, (x.shape[-1],))
     return x * jax.lax.rsqrt(mean_square(x) + 1e-4) * gain
 

@@ -45,6 +45,7 @@ class BlockLinear(nn.Module):
 
   @nn.compact
   def __call__(self, x: jax.Array, shared: jax.Array | None = None) -> jax.Array:
+    """Each block times its own kernel, plus what all blocks share."""
     blocks, rows, own = x.shape
     extra = 0 if shared is None else shared.shape[-1]
     kernel = parameter(
@@ -67,6 +68,7 @@ class BlockNorm(nn.Module):
 
   @nn.compact
   def __call__(self, x: jax.Array) -> jax.Array:
+    """Each block over its root mean square, times the gain."""
     blocks, _, width = x.shape
     gain = parameter(self, "gain", nn.initializers.ones, (blocks * width,)).reshape(
       blocks, 1, width

@@ -99,8 +99,8 @@ class Place(NamedTuple):
 def build(
   name: str, points: np.ndarray, right: np.ndarray | float, left: np.ndarray | float
 ) -> Track:
-  """Track along the closed cubic spline through points (K, 2) [m], with half widths right, left (K,)
-  or () [m], linear in between; the parameter is the length of the chords.
+  """Track along the closed cubic spline through points (K, 2) [m], with half widths right, left
+  (K,) or () [m], linear in between; the parameter is the length of the chords.
   """
   points = np.asarray(points, float)
   around = np.concatenate([points, points[:1]])
@@ -277,7 +277,9 @@ def load_csv(path) -> Track:
 
 
 def _gap(a0, a1, b0, b1):
-  """Least distance of segments a, b, given as endpoints (N, 2) each [m], that do not cross: (N,)."""
+  """Least distance of segments a, b, given as endpoints (N, 2) each [m], that do not
+  cross: (N,).
+  """
 
   def to(p, c, d):
     share = np.clip(((p - c) * (d - c)).sum(1) / ((d - c) ** 2).sum(1), 0, 1)
@@ -401,7 +403,9 @@ class Course:
     )  # lateral offset at spawn [m]; 0.3 m holds half a turned car
 
   def _project(self, track, x, y):
-    """Nearest cell (int32 ()), share of it that lies behind (), and offset from its line [m] (2,)."""
+    """Nearest cell (int32 ()), share of it that lies behind (), and offset from its line
+    [m] (2,).
+    """
     step = self._ahead[track]
     away = jnp.stack([x, y]) - self._centre[track]
     share = jnp.clip(jnp.sum(away * step, -1) / jnp.sum(step * step, -1), 0.0, 1.0)

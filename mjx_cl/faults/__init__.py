@@ -53,7 +53,9 @@ FAULTS = Registry(
 
 
 def family(name: str) -> str:
-  """Name of the family of fault `name`; those of other packages and files are of family `plugin`."""
+  """Name of the family of fault `name`; those of other packages and files are of family
+  `plugin`.
+  """
   return next(
     (f for f, members in FAMILIES.items() if name in members),
     "none" if name == "none" else "plugin",
@@ -144,7 +146,9 @@ def available(env) -> dict[str, Fault]:
 
 
 def target_index(fault: Fault, target: str | None) -> int:
-  """Index of a named target, -1 where it is to be drawn from the stream's seed (`random` or None)."""
+  """Index of a named target, -1 where it is to be drawn from the stream's seed (`random`
+  or None).
+  """
   if target in (None, "random"):
     return -1
   if target not in fault.targets:

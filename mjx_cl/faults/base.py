@@ -214,7 +214,9 @@ def as_tuple(faults) -> tuple[Fault, ...]:
 
 
 def begin(faults, key: jax.Array, plan: schedule.Plan, target=-1) -> Injection:
-  """Injection of `faults` before the first step; `target` int32 () or (F,), -1: drawn from `key`."""
+  """Injection of `faults` before the first step; `target` int32 () or (F,), -1: drawn
+  from `key`.
+  """
   faults = as_tuple(faults)
   target = jnp.broadcast_to(jnp.asarray(target, jnp.int32), (len(faults),))
   keys = [key] + [jax.random.fold_in(key, i) for i in range(1, len(faults))]
@@ -310,7 +312,9 @@ def none(env) -> Fault:
 
 
 def actuator_targets(env):
-  """Single actuators, then groups, then all: (names, bool mask (targets, A), how many are single)."""
+  """Single actuators, then groups, then all: (names, bool mask (targets, A), how many
+  are single).
+  """
   size = len(env.spec.act)
   rows = [(name, (i,)) for i, name in enumerate(env.spec.targets)] + list(env.spec.act_groups)
   return _masks(rows, size, len(env.spec.targets))

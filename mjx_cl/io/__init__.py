@@ -1,1 +1,3 @@
-"""Files and machines: tables, arrays, checkpoints, folders, JAX's start, memory, plug-ins, interrupts."""
+"""Files and machines: tables, arrays, checkpoints, folders, JAX's start, memory, plug-ins,
+interrupts.
+"""

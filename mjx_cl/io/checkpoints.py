@@ -38,7 +38,7 @@ def pack(tree):
 def unpack(tree, like):
   """Inverse of `pack`, for a tree of the same structure as `like`."""
   return jax.tree.map(
-    lambda x, l: jax.random.wrap_key_data(x) if _is_key(l) else l if _is_empty(l) else x, tree, like
+    lambda x, y: jax.random.wrap_key_data(x) if _is_key(y) else y if _is_empty(y) else x, tree, like
   )
 
 
@@ -200,4 +200,5 @@ class Checkpoints:
     self._manager.reload()
 
   def close(self) -> None:
+    """Waits for what is being written and lets go of the folder."""
     self._manager.close()

@@ -24,6 +24,7 @@ class Lasting:
     self._stream = stream
 
   def write(self, text: str) -> int:
+    """Writes, or nothing where nobody reads any more."""
     try:
       return self._stream.write(text)
     except (OSError, ValueError):  # ValueError: it is closed
@@ -31,6 +32,7 @@ class Lasting:
       return len(text)
 
   def flush(self) -> None:
+    """Flushes, or nothing where nobody reads any more."""
     try:
       self._stream.flush()
     except (OSError, ValueError):

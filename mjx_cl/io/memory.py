@@ -1,4 +1,6 @@
-"""Memory of the machine: what is free of it, within a container's limit, and what a process grows to."""
+"""Memory of the machine: what is free of it, within a container's limit, and what a process grows
+to.
+"""
 
 from __future__ import annotations
 

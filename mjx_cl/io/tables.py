@@ -87,7 +87,6 @@ def write_table(
 
 def write_arrow(path, table) -> None:
   """Writes a pyarrow Table as Parquet, compressed as `write_table` does."""
-
   folders.atomic(
     path,
     lambda file: pyarrow.parquet.write_table(table, file, compression="zstd", use_dictionary=False),
@@ -122,7 +121,6 @@ def read_arrow(path):
   Raises:
     FileError for a file that cannot be read.
   """
-
   try:
     return pyarrow.parquet.read_table(path)
   except FileNotFoundError:
@@ -205,7 +203,6 @@ def query(tables, sql: str | None = None) -> tuple[list[str], list[tuple]]:
   Returns:
     (names of columns, rows).
   """
-
   if not isinstance(tables, dict):
     tables = {file.stem: file for file in sorted(pathlib.Path(tables).glob("*.parquet"))} or _none(
       tables

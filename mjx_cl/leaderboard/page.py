@@ -221,36 +221,6 @@ COLUMNS = (
   Column("note", "Note", "text", 0, "What is to be known about the row"),
 )
 
-HTML = """<!doctype html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<meta name="color-scheme" content="light dark">
-<meta http-equiv="Content-Security-Policy" content="default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data:">
-<link rel="icon" href="data:,">
-<title>mjx_cl leaderboard</title>
-<style>
-@CSS@</style>
-</head>
-<body>
-<header>
-<h1><a href="#"><svg viewBox="0 0 32 24" aria-hidden="true"><path d="M1 16h7l2-4 2 6 2-4h4V4l3 0v10h10"/></svg>mjx_cl leaderboard</a></h1>
-<p class="lead">Each detector watches what a robot fails to predict about itself and should raise an alarm soon after a fault begins, and not before.
-All thresholds were set on healthy robots to the same mean time between false alarms, and the cost score puts delay, misses and false alarms
-into one figure: 0 for a detector that never alarms, 100 for one that alarms at every onset and at no other time.</p>
-</header>
-<noscript><p>The tables and plots need JavaScript; all figures are in this file as JSON, in the element with the id "data".</p></noscript>
-<main id="board"></main>
-<main id="page" hidden></main>
-<footer id="about"></footer>
-<div id="tip" role="status" hidden></div>
-<script type="application/json" id="data">@DATA@</script>
-<script>
-@JS@</script>
-</body>
-</html>
-"""
 
 
 def write(

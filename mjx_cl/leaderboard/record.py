@@ -93,6 +93,7 @@ class Behind:
     return self
 
   def __call__(self, *args) -> None:
+    """Begins the next one once the last has ended."""
     if self._last is not None:
       self._last.result()
     self._last = self._pool.submit(self._function, *args)
@@ -113,7 +114,6 @@ def _record(
     COLUMNS float32 (steps, S), nan where unknown; episode int16, terminated bool (steps, S); latent
     float16 (steps, S, 16); target (S,) names.
   """
-
   names = list(dict.fromkeys(lane.fault for lane in lanes_ if lane.fault))
   faults = tuple(faults_lib.make(n, env) for n in names) or (faults_lib.none(env),)
   severity, target = (
@@ -326,7 +326,6 @@ def prepare(suite_: Suite, robots, physics: str, agent: str | None) -> dict[str,
     UserError, before hours are spent: an unknown robot, fault, target or agent, or an agent that
       does not act in every control step.
   """
-
   out = {}
   for robot in robots or suite_.robots:
     if robot not in suite_.robots:
@@ -370,7 +369,6 @@ def record(
   Returns:
     {robot: stream-steps per second of its parts}, plus the size of the files.
   """
-
   out = pathlib.Path(out)
   work, staged = out / "work", out / "work" / "set"
   staged.mkdir(parents=True, exist_ok=True)
@@ -517,7 +515,6 @@ def _digest(params) -> int:
   """CRC-32 of an agent's weights, which tells agents apart; config.json of a set holds it for each
   robot's.
   """
-
   return zlib.crc32(b"".join(np.asarray(x).tobytes() for x in jax.tree.leaves(params)))
 
 

@@ -348,7 +348,9 @@ def rows_of(name: str, reference: bool, result: Found, data: Data, oracle: dict)
 def _row(
   name, reference, data, key, alarms, oracle, threshold=None, arl0=None, episode=None, us=None
 ) -> dict:
-  """One row; alarms: fired and score on the fault streams, fired and score on healthy ones by seed."""
+  """One row; alarms: fired and score on the fault streams, fired and score on healthy
+  ones by seed.
+  """
   fired, score, nominal_fired, nominal_score = alarms
   onset = data.fault.onset[data.own(key)]
   row = metrics.row(
@@ -565,7 +567,6 @@ def _one_line(one: Entry, run: Callable[[], Any]):
   """run(); whatever goes wrong inside a detector, which may be anybody's, becomes one line that
   names it.
   """
-
   try:
     return run()
   except UserError:

@@ -290,6 +290,7 @@ class StreamSet:
 
   @property
   def robots(self) -> list[str]:
+    """Robots of the set, in its order."""
     return list(dict.fromkeys(self.meta["robot"].tolist()))
 
   def choose(self, robots=()) -> list[str]:

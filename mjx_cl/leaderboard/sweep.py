@@ -89,7 +89,6 @@ def samples(
     nominal, fault: monitor.Residual, NumPy. onset, seed: int (F,). horizon: steps kept from the
       onset on. most: rows to fill up to.
   """
-
   leaves = jax.tree.leaves(fault)
   same = lambda a, b, steps: all(
     np.array_equal(x[:steps, a], x[:steps, b], equal_nan=x.dtype.kind == "f") for x in leaves
@@ -144,7 +143,6 @@ def updates(detector):
   """Update that gives (state, (fired (), scores (M,))): the score of each member of `any_of`, since
   each restarts by itself; else the one score.
   """
-
   members = getattr(detector.update, "members", None)
 
   def update(state, x):
@@ -245,7 +243,9 @@ def program(build: Callable, rows: int, pool: int):
 
 
 class Stretch(NamedTuple):
-  """One of `program`, see there. thresholds: (K, n), first, source, into: (n,) for n of the lanes."""
+  """One of `program`, see there. thresholds: (K, n), first, source, into: (n,) for n of
+  the lanes.
+  """
 
   thresholds: np.ndarray
   first: np.ndarray
@@ -268,7 +268,6 @@ class Runner:
 
   def prepare(self, data: Samples) -> None:
     """Compiles for these streams; a second robot that fits needs nothing."""
-
     if not self.together:
       self.together = (
         healthy.TOGETHER if shared(self.build, jax.tree.map(lambda x: x[0], data.residual)) else 1
@@ -415,7 +414,9 @@ class Runner:
 
 
 def strongest(scores: np.ndarray) -> np.ndarray:
-  """The largest known of the members' scores (.., M), as `any_of` has it; nan where none is known."""
+  """The largest known of the members' scores (.., M), as `any_of` has it; nan where none
+  is known.
+  """
   return scores[..., 0] if scores.shape[-1] == 1 else np.fmax.reduce(scores, -1)
 
 

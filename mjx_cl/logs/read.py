@@ -117,7 +117,7 @@ def read(path) -> Log:
     if "time" not in told
     else {}
   )
-  told |= {"time": x for x in list(filter(_throughout, seconds.values()))[:1]}
+  told |= dict(zip(["time"], filter(_throughout, seconds.values())))
   if seconds and "time" not in told and cells:
     notes.append(
       f"{path}: column {next(iter(seconds))} tells no times, as it does not rise at every row"
@@ -251,7 +251,9 @@ def _words(label: str) -> list[str]:
 
 
 def _told(name: str, label: str) -> str | None:
-  """ "time" where a column of that name has seconds or no unit, "step" where it is called so."""
+  """Says `time` where a column of that name has seconds or no unit, `step` where it is
+  called so.
+  """
   role = "".join(_words(name)[:1])
   return (
     role
@@ -306,9 +308,14 @@ def _clocks(log: Log, nominal: Log) -> list[str]:
   for name in {**log.columns, **nominal.columns}:
     there = [one.columns[name] for one in (nominal, log) if name in one.columns]
     called = any(_called_clock(one.labels[name]) for one in (log, nominal) if name in one.labels)
-    if called and any(map(_rises, there)):
-      found.append(name)
-    elif len(there) == 2 and _rises(there[0]) and _rises(there[1], 0) and all(map(_evenly, there)):
+    if (
+      called
+      and any(map(_rises, there))
+      or len(there) == 2
+      and _rises(there[0])
+      and _rises(there[1], 0)
+      and all(map(_evenly, there))
+    ):
       found.append(name)
   return list(dict.fromkeys(found))
 

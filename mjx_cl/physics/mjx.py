@@ -106,6 +106,7 @@ class Mjx:
     }
 
   def step(self, fields: dict[str, jax.Array], state, ctrl: jax.Array, task=None, force=None):
+    """`substeps` physics steps of one robot, see `Native.step`."""
     model = self.model(fields)
     if force is not None:
       state = state.replace(qfrc_applied=jnp.asarray(force, state.qfrc_applied.dtype))

@@ -207,7 +207,9 @@ class Host:
     self.seconds = 0.0
 
   def __call__(self, layout: str, packed: np.ndarray) -> np.ndarray:
-    """`step` on one array of bits, (..., state + everything in `layout`) -> (..., state + outputs)."""
+    """`step` on one array of bits, (..., state + everything in `layout`) -> (..., state
+    + outputs).
+    """
     lead, at, given = packed.shape[:-1], self.template.shape[0], {}
     for name, shape, size in _read(layout):
       given[name] = packed[..., at : at + size].view(np.float32).reshape(lead + shape)

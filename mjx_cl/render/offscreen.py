@@ -79,6 +79,7 @@ class Offscreen:
     self._camera.distance = 3.2 * self.reach
 
   def close(self) -> None:
+    """Frees the GL context."""
     self._context.free()
     self._gl.free()
 

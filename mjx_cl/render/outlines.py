@@ -53,7 +53,9 @@ def outline(points: np.ndarray, radius: float) -> np.ndarray:
 
 
 class Canvas:
-  """A matplotlib figure of width x height pixels that is one pair of axes, equal scales, no frame."""
+  """A matplotlib figure of width x height pixels that is one pair of axes, equal scales,
+  no frame.
+  """
 
   def __init__(self, width: int, height: int):
     self.width, self.height = width, height
@@ -99,7 +101,7 @@ class Sketch:
     ]
 
   def close(self) -> None:
-    pass
+    """Nothing to free."""
 
   def _floor(self, center: np.ndarray, height: float) -> None:
     ax = self.canvas.ax
@@ -174,7 +176,7 @@ class Plan:
     self.canvas.figure.set_facecolor("0.93")
 
   def close(self) -> None:
-    pass
+    """Nothing to free."""
 
   def picture(self, frame: Frame) -> np.ndarray:
     """uint8 (height, width, 3)."""

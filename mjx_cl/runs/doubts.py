@@ -16,7 +16,8 @@ from mjx_cl.scoring import intervals
 
 def watching(config: RunConfig) -> str | None:
   """The threshold that a detector has without having been given one, in a line; None where it was,
-  takes none, is one of the paper's rules or looks at nothing."""
+  takes none, is one of the paper's rules or looks at nothing.
+  """
   name = detectors.split(config.detector)[0]
   build = detectors.factory(config.detector)
   if (

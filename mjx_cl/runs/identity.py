@@ -1,4 +1,6 @@
-"""What makes a run what it is: its settings, agents and threshold, and whether a folder holds the same."""
+"""What makes a run what it is: its settings, agents and threshold, and whether a folder holds the
+same.
+"""
 
 from __future__ import annotations
 

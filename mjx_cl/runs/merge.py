@@ -73,6 +73,7 @@ def differs(folder, config: RunConfig, but: tuple[str, ...] = ()) -> str | None:
 
   Args:
     but: settings that may differ.
+
   Raises:
     FileError for a config.json or an agent that is broken.
   """
@@ -102,8 +103,8 @@ def differs(folder, config: RunConfig, but: tuple[str, ...] = ()) -> str | None:
 
 
 def cards(config: RunConfig) -> dict[str, dict]:
-  """Today's `agent_card` and `arm_cards` as config.json holds them; empty where there is no agent, as
-  where it was moved.
+  """Today's `agent_card` and `arm_cards` as config.json holds them; empty where there is no agent,
+  as where it was moved.
 
   Raises:
     FileError for a broken one.
@@ -197,6 +198,7 @@ def join(folders, out, config: RunConfig) -> dict:
 
   Args:
     folders: of finished runs, see `choose`. config: with the seeds of all of them.
+
   Raises:
     UserError where pieces differ in their agent or physics; FileError for a piece that cannot be
     read.
@@ -303,7 +305,7 @@ def copy_agents(folder: pathlib.Path, out: pathlib.Path) -> None:
 
 
 def joined(tables, number: dict[tuple[str, int], int], key: str):
-  """pyarrow Tables one below the other, `stream` counted anew, ordered by stream and `key`. A
+  """Pyarrow Tables one below the other, `stream` counted anew, ordered by stream and `key`. A
   column that a piece lacks is null there.
   """
   table = pyarrow.concat_tables(tables, promote_options="permissive")

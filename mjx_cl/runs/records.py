@@ -83,6 +83,7 @@ class Ledger(NamedTuple):
     return dict(sorted(out.items()))
 
   def trace(self, trace) -> dict:
+    """Columns of trace.parquet, stream by stream."""
     steps, groups = trace["reward"].shape
     flat = lambda x: np.ascontiguousarray(x.T).reshape(-1)
     column = lambda values: np.repeat(np.asarray(values), steps)
@@ -376,7 +377,8 @@ def set_apart(rows: list[dict], events: list[dict]) -> list[dict]:
   """Rows with `adapting_at_onset`: whether the stream's finetuning was under way when the change
   came. Such a stream is a false alarm (or one that was told to adapt) and is kept apart from
   latency: what its detector says then starts nothing, so it has no `alarm_step`, `latency_steps`
-  and `latency_s`, and counts neither as a detection nor as a miss."""
+  and `latency_s`, and counts neither as a detection nor as a miss.
+  """
   out = []
   for r in rows:
     last = None

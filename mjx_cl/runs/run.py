@@ -356,7 +356,8 @@ class Runner:
   def onsets(self) -> list[int | None]:
     """Each stream's onset; where the robot becomes another one: as far as it is known. None: not in
     this run, an arm whose robot is spared, or a run without a fault or with one of severity 0,
-    which changes nothing."""
+    which changes nothing.
+    """
     if self.other is None:
       met = self.config.onset < self.config.steps and any(acts(change) for change in self.changes)
       return [self.config.onset if breaks and met else None for breaks in self.breaks]
@@ -476,6 +477,7 @@ class Runner:
 
   @property
   def done(self) -> bool:
+    """All chunks have been lived."""
     return self.done_chunks >= self.chunks
 
   # ---- result files ------------------------------------------------------------------------------
@@ -597,7 +599,7 @@ class Runner:
       )
       card = {
         k: v
-        for k, v in (self.others[arm] if arm in self.others else self.trained).card.items()
+        for k, v in self.others.get(arm, self.trained).card.items()
         if k not in ("eval", "demonstrator_return")
       }
       adapted = {

@@ -54,6 +54,7 @@ def due(before, decision, since, now: int, length: int, every: int) -> np.ndarra
     before: int (groups,), phase before the chunk. decision, since: int (groups,), of its end, see
       phase.PhaseState. now: control steps done after it.
     length: control steps of a chunk. every: control steps between two snapshots.
+
   Returns:
     bool (groups,). The first one, at since itself, holds the weights that adaptation began with.
   """
@@ -71,6 +72,7 @@ class Snapshots:
     repeat: control steps per decision. labels: (arm, seed) of each stream. params: of the agent,
       for their shapes.
     folder: where they lie; made when the first is taken.
+
   Raises:
     UserError where the run would take more than LIMIT_MIB of them.
   """
@@ -181,6 +183,7 @@ class Snapshots:
     Args:
       targets: int (groups, F), of each stream's faults.
       tell: called with a line after each batch.
+
     Returns:
       (columns of snapshots.parquet, seconds that it took).
     """

@@ -137,6 +137,7 @@ def suite(name: str, change: dict | None = None) -> Suite:
 
   Args:
     change: settings that take the place of the suite's own in every entry, e.g. {"seeds": 2}.
+
   Raises:
     UserError for an unknown name, key or value, with the choices; FileError for a file that is no
     TOML.
@@ -473,6 +474,7 @@ def offers(
   Args:
     folders: others' OUT of the same suite. tell: gets a line for each part of theirs that is
       refused, since it was run with other settings or cannot be read.
+
   Raises:
     UserError where OUT holds a part with other settings, or seeds of a part are missing or there
     twice.
@@ -820,6 +822,7 @@ def execute(
     jobs: parts side by side, see workers.py, the longest first. The last digits of a run depend on
       how many cores it has.
     worker: module that such a process runs.
+
   Returns:
     bench.json's value.
   """

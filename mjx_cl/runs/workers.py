@@ -29,6 +29,7 @@ def number(asked: int | None, needs: list[int], space: int) -> int:
 
   Args:
     asked: the user's number, None: as many as that.
+
   Raises:
     UserError where the user's number is below 1, above the cores, or does not fit. On an
     accelerator, which each process would take whole, it is 1.

@@ -92,7 +92,9 @@ class Conditional(NamedTuple):
 
 
 class Parameters(NamedTuple):
-  """Conditional densities of a channel, healthy and faulty: what detectors.likelihood_ratio takes."""
+  """Conditional densities of a channel, healthy and faulty: what
+  detectors.likelihood_ratio takes.
+  """
 
   before: Conditional
   after: Conditional
@@ -226,7 +228,9 @@ def innovations(x, model: Conditional) -> np.ndarray:
 
 
 def log_density(x, model: Conditional) -> np.ndarray:
-  """Ln p(x_t | past) of each step, but for a constant, (T - order, S); nan where a lag is unknown."""
+  """Ln p(x_t | past) of each step, but for a constant, (T - order, S); nan where a lag
+  is unknown.
+  """
   return -0.5 * (np.sum(innovations(x, model) ** 2, -1) + model.log_det)
 
 

@@ -136,8 +136,8 @@ def rows(snapshots, happened, runs, updates) -> list[dict]:
   where it does not end, what rests on it is None.
 
   Args:
-    snapshots, happened, runs: rows of snapshots.parquet, events.parquet and runs.parquet. updates: int (streams, steps), the
-      column of trace.parquet.
+    snapshots, happened, runs: rows of snapshots.parquet, events.parquet and runs.parquet. updates:
+      int (streams, steps), the column of trace.parquet.
 
   Returns:
     rows with COLUMNS, sorted by stream.
@@ -273,8 +273,8 @@ def ablation(folder, **rule) -> list[dict]:
   it not asked a signal to settle.
 
   The phase machine of a run (adapt.decide) lives once more over the recorded chunk signals. A
-  reward that is left out need not settle, but must still be accepted. Until the stop this is the life of
-  arm `oracle` in the same seed, as far as both were rounded alike (run.Runner).
+  reward that is left out need not settle, but must still be accepted. Until the stop this is the
+  life of arm `oracle` in the same seed, as far as both were rounded alike (run.Runner).
 
   Args:
     rule: settings of AdaptConfig that the rule reads, in place of the run's: ablation(folder,

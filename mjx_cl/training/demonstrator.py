@@ -39,7 +39,9 @@ class Policy(NamedTuple):
   layers: tuple[tuple[jax.Array, jax.Array], ...]
 
   def __call__(self, obs: jax.Array) -> jax.Array:
-    """Action in [-1, 1], float32 (..., act), for obs (..., obs): the mode of the squashed normal."""
+    """Action in [-1, 1], float32 (..., act), for obs (..., obs): the mode of the
+    squashed normal.
+    """
     x = (obs - self.mean) / self.std
     for kernel, bias in self.layers[:-1]:
       x = jax.nn.swish(x @ kernel + bias)
@@ -98,6 +100,7 @@ class Shaped:
     return getattr(self.env, name)
 
   def step(self, model, state, action):
+    """A step of the robot with the shaped reward."""
     state, out = self.env.step(model, state, action)
     return state, out._replace(reward=out.reward + self.bonus)
 

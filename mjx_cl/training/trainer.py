@@ -571,6 +571,7 @@ class Trainer:
 
   @property
   def done(self) -> bool:
+    """All updates have been made."""
     return self.updates >= self.config.updates
 
   # ---- files -------------------------------------------------------------------------------------

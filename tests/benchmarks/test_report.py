@@ -477,7 +477,8 @@ def test_json_says_which_agree(mjx, results, tmp_path):
 
 def test_no_jax_is_imported():
   code = (
-    "import sys; from mjx_cl.cli import app as cli; code = cli.main(['report', '--check', '--page', "
+    "import sys; from mjx_cl.cli import app as cli; code = cli.main(['report', '--check', "
+    "'--page', "
     "'docs/results.md']); "
     "print(code, [m for m in ('jax', 'mujoco', 'flax', 'matplotlib') if m in sys.modules])"
   )

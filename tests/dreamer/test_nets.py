@@ -300,8 +300,8 @@ def test_sample_gradient_is_that_of_probs():
     normals(5, 8, seed=2),
     jnp.asarray(np.random.default_rng(0).random(5), jnp.float32),
   )
-  got = jax.grad(lambda l: jnp.sum(weights * rssm.sample(l, uniform)))(logits)
-  want = jax.grad(lambda l: jnp.sum(weights * rssm.probs(l)))(logits)
+  got = jax.grad(lambda x: jnp.sum(weights * rssm.sample(x, uniform)))(logits)
+  want = jax.grad(lambda x: jnp.sum(weights * rssm.probs(x)))(logits)
   np.testing.assert_allclose(got, want, rtol=1e-6)  # the same sum, perhaps fused otherwise
   assert np.abs(want).max() > 0.01
 

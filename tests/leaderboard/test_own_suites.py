@@ -262,8 +262,8 @@ def test_a_threshold_below_one_with_too_many_alarms_is_none():
 
 @pytest.mark.parametrize("name", ["slow", "clipped", "constant"])
 def test_no_threshold_lies_where_nothing_is_counted(name):
-  """A score that crosses no level as often as is allowed: the threshold with the most crossings, not
-  one below all scores, above which even a sound score stays from its first step on.
+  """A score that crosses no level as often as is allowed: the threshold with the most crossings,
+  not one below all scores, above which even a sound score stays from its first step on.
   """
   steps = np.arange(6000)
   score = {

@@ -360,7 +360,7 @@ def test_trace_rows(whole):
   np.testing.assert_array_equal(
     trace["truncated"], np.broadcast_to(np.arange(STEPS) % EPISODE == EPISODE - 1, (4, STEPS))
   )
-  assert not trace["terminated"].any() and ((0 <= trace["reward"]) & (trace["reward"] <= 1)).all()
+  assert not trace["terminated"].any() and ((trace["reward"] >= 0) & (trace["reward"] <= 1)).all()
   for name in ("opr", "rpr"):
     np.testing.assert_array_equal(np.isfinite(trace[name]), trace["valid"])
   assert not trace["valid"][:, :14].any() and trace["valid"][:, 14:].mean() > 0.9

@@ -401,9 +401,9 @@ def test_lengths_of_finetunings_are_those_of_the_published_suites():
           for s in stop_rule.spans(tables.read_rows(RESULTS / suite / part.name / "events.parquet"))
           if ARMS[s["arm"]].end.rule
         ]
-  assert bench.ADAPTS == {
+  assert {
     robot: pytest.approx(np.mean(own), rel=0.1) for robot, own in lengths.items()
-  }
+  } == bench.ADAPTS
 
 
 def published(folder):

@@ -68,7 +68,9 @@ def brax_env(env: Any, fault: str | None = None, **settings: Any) -> BraxEnv:
 
 
 def gymnasium_env(env: Any, seed: int = 0, physics: str = "auto", **fault: Any) -> GymnasiumEnv:
-  """One robot as a `gymnasium.Env`; arguments and the meaning of a reset as in `gymnasium_vector`."""
+  """One robot as a `gymnasium.Env`; arguments and the meaning of a reset as in
+  `gymnasium_vector`.
+  """
   return _optional("gymnasium", f"{__name__}.gymnasium").GymnasiumEnv(env, seed, physics, **fault)
 
 

@@ -1,4 +1,6 @@
-"""Robots that are driven from outside, with the faults of `mjx-cl run`: what every adapter holds."""
+"""Robots that are driven from outside, with the faults of `mjx-cl run`: what every
+adapter holds.
+"""
 
 from __future__ import annotations
 
@@ -35,9 +37,11 @@ class Puppet:
     self.size = types.SimpleNamespace(stoch=1, classes=1)
 
   def carry(self) -> Carry:
+    """A carry that holds nothing."""
     return Carry(jnp.zeros(1), jnp.zeros(1), jnp.zeros(self.act_size))
 
   def prepare(self, params: Any) -> Any:
+    """The parameters as they are."""
     return params
 
   def act(
