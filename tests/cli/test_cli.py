@@ -7,6 +7,8 @@ import errno
 import json
 import os
 import pathlib
+import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -21,7 +23,7 @@ import mjx_cl
 from mjx_cl import detectors, envs, faults
 from mjx_cl.cli import app, commands
 from mjx_cl.adapt.arms import ARMS
-from mjx_cl.config import PRESETS
+from mjx_cl.config import PRESETS, RunConfig
 from mjx_cl.errors import FileError
 from mjx_cl.faults import presets
 from mjx_cl.io import tables as store
@@ -104,6 +106,37 @@ def test_help_imports_nothing_heavy(argv):
     "duckdb",
     "scipy",
   }
+
+
+@pytest.mark.parametrize("command", app.COMMANDS)
+def test_help_of_each_command_shows_an_example_that_it_takes(mjx, command):
+  name = command.__name__.lower()
+  code, out, err = mjx(name, "--help")
+  (example,) = re.findall(r"^Example: mjx-cl (.*)$", out, re.M)
+  assert (code, err) == (0, "") and type(app.parse(shlex.split(example))) is command
+
+
+def test_run_takes_every_setting_of_a_run():
+  """A flag for each field, under its own name but for --arm and --set."""
+  given = app.parse(
+    [
+      "run",
+      "car",
+      "--set",
+      "a=1",
+      "b=x",
+      "--arm",
+      "none",
+      "--target",
+      "random",
+      "--adapt.ratio",
+      "2",
+    ]
+  )
+  assert given.env == "car" and given.settings == {"a": 1, "b": "x"} and given.arms == ("none",)
+  assert given.target is None and given.adapt.ratio == 2.0
+  flags = {f.name for f in dataclasses.fields(app.Run)} - {"out", "json", "resume", "overwrite"}
+  assert flags == {f.name for f in dataclasses.fields(RunConfig)}
 
 
 def test_help_names_every_command(mjx):
