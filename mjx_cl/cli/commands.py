@@ -25,7 +25,7 @@ from mjx_cl.cli.display import (
   plan_lines,
   say,
   show,
-  summary_text,
+  show_summary,
 )
 from mjx_cl.config import (
   PRESETS,
@@ -71,7 +71,7 @@ def do_run(args: Run) -> None:
   if args.json:
     emit(summary)
   else:
-    print(summary_text(summary, args.out))
+    show_summary(summary, args.out)
 
 
 def do_bench(args: Bench) -> None:
@@ -163,7 +163,8 @@ def do_bench(args: Bench) -> None:
     emit(value)
     return
   for name, summary in value["entries"].items():
-    print(f"{name}: {summary_text(summary, str(out / name))}")
+    print(f"{name}: ", end="")
+    show_summary(summary, str(out / name))
   print(f"{value['finished']} of {value['parts']} parts finished; files in {out}")
 
 
@@ -729,7 +730,6 @@ def do_doctor(args: Doctor) -> None:
     emit(rows)
   else:
     for name, value in rows.items():
-      print(
-        f"{name:16s} "
-        f"{value if not isinstance(value, dict) else ', '.join(f'{k} {v}' for k, v in value.items())}"
-      )
+      if isinstance(value, dict):
+        value = ", ".join(f"{k} {v}" for k, v in value.items())
+      print(f"{name:16s} {value}")
