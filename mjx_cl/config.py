@@ -5,9 +5,14 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
 import numbers
+from collections.abc import Iterable
 from dataclasses import dataclass, field
+from typing import Annotated
+
+import tyro
 
 from mjx_cl.errors import UserError, choose
 from mjx_cl.sizes import SIZES
@@ -89,6 +94,35 @@ def finite(values: dict, where: str) -> None:
       raise UserError(f"{where}: {name} must be finite; got {value}")
 
 
+def settings(pairs: Iterable[str]) -> dict:
+  """("a=1", "b=x") -> {"a": 1, "b": "x"}; values are read as JSON where they are JSON."""
+  out = {}
+  for pair in pairs:
+    name, sign, value = pair.partition("=")
+    if not sign:
+      raise UserError(f"--set takes name=value; got {pair!r}")
+    try:
+      out[name] = json.loads(value.lower() if value in ("True", "False") else value)
+    except ValueError:
+      out[name] = value
+  finite(out, "--set")
+  return out
+
+
+# settings by name; on the command line --set name=value ...
+Settings = Annotated[
+  dict,
+  tyro.conf.arg(name="set"),
+  tyro.constructors.PrimitiveConstructorSpec(
+    nargs="*",
+    metavar="[NAME=VALUE ...]",
+    instance_from_str=settings,
+    is_instance=lambda x: isinstance(x, dict),
+    str_from_instance=lambda x: [f"{name}={json.dumps(value)}" for name, value in x.items()],
+  ),
+]
+
+
 def fraction(config, *names: str) -> None:
   """Raises unless every named field lies in [0, 1]."""
   for name in names:
@@ -99,29 +133,35 @@ def fraction(config, *names: str) -> None:
 
 @dataclass(frozen=True)
 class DreamerConfig:
-  """The learner. Defaults are the authors' (facts of danijar/dreamerv3 at e3f0224) except `size`.
+  """The learner. Defaults are those of DreamerV3's authors, less `size`.
 
   Attributes:
-    size: row of the size table.
-    batch, length: sequences and trained steps of one update.
-    context: leading records of a window that only give the initial state; 1, as the authors'.
-    imagine: imagined steps from each start.
-    last_starts: imagination starts are the last k states of each sequence; 0 means all.
-    horizon: the discount is 1 - 1 / horizon.
-    lr, warmup: learning rate and updates of its linear warm-up.
-    policy_lr: factor on the policy's steps; 1, as the authors'. Below 1 the world model keeps ahead
-      of the policy (the cloned quadruped's at 1 runs to where the model promises too much, and its
-      return falls).
-    anchor: weight of -log policy(a | s) for the mean of the policy, over the actions that the robot
-      itself took, in replayed states; 0: off, as the authors. The policy reads the latents of the
-      world model; where learning moves those under it, this makes it follow.
-    min_std, max_std: least and greatest deviation of the policy's actions; 0.1 and 1, as the
-      authors'. What the robot does is drawn with it, in tests too.
-    bins: classes of the two-hot heads.
-    entropy: weight of the policy's entropy.
-    obs_scale: one number per observation variable that it is divided by before encoder and decoder
-      loss, `spec`: the robot's typical deviations (Var.scale); None: raw units, as the authors. In
-      raw units a joint angle of 0.2 rad counts a hundredth of a joint speed of 2 rad/s.
+    size: Row of the size table, see `mjx-cl list sizes`.
+    batch: Sequences of one update.
+    length: Trained steps of a sequence.
+    context: Leading records of a window that only give the initial state; 1.
+    imagine: Imagined steps from each start.
+    last_starts: Imagination starts are the last so many states of each sequence; 0: all.
+    horizon: The discount is 1 - 1 / horizon.
+    lam: Lambda of the returns, in [0, 1].
+    lr: Learning rate.
+    policy_lr: Factor on the policy's steps; below 1 the world model keeps ahead of the policy.
+    anchor: Weight of -log policy(a | s) for the actions that the robot itself took, in replayed
+      states; holds the policy where learning moves the latents that it reads. 0: off.
+    min_std: Least deviation of the policy's actions.
+    max_std: Greatest deviation of the policy's actions.
+    warmup: Updates over which the learning rate rises linearly.
+    agc: Adaptive gradient clipping: largest ratio of a gradient's norm to its weights'.
+    bins: Classes of the two-hot heads, odd.
+    entropy: Weight of the policy's entropy.
+    free_nats: Divergence below which dynamics and representation are not trained [nat].
+    rep_scale: Weight of the representation loss.
+    repval_scale: Weight of the value loss on replayed states.
+    range_rate: Rate at which the range of returns is followed.
+    slow_rate: Rate at which the slow critic follows the critic.
+    obs_scale: What each observation variable is divided by before encoder and decoder loss; `spec`:
+      the robot's typical deviations; None: raw units, in which a joint's angle counts far less
+      than its speed.
   """
 
   size: str = "size12m"
@@ -182,47 +222,40 @@ class TrainConfig:
   """Pretraining.
 
   Attributes:
-    envs: robots that act side by side.
-    updates: gradient steps in all.
-    ratio: replayed steps per collected record (1,024 = one update per record at batch 16 x 64).
-    capacity: records kept per robot.
-    repeat: control steps for which an action is held.
-    episode: control steps after which a training episode is cut off, None: the robot's own. Short
-      ones show more of how an episode starts.
-    lr_end: learning rate at the last update, reached linearly over the last `pure` updates (None:
-      constant).
-    demonstrator: path of a demonstrator policy, `reference` (the robot's own driver that knows its
+    envs: Robots that act side by side.
+    updates: Gradient steps in all.
+    ratio: Replayed steps per collected record; 1,024 is one update per record at batch 16 x 64.
+    capacity: Records kept per robot.
+    repeat: Control steps for which an action is held.
+    episode: Control steps after which a training episode is cut off; None: the robot's own.
+    lr_end: Learning rate at the last update, reached linearly over the last `pure` updates; None:
+      constant.
+    demonstrator: Path of a demonstrator policy, `reference` (the robot's own driver that knows its
       state), or None.
-    demo_share: share of the robots that the demonstrator drives until the pure phase.
-    demo_noise: deviation of the noise on the demonstrator's actions.
-    clone: at most so many updates with cloning alone (the policy's own gradient off).
-    clone_until: cloning alone ends when the agent's own return reaches this share of the
+    demo_share: Share of the robots that the demonstrator drives until the pure phase.
+    demo_noise: Deviation of the noise on the demonstrator's actions.
+    clone: At most so many updates with cloning alone, the policy's own gradient off.
+    clone_until: Cloning alone ends when the agent's own return reaches this share of the
       demonstrator's.
-    clone_weight, clone_std: weight of KL(N(demonstrator's action, clone_std^2) || policy), and that
-      deviation.
-    fade: updates over which the weight falls to 0 after that.
-    pure: least number of last updates with neither the demonstrator's data nor its term.
-    shake: probability that a stretch of 16 control steps is driven by one random action, on
-      `shake_share` of the robots: stumbles and falls to learn from. 0: never, as the authors.
-    shake_share: share of the robots that are shaken; the return of the others is the one reported.
-    jitter: deviation of white noise on the actions of those same robots, in every phase: the last
-      of them gets all of it, the others equal steps less. What an action does shows in the data
-      only as far as actions differ from what the policy would have done there.
-    hold: updates of the pure phase, from its start, without the policy's own gradient: critic and
-      model learn what the robots do by themselves, held by `anchor`, before the policy climbs on
-      them. A critic that saw a demonstrator's data too may tell the two apart by posture.
-    fall_cost: taken off the reward of new records where an episode ends for good, but for the last
-      `pure` updates; returns are reported without it. Where a random robot pays for every step (the
-      quadruped's effort), an end that costs nothing is what is learnt. 0: never.
-    penalties: factor on the negative weights of the reward in training, returns included: a first
-      stage, from which `--agent` goes on with the task's own, 1. Where effort costs more than a
-      beginner earns, it learns not to move.
-    fault, severity: domain randomisation: each robot draws a target of this fault and a severity,
-      uniform in [0, `severity`], at the start and at the end of every chunk of 64 decisions in
-      which one of its episodes ended. A preset (robot/name) brings its own severities, schedules,
-      whose clock
-      begins with the first step of a robot, and the targets that it names: what an agent comes to
-        that has the faulty robot to itself. None: healthy ones.
+    clone_weight: Weight of KL(N(demonstrator's action, clone_std^2) || policy).
+    clone_std: That deviation.
+    fade: Updates over which the weight falls to 0 after that.
+    pure: Least number of last updates with neither the demonstrator's data nor its term.
+    shake: Probability that a stretch of 16 control steps is driven by one random action, on
+      `shake_share` of the robots: stumbles and falls to learn from.
+    shake_share: Share of the robots that are shaken; the return of the others is reported.
+    jitter: Deviation of white noise on the actions of those same robots: the last of them gets all
+      of it, the others equal steps less.
+    hold: Updates of the pure phase, from its start, without the policy's own gradient: critic and
+      model learn what the robots do by themselves before the policy climbs on them.
+    fall_cost: Taken off the reward of new records where an episode ends for good, but for the last
+      `pure` updates; returns are reported without it.
+    penalties: Factor on the negative weights of the reward in training, returns included. Where
+      effort costs more than a beginner earns, a first stage below 1 keeps it moving.
+    fault: Domain randomisation: each robot draws a target of this fault and a severity at the start
+      and whenever one of its episodes has ended. A preset (robot/name) brings its own severities,
+      targets and schedules, on the robot's own clock. None: healthy robots.
+    severity: Severities are drawn uniformly in [0, severity].
   """
 
   envs: int = 16
@@ -297,55 +330,38 @@ class TrainConfig:
 
 @dataclass(frozen=True)
 class AdaptConfig:
-  """When adaptation starts, how it runs and when it ends. Chosen on seeds 100 to 109.
+  """When adaptation starts, how it runs and when it ends.
 
   Attributes:
-    ratio: replayed steps per post-alarm record, 16 in the paper.
-    start_windows: windows that the post-alarm replay must hold before the first update.
-    lr: learning rate while adapting, None: the agent's own.
-    policy_lr: factor on the policy's steps while adapting, None: the agent's own.
-    anchor: weight while adapting of the actions that the robot took (DreamerConfig.anchor), None:
+    ratio: Replayed steps per record collected after the alarm.
+    start_windows: Windows that the replay must hold before the first update.
+    lr: Learning rate while adapting; None: the agent's own.
+    policy_lr: Factor on the policy's steps while adapting; None: the agent's own.
+    anchor: Weight while adapting of the actions that the robot itself took; None: the agent's own.
+    batch: Sequences of one update while adapting; fewer mean more updates at the same ratio. None:
       the agent's own.
-    batch: sequences of one update while adapting, None: the agent's own 16. At the same train ratio
-      fewer sequences mean more updates: 4 give four updates every 64 steps. Right hip's gear
-        halved, seeds 100 to 103, mean reward 4,000 to 8,000 steps after onset, two agents that
-      differ in nothing but their training: 0.73 with 4 sequences at 1e-4, 0.68 with 16 at 2e-4,
-        0.58 with 4 at 2e-4 (an agent whose training
-      never saw a stumble); 0.85 with 4 at 1e-4 (the shipped one, whose robots were shaken).
-    last_starts: imagination starts while adapting, the last k states of each sequence, 0 all; None:
-      the agent's own. The gradient of
-      few updates must do: with 16 of 64 states its noise undoes the policy.
-    average: rate per chunk with updates of the moving average of the weights that acts while
-      adapting; 1: the newest weights. An earlier
-      agent, seeds 100 to 104, reward 5,000 to 10,000 steps after onset: 0.82 with 0.1, 0.78 with 1
-        (that run ended at 8,000).
-    fresh_moments: forget the optimiser's moments at an alarm. Kept ones were gathered on the
-      gradients of a trained agent; those after an event are many times larger, so that each step
-      would be that many times the learning rate until the RMS (memory 1,000 updates) has followed.
-      On tuning seeds no difference shows, of walkers and cars (results/fresh_moments).
-    patience: length over which every signal must be settled [chunks of 64 decisions].
-    trend: largest difference of the medians of the first and second half of that length [share of
-      the level].
-    fluctuation: largest spread over that length, the interquartile range / 1.349 [share of the
-      level], or
-    excess: ... that many times the nominal deviation, whichever is larger.
-    near: OPR and RPR also count as settled while at most this many times their nominal mean.
-    least: steps of adaptation before it may converge [control steps].
-    acceptance: mean reward per control step over the patience that counts as recovered, None: the
-      task's own.
-    give_up: steps after which "no settling in sight" may be declared [control steps]: the reward
-      has not risen for a third of this length and is below acceptance; a quarter of this length
-      later also where it is acceptable but some signal will not settle.
-    budget: most steps of adaptation [control steps].
-    warmup: control steps at the start of a run before alarms are acted on and nominal levels are
-      taken.
-    refit: control steps on which the detector's reference is refitted after convergence.
-    period, period_steps: arm `periodic` starts every `period` control steps and adapts for
-      `period_steps` [control steps].
-    random_steps: length of the one adaptation of arm `random` [control steps]. A detected walker
-      adapts for 6,016 to 7,168 steps (seeds 0 to 9, one of six apart) and takes 308 to 376 updates;
-      6,000 steps cost as many, since the first 17 chunks fill the replay, and so do 3,520 steps
-      twice, as `periodic` spends them in a run of 25,000.
+    last_starts: Imagination starts are the last so many states of each sequence; 0: all, None: the
+      agent's own.
+    average: Rate per chunk of the moving average of the weights that acts while adapting; 1: the
+      newest weights act.
+    fresh_moments: Forget the optimiser's moments at an alarm.
+    patience: Length over which every signal must be settled [chunks of 64 decisions].
+    trend: Largest difference of the medians of that length's two halves [share of the level].
+    fluctuation: Largest spread over that length, interquartile range / 1.349 [share of the level].
+    excess: Spread also counts as small up to so many times the nominal deviation.
+    near: Residuals also count as settled up to so many times their nominal mean.
+    least: Steps of adaptation before it may converge [control steps].
+    acceptance: Mean reward per control step that counts as recovered; None: the robot's own.
+    give_up: Steps after which an adaptation without settling in sight may be aborted: the reward
+      has not risen for a third of this length and is below acceptance; a quarter later also where
+      it is acceptable but a signal will not settle [control steps].
+    budget: Most steps of one adaptation [control steps].
+    warmup: Steps at the start of a run before alarms are acted on and nominal levels are taken
+      [control steps].
+    refit: Steps on which the detector learns its reference anew after adaptation [control steps].
+    period: Arm `periodic` starts so often [control steps].
+    period_steps: Length of each of its adaptations [control steps].
+    random_steps: Length of the one adaptation of arm `random` [control steps].
   """
 
   ratio: float = 16.0
@@ -421,34 +437,22 @@ class AdaptConfig:
 
 
 @dataclass(frozen=True)
-class RunConfig:
-  """One run of the loop: arms x seeds streams, each with its own fault.
+class FaultConfig:
+  """A robot and what happens to it.
 
   Attributes:
-    env, fault, target, severity, onset, duration: which robot meets what, when [control steps].
-      target None: drawn from the stream's seed. fault may name a preset (robot/name), which brings
-        its own faults, targets and severities. severity None: 0.5, or the preset's.
-      Where a preset turns the robot into another one, that happens at the end of the first episode
-      that ends at the onset or later; an onset after the last step then means never.
-    schedule, period, share: how the severity moves once the fault is there, see faults.schedule
-      [control steps, 1].
-    steps: control steps in all, counted from 0.
-    seeds, first_seed: streams per arm; their seeds are first_seed, first_seed + 1, ...
-    detector, settings: name and keyword settings.
-    arms: names out of ARMS.
-    agent: shipped name or folder, None: the shipped agent of the robot.
-    physics: auto, native or mjx.
-    form, actions: of the residual (monitor.Monitor).
-    deterministic: act by the policy's mean.
-    snapshots: control steps of adaptation between two snapshots of the weights that act, in arms
-      that never stop by themselves; 0: none. Each is evaluated on the broken robot once the run is
-      over, see snapshots.py.
-    stops: folder of a finished run of the same robots with an arm that never stops by itself and
-      snapshots: where arms that end at the oracle stop find it, see scoring.stop.told.
-    keep: what each stream has learnt is written as an agent, see run.Runner.keep.
-    parts: trace.parquet also holds the residual of each part of the observation (monitor.watched),
-      columns residual_NAME.
-    residuals: residuals.parquet holds the residual of every observation variable, in its own unit.
+    env: Robot, see `mjx-cl list envs`.
+    fault: Fault, see `mjx-cl list faults`, or preset, see `mjx-cl list fault-presets`; `none` for
+      the healthy robot.
+    target: Joint or part that the fault hits; `random` or None: drawn from the seed.
+    severity: In [0, 1]; 0 is nominal. None: 0.5, or the preset's own.
+    onset: First control step that the fault acts in. A preset that turns the robot into another one
+      waits for the end of an episode.
+    duration: Control steps until the fault is repaired; None: never.
+    schedule: How the severity moves from the onset on: abrupt, ramp, intermittent, cyclic or
+      random_walk.
+    period: Control steps of the ramp, of one cycle, or between two steps of the random walk.
+    share: On-share of an intermittent fault, deviation of a random walk's steps.
   """
 
   env: str
@@ -460,12 +464,49 @@ class RunConfig:
   schedule: str = "abrupt"
   period: int = 1000
   share: float = 0.5
+
+  def __post_init__(self):
+    if self.target == "random":
+      object.__setattr__(self, "target", None)
+
+
+@dataclass(frozen=True)
+class RunConfig(FaultConfig):
+  """One run of the loop: arms x seeds streams, each with its own fault.
+
+  Attributes:
+    steps: Control steps in all, counted from 0.
+    seeds: Streams per arm.
+    first_seed: Seeds are first_seed, first_seed + 1, ...
+    detector: Change detector, see `mjx-cl list detectors`; NAME@CHANNEL watches one channel. One
+      that stands on the leaderboard has, unless given, its threshold of one false alarm in 100,000
+      steps.
+    settings: Detector settings, name=value ...
+    arms: Arms, see `mjx-cl list arms`.
+    agent: Trained agent: shipped name or folder; None: the robot's shipped one.
+    physics: auto, native or mjx.
+    form: Residual form, paper or streaming.
+    actions: Actions of the monitor's predictions, recorded or policy.
+    deterministic: Act by the policy's mean instead of a sample.
+    adapt: When adaptation starts, how it runs and when it ends.
+    snapshots: Control steps of adaptation between two snapshots of arm oracle-budget, which the
+      stop rule is scored against; 0: none.
+    stops: For arm oracle-stop: folder of a finished run of arm oracle-budget with --snapshots, of
+      the same robot, fault and seeds.
+    keep: Write what each stream has learnt as an agent, OUT/agents/ARM-SEED, for --agent of another
+      run.
+    parts: Also write the residual of each part of the observation into trace.parquet, columns
+      residual_NAME.
+    residuals: Also write residuals.parquet: the residual of every single variable of the
+      observation, in its own unit, for each stream and control step.
+  """
+
   steps: int = 25_000
   seeds: int = 10
   first_seed: int = 0
   detector: str = "rolling_sigma"
-  settings: dict = field(default_factory=dict)
-  arms: tuple[str, ...] = ("detector", "none")
+  settings: Settings = field(default_factory=dict)
+  arms: Annotated[tuple[str, ...], tyro.conf.arg(name="arm")] = ("detector", "none")
   agent: str | None = None
   physics: str = "auto"
   form: str = "paper"
@@ -479,6 +520,7 @@ class RunConfig:
   residuals: bool = False
 
   def __post_init__(self):
+    super().__post_init__()
     positive(self, "steps", "seeds")
     if self.steps >= FOREVER:
       raise UserError(f"steps must be below {FOREVER:,} control steps; got {self.steps}")
@@ -507,25 +549,16 @@ PRESETS = {
   "paper": Preset(
     DreamerConfig(size="size12m"),
     TrainConfig(envs=16, updates=250_000, ratio=512.0, repeat=2),
-    (
-      "size12m, published protocol: action repeat 2, train ratio 512, 16 environments, all 1,024 "
-      "imagination starts"
-    ),
+    "size12m, published protocol: action repeat 2, train ratio 512, 16 robots, all 1,024 "
+    "imagination starts",
   ),
   "cpu": Preset(
     DreamerConfig(size="size1m", last_starts=16, lr=3e-4, warmup=200),
     TrainConfig(
       envs=32, updates=48_000, ratio=4.0, capacity=4096, lr_end=1e-4, pure=12_000, shake=0.08
     ),
-    "what 2 cores train in a few hours. Departures from the paper: size1m instead of size12m; "
-    "imagination from the last 16 states of each "
-    "sequence (256 starts instead of 1,024); learning rate 3e-4 falling to 1e-4, warm-up 200, "
-    "instead of 4e-5 and 1,000; 32 environments at "
-    "train ratio 4 (fresh data is cheap, updates are not) instead of 16 at 512; replay of "
-    "131,072 records; action repeat 1; half of the "
-    "robots are shaken, that is in 8 % of all stretches of 16 control steps one random action "
-    "drives them; optionally a demonstrator, which "
-    "the agent's card then names",
+    "what 2 cores train in a few hours: size1m, imagination from the last 16 states of each "
+    "sequence, 32 robots, one update to 256 records, half of the robots shaken",
   ),
   "tiny": Preset(
     DreamerConfig(size="tiny", batch=8, length=16, imagine=8, lr=1e-3, warmup=20, bins=63),

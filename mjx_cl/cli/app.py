@@ -24,7 +24,7 @@ import tyro
 from mjx_cl import __version__
 from mjx_cl.cli import commands
 from mjx_cl.cli.display import apart, say
-from mjx_cl.config import AdaptConfig
+from mjx_cl.config import FaultConfig, RunConfig
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.io.interrupt import Interruptible, Lasting, later
 
@@ -32,80 +32,17 @@ Positional = tyro.conf.Positional
 
 
 @dataclass(frozen=True)
-class Run:
+class Run(RunConfig):
   """Lives the whole loop: fault, alarm, finetuning, stop; arms x seeds streams side by side.
 
   Writes config.json, trace.parquet, events.parquet, runs.parquet, summary.json and figure.png into
   --out.
+
+  Example: mjx-cl run walker --fault gear --severity 0.5 --seeds 2 --out runs/gear
   """
 
-  env: Positional[str]
-  """Robot, see `mjx-cl list envs`."""
   out: str = "runs/latest"
   """Result folder."""
-  fault: str = "gear"
-  """Fault, see `mjx-cl list faults`, or preset, see `mjx-cl list fault-presets`; `none` for the
-  healthy robot.
-  """
-  target: str = "random"
-  """Joint or part that the fault hits, `random`: drawn from the stream's seed."""
-  severity: float | None = None
-  """In [0, 1]; 0 is nominal, 0.5 (the default) is the paper's gear halved; a preset brings its own.
-  """
-  onset: int = 5000
-  """First control step that the fault acts in."""
-  duration: int | None = None
-  """Control steps until the fault is repaired; default: never."""
-  schedule: str = "abrupt"
-  """How the severity moves from the onset on: abrupt, ramp, intermittent, cyclic or random_walk."""
-  period: int = 1000
-  """Control steps of the ramp, of one cycle, or between two steps of the random walk."""
-  share: float = 0.5
-  """On-share of an intermittent fault, deviation of a random walk's steps."""
-  steps: int = 25_000
-  """Control steps in all, counted from 0."""
-  seeds: int = 10
-  """Streams per arm."""
-  first_seed: int = 0
-  """Seeds are first_seed, first_seed + 1, ..."""
-  detector: str = "rolling_sigma"
-  """Change detector, see `mjx-cl list detectors`; NAME@CHANNEL watches one channel. One that stands
-  on the leaderboard has, unless given, its threshold of one false alarm in 100,000 steps.
-  """
-  set: tuple[str, ...] = ()
-  """Detector settings, name=value ..."""
-  arm: tuple[str, ...] = ("detector", "none")
-  """Arms, see `mjx-cl list arms`."""
-  agent: str | None = None
-  """Trained agent: shipped name or folder."""
-  physics: str = "auto"
-  """auto, native or mjx."""
-  form: str = "paper"
-  """Residual form, paper or streaming."""
-  actions: str = "recorded"
-  """Actions of the monitor's predictions, recorded or policy."""
-  deterministic: bool = False
-  """Act by the policy's mean instead of a sample."""
-  snapshots: int = 0
-  """Control steps of adaptation between two snapshots of arm oracle-budget, which the stop rule is
-  scored against; 0: none.
-  """
-  stops: str | None = None
-  """For arm oracle-stop: folder of a finished run of arm oracle-budget with --snapshots, of the
-  same robot, fault and seeds.
-  """
-  keep: bool = False
-  """Write what each stream has learnt as an agent, OUT/agents/ARM-SEED, for --agent of another run.
-  """
-  parts: bool = False
-  """Also write the residual of each part of the observation into trace.parquet, columns
-  residual_NAME.
-  """
-  residuals: bool = False
-  """Also write residuals.parquet: the residual of every single variable of the observation, in its
-  own unit, for each stream and control step.
-  """
-  adapt: AdaptConfig = AdaptConfig()
   json: bool = False
   """One JSON value on standard output, nothing else there."""
   resume: bool = False
@@ -116,7 +53,10 @@ class Run:
 
 @dataclass(frozen=True)
 class Train:
-  """Pretrains an agent; ends with OUT/agent (weights, card), which every --agent takes."""
+  """Pretrains an agent; ends with OUT/agent (weights, card), which every --agent takes.
+
+  Example: mjx-cl train walker --preset tiny --out runs/train
+  """
 
   env: Positional[str]
   """Robot, see `mjx-cl list envs`."""
@@ -149,7 +89,10 @@ class Train:
 
 @dataclass(frozen=True)
 class Eval:
-  """Return of an agent on the healthy robot."""
+  """Return of an agent on the healthy robot.
+
+  Example: mjx-cl eval walker --episodes 20
+  """
 
   env: Positional[str]
   episodes: int = 20
@@ -165,6 +108,8 @@ class Eval:
 class Certify:
   """Proves for every fault that it acts, and measures what it costs; writes certificates.parquet
   and certificates.md into --out.
+
+  Example: mjx-cl certify walker --fault gear --episodes 0 --out runs/certificates
   """
 
   env: Positional[tuple[str, ...]] = ()
@@ -188,6 +133,8 @@ class Record:
 
   A recording that was cut off goes on where it stopped: parts that are finished are kept in
   OUT/work until all are there.
+
+  Example: mjx-cl record leaderboard --robot walker --out runs/streams
   """
 
   suite: Positional[str] = "leaderboard"
@@ -213,6 +160,8 @@ class Leaderboard:
 
   Ways in for a detector of one's own: a plug-in (entry point mjx_cl.detectors), --add with a Python
   class, --submit with a file of scores.
+
+  Example: mjx-cl leaderboard --robot walker --detector cusum ewma --out runs/leaderboard
   """
 
   streams: Positional[str | None] = None
@@ -259,6 +208,8 @@ class Bench:
 
   The same command goes on where it was cut off; finished parts are never run again. Writes
   OUT/PART/ as `mjx-cl run` does, OUT/bench.parquet, OUT/bench.json.
+
+  Example: mjx-cl bench quick --plan
   """
 
   suite: Positional[str] = "quick"
@@ -295,39 +246,28 @@ class Bench:
 
 @dataclass(frozen=True)
 class Plot:
-  """Draws figure.png of a run anew."""
+  """Draws figure.png of a run anew.
+
+  Example: mjx-cl plot runs/latest
+  """
 
   folder: Positional[str]
 
 
 @dataclass(frozen=True)
-class Render:
+class Render(FaultConfig):
   """A moving picture of an agent at work: GIF, or MP4 with mjx-cl[video]; red border while a fault
   acts.
+
+  Example: mjx-cl render walker --fault gear --target right_hip --out gear.gif
   """
 
-  env: Positional[str]
-  """Robot, see `mjx-cl list envs`."""
+  fault: str = "none"
+  onset: int = 200
   out: str | None = None
   """File that ends in .gif or .mp4; default: ENV.gif."""
   agent: str | None = None
   """Trained agent: shipped name or folder; `none` stands still, `random` moves at random."""
-  fault: str = "none"
-  """Fault, see `mjx-cl list faults`, or preset, see `mjx-cl list fault-presets`."""
-  target: str = "random"
-  """Joint or part that the fault hits, `random`: drawn from the seed."""
-  severity: float | None = None
-  """In [0, 1], default 0.5; a preset brings its own."""
-  onset: int = 200
-  """First control step that the fault acts in."""
-  duration: int | None = None
-  """Control steps until the fault is repaired; default: never."""
-  schedule: str = "abrupt"
-  """How the severity moves from the onset on: abrupt, ramp, intermittent, cyclic or random_walk."""
-  period: int = 1000
-  """Control steps of the ramp, of one cycle, or between two steps of the random walk."""
-  share: float = 0.5
-  """On-share of an intermittent fault, deviation of a random walk's steps."""
   steps: int = 400
   """Control steps in all."""
   seed: int = 0
@@ -358,6 +298,8 @@ class Detect:
   The nominal log counts as the past of the other: detectors warm up on its first third (1,000
   samples at most) and are calibrated on the rest. Every column has a detector of its own, the alarm
   of any counts. Writes detect.json, alarms.csv and detect.png into --out.
+
+  Example: mjx-cl detect today.csv --nominal healthy.csv --out runs/detect
   """
 
   file: Positional[str]
@@ -399,6 +341,8 @@ class Query:
   `query SQL`: every table under results/ is a view named after its path
   (results/walker_gear/runs.parquet is walker_gear_runs). `query FOLDER SQL`: the tables of one
   folder, under their own names (trace, events, runs).
+
+  Example: mjx-cl query runs/latest "select arm, seed, outcome from runs"
   """
 
   words: Positional[tuple[str, ...]] = ()
@@ -412,6 +356,8 @@ class Query:
 class Report:
   """Writes the numbers of README and docs anew from the files in results/: what lies between `<!--
   report:NAME -->` and `<!-- /report -->`, nothing else.
+
+  Example: mjx-cl report --check
   """
 
   results: str = "results"
@@ -429,7 +375,10 @@ class Report:
 
 @dataclass(frozen=True)
 class List:
-  """Names that other commands take."""
+  """Names that other commands take.
+
+  Example: mjx-cl list faults
+  """
 
   what: Positional[str] = "all"
   """envs, faults, fault-presets, schedules, detectors, presets, agents, arms, sizes, suites,
@@ -440,7 +389,10 @@ class List:
 
 @dataclass(frozen=True)
 class Doctor:
-  """Versions, devices, physics backend, free memory and a two-second speed check."""
+  """Versions, devices, physics backend, free memory and a two-second speed check.
+
+  Example: mjx-cl doctor --json
+  """
 
   json: bool = False
 
@@ -462,7 +414,14 @@ COMMANDS = (
   Doctor,
 )  # Run is `mjx-cl run`, done by commands.do_run
 Command = Union[
-  tuple(Annotated[kind, tyro.conf.subcommand(kind.__name__.lower())] for kind in COMMANDS)
+  tuple(
+    Annotated[
+      kind,
+      tyro.conf.subcommand(kind.__name__.lower()),
+      *[tyro.conf.PositionalRequiredArgs] * issubclass(kind, FaultConfig),
+    ]
+    for kind in COMMANDS
+  )
 ]
 DO = {kind: getattr(commands, f"do_{kind.__name__.lower()}") for kind in COMMANDS}
 

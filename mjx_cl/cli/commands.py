@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
-import json
 import math
 import os
 import pathlib
@@ -26,9 +25,17 @@ from mjx_cl.cli.display import (
   plan_lines,
   say,
   show,
-  summary_text,
+  show_summary,
 )
-from mjx_cl.config import PRESETS, RunConfig, TrainConfig, check_seeds, finite, replace
+from mjx_cl.config import (
+  PRESETS,
+  FaultConfig,
+  RunConfig,
+  TrainConfig,
+  check_seeds,
+  replace,
+  settings,
+)
 from mjx_cl.errors import FileError, UserError, choose
 
 if TYPE_CHECKING:
@@ -53,51 +60,9 @@ if TYPE_CHECKING:
 MOST_EPISODES = 10_000  # all at once in one program
 
 
-def settings(pairs: tuple[str, ...]) -> dict:
-  """("a=1", "b=x") -> {"a": 1, "b": "x"}; values are read as JSON where they are JSON."""
-  out = {}
-  for pair in pairs:
-    name, sign, value = pair.partition("=")
-    if not sign:
-      raise UserError(f"--set takes name=value; got {pair!r}")
-    try:
-      out[name] = json.loads(value.lower() if value in ("True", "False") else value)
-    except ValueError:
-      out[name] = value
-  finite(out, "--set")
-  return out
-
-
 def do_run(args: Run) -> None:
   """Lives the loop and prints its table."""
-  config = RunConfig(
-    env=args.env,
-    fault=args.fault,
-    target=None if args.target == "random" else args.target,
-    severity=args.severity,
-    onset=args.onset,
-    duration=args.duration,
-    schedule=args.schedule,
-    period=args.period,
-    share=args.share,
-    steps=args.steps,
-    seeds=args.seeds,
-    first_seed=args.first_seed,
-    detector=args.detector,
-    settings=settings(args.set),
-    arms=args.arm,
-    agent=args.agent,
-    physics=args.physics,
-    form=args.form,
-    actions=args.actions,
-    deterministic=args.deterministic,
-    adapt=args.adapt,
-    snapshots=args.snapshots,
-    stops=args.stops,
-    keep=args.keep,
-    parts=args.parts,
-    residuals=args.residuals,
-  )
+  config = RunConfig(**{f.name: getattr(args, f.name) for f in dataclasses.fields(RunConfig)})
   from mjx_cl.runs import run
 
   with RunDisplay() as display:
@@ -107,7 +72,7 @@ def do_run(args: Run) -> None:
   if args.json:
     emit(summary)
   else:
-    print(summary_text(summary, args.out))
+    show_summary(summary, args.out)
 
 
 def do_bench(args: Bench) -> None:
@@ -202,7 +167,8 @@ def do_bench(args: Bench) -> None:
     emit(value)
     return
   for name, summary in value["entries"].items():
-    print(f"{name}: {summary_text(summary, str(out / name))}")
+    print(f"{name}: ", end="")
+    show_summary(summary, str(out / name))
   print(f"{value['finished']} of {value['parts']} parts finished; files in {out}")
 
 
@@ -560,16 +526,9 @@ def do_render(args: Render) -> None:
   out = args.out or f"{args.env.rpartition(':')[2]}.gif"
   pictures.check(out, args.steps, args.width, args.height, args.fps, args.seed)
   env = envs.make(args.env, args.physics)
-  acting = {
-    "seed": args.seed,
-    "deterministic": args.deterministic,
-    "severity": args.severity,
-    "onset": args.onset,
-    "duration": args.duration,
-    "schedule": args.schedule,
-    "period": args.period,
-    "share": args.share,
-  }
+  acting = {f.name: getattr(args, f.name) for f in dataclasses.fields(FaultConfig)}
+  del acting["env"]
+  acting |= {"seed": args.seed, "deterministic": args.deterministic}
   if args.agent in ("none", "random"):
     acting["agent"] = adapters.Puppet(len(env.spec.act), float(args.agent == "random"))
   elif args.agent is None and not agents.is_shipped(env):
@@ -591,8 +550,6 @@ def do_render(args: Render) -> None:
     args.width,
     args.height,
     args.fps,
-    args.fault,
-    args.target,
     view=args.view,
     say=lambda text: say(f"mjx-cl: {text}"),
     **acting,
@@ -788,7 +745,6 @@ def do_doctor(args: Doctor) -> None:
     emit(rows)
   else:
     for name, value in rows.items():
-      print(
-        f"{name:16s} "
-        f"{value if not isinstance(value, dict) else ', '.join(f'{k} {v}' for k, v in value.items())}"
-      )
+      if isinstance(value, dict):
+        value = ", ".join(f"{k} {v}" for k, v in value.items())
+      print(f"{name:16s} {value}")

@@ -62,36 +62,75 @@ def apart(command):
     RESULT.pop()
 
 
-def summary_text(s: dict, out: str) -> str:
-  """A run's numbers for a reader."""
-  lines = [
-    (
-      f"{s['env']}, {s['fault']} {s['severity']:g} at step {s['onset']:,} of {s['steps']:,}, "
-      f"detector {s['detector']}; {clock(s['wall_s'])} wall ("
+def _cell(arm: dict, key: str, form: str, of: str | None = None) -> str:
+  """A number of an arm, out of how many, and its 95 % interval below it."""
+  value, interval = arm[key], arm.get(f"{key}_ci")
+  if value is None:
+    return "-"
+  text = format(value, form) + (f" of {arm[of]}" if of else "")
+  return text if interval is None else f"{text}\n[{interval[0]:{form}}, {interval[1]:{form}}]"
+
+
+def _outcomes(arm: dict) -> str:
+  """How many streams ended how, those alone that are some."""
+  names = {
+    "converged": "converged",
+    "aborted_by_rule": "aborted by rule",
+    "aborted_by_budget": "by budget",
+    "ended": "ended",
+    "adapting": "adapting at the end",
+    "adapting_at_onset": "adapting at the onset",
+    "failed": "numeric failures",
+  }
+  return ", ".join(f"{arm[key]} {name}" for key, name in names.items() if arm.get(key)) or "-"
+
+
+def show_summary(s: dict, out: str) -> None:
+  """Prints a run's numbers for a reader: a row an arm, below each number its 95 % interval."""
+  from rich.table import Table
+  from rich.text import Text
+
+  severity = "" if s["severity"] is None else f" {s['severity']:g}"
+  shares = ", ".join(f"{k} {v:.0%}" for k, v in s["wall_share"].items())
+  print(
+    f"{s['env']}, {s['fault']}{severity} at step {s['onset']:,} of {s['steps']:,}, detector "
+    f"{s['detector']}; {clock(s['wall_s'])} wall ({shares})"
+  )
+  table = Table(show_lines=True)
+  for heading in (
+    "arm",
+    "streams",
+    "affected",
+    "alarmed",
+    "false\nalarms",
+    "latency\n[steps]",
+    "recovered\nin 10,000",
+    "outcome",
+    "reward\nat first",
+    "lost\nby fault",
+    "reward\nat last",
+  ):
+    table.add_column(Text(heading), justify="left" if heading in ("arm", "outcome") else "right")
+  for name, arm in s["arms"].items():
+    cells = (
+      name,
+      str(arm["seeds"]),
+      str(arm["affected"]),
+      str(arm["alarms"]),
+      str(arm["false_alarm_streams"]),
+      _cell(arm, "latency_median_steps", ".0f"),
+      _cell(arm, "recovered_within_10000", ".3g", "affected"),
+      _outcomes(arm),
+      _cell(arm, "reward_pre", ".2f"),
+      _cell(arm, "reward_drop", ".0%"),
+      _cell(arm, "reward_final", ".2f"),
     )
-    + ", ".join(f"{k} {v:.0%}" for k, v in s["wall_share"].items())
-    + ")"
-  ]
-  number = lambda x, form: "-" if x is None else format(x, form)
-  width = max(9, *map(len, s["arms"]))
-  for arm, a in s["arms"].items():
-    lines.append(
-      f"  {arm:{width}s} {a['seeds']} seeds, {a['affected']} "
-      f"affected{f', {busy} adapting at the onset' if (busy := a.get('adapting_at_onset')) else ''}; "
-      f"false-alarm streams {a['false_alarm_streams']}; alarm within 500 steps "
-      f"{a['affected_alarmed_within_500']}/{a.get('affected_watched', a['affected'])}, median "
-      f"{number(a['latency_median_steps'], '.0f')} steps; recovered within 10,000 steps "
-      f"{a['recovered_within_10000']}/{a['affected']}, median "
-      f"{number(a['recovery_median_steps'], '.0f')}; converged {a['converged']}, aborted by "
-      "rule "
-      f"{a['aborted_by_rule']}, by budget "
-      f"{a['aborted_by_budget']}{f', numeric failures {failed}' if (failed := a.get('failed')) else ''}; "
-      f"reward {number(a['reward_pre'], '.2f')} -> drop {number(a['reward_drop'], '.0%')} -> "
-      f"{number(a['reward_final'], '.2f')}; a stream: {number(a['updates_mean'], '.0f')} "
-      f"updates in {number(a['adapted_steps_mean'], '.0f')} steps of "
-      f"adaptation, return lost by it before onset {number(a['return_lost_healthy_mean'], '.0f')}"
-    )
-  return "\n".join(lines + [f"files in {out}"])
+    table.add_row(*map(Text, cells))
+  show(table)
+  print(
+    "streams in all but latency (median), rewards (a control step, interquartile mean); [95 % "
+    f"interval]; more in summary.json\nfiles in {out}"
+  )
 
 
 def plan_lines(suite, parts, done, estimates) -> list[str]:

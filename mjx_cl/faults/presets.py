@@ -17,7 +17,8 @@ SCHEDULES = {
   "ramp": "grows linearly over `period` control steps from the onset on, then stays",
   "intermittent": "on for `share` of every `period`, off for the rest",
   "cyclic": "rises and falls as (1 - cos) / 2 with `period`",
-  "random_walk": "starts at 0; every `period` a normal step of deviation `share`, reflected at 0 and 1",
+  "random_walk": "starts at 0; every `period` a normal step of deviation `share`, reflected at 0 "
+  "and 1",
 }
 
 

@@ -222,7 +222,6 @@ COLUMNS = (
 )
 
 
-
 def write(
   path, rows: list[dict], overall: list[dict], curves: dict, faults: list[dict], meta: dict
 ) -> None:
@@ -283,7 +282,7 @@ def write(
     "@JS@": _asset("leaderboard.js"),
     "@DATA@": embed(data),
   }
-  text = HTML
+  text = _asset("leaderboard.html")
   for mark, part in parts.items():  # the data last, since a name may hold a mark
     text = text.replace(mark, part)
   folders.atomic(path, lambda file: file.write(text.encode()))

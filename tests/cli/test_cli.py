@@ -7,6 +7,8 @@ import errno
 import json
 import os
 import pathlib
+import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -20,8 +22,8 @@ from test_run import saved  # noqa: F401  a fixture
 import mjx_cl
 from mjx_cl import detectors, envs, faults
 from mjx_cl.adapt.arms import ARMS
-from mjx_cl.cli import app, commands
-from mjx_cl.config import PRESETS
+from mjx_cl.cli import app, commands, display
+from mjx_cl.config import PRESETS, RunConfig
 from mjx_cl.errors import FileError
 from mjx_cl.faults import presets
 from mjx_cl.io import tables as store
@@ -104,6 +106,37 @@ def test_help_imports_nothing_heavy(argv):
   }
 
 
+@pytest.mark.parametrize("command", app.COMMANDS)
+def test_help_of_each_command_shows_an_example_that_it_takes(mjx, command):
+  name = command.__name__.lower()
+  code, out, err = mjx(name, "--help")
+  (example,) = re.findall(r"^Example: mjx-cl (.*)$", out, re.M)
+  assert (code, err) == (0, "") and type(app.parse(shlex.split(example))) is command
+
+
+def test_run_takes_every_setting_of_a_run():
+  """A flag for each field, under its own name but for --arm and --set."""
+  given = app.parse(
+    [
+      "run",
+      "car",
+      "--set",
+      "a=1",
+      "b=x",
+      "--arm",
+      "none",
+      "--target",
+      "random",
+      "--adapt.ratio",
+      "2",
+    ]
+  )
+  assert given.env == "car" and given.settings == {"a": 1, "b": "x"} and given.arms == ("none",)
+  assert given.target is None and given.adapt.ratio == 2.0
+  flags = {f.name for f in dataclasses.fields(app.Run)} - {"out", "json", "resume", "overwrite"}
+  assert flags == {f.name for f in dataclasses.fields(RunConfig)}
+
+
 def test_help_names_every_command(mjx):
   code, out, err = mjx("--help")
   assert (
@@ -142,6 +175,34 @@ def test_list(mjx):
   assert json.loads(mjx("list", "faults", "--json")[1]) == {"faults": tables["faults"]}
   text = mjx("list")[1]
   assert all(name in text for table in tables.values() for name in table)
+
+
+def test_a_run_is_shown_as_a_table_with_intervals(capsys):
+  arm = {"seeds": 4, "affected": 4, "alarms": 4, "false_alarm_streams": 0, "converged": 3}
+  arm |= {
+    "aborted_by_rule": 1,
+    "latency_median_steps": 354.0,
+    "latency_median_steps_ci": [269, 537],
+  }
+  arm |= {"recovered_within_10000": 3, "recovered_within_10000_ci": [1.2, 3.82]}
+  arm |= {"reward_pre": 0.95, "reward_pre_ci": None, "reward_drop": None}
+  arm |= {"reward_final": 0.88, "reward_final_ci": [0.85, 0.92]}
+  summary = {"env": "walker", "fault": "gear", "severity": 0.5, "onset": 4000, "steps": 13_000}
+  summary |= {"detector": "cusum", "wall_s": 65.0, "wall_share": {"physics": 1.0}}
+  display.show_summary(summary | {"arms": {"detector": arm}}, "runs/x")
+  out = capsys.readouterr().out
+  assert "walker, gear 0.5 at step 4,000 of 13,000, detector cusum; 1:05 wall" in out
+  row, below = (
+    [cell.strip() for cell in line.split("│")[1:-1]] for line in out.splitlines() if "│" in line
+  )
+  assert row == ["detector", "4", "4", "4", "0", "354", "3 of 4"] + [
+    "3 converged, 1 aborted by rule",
+    "0.95",
+    "-",
+    "0.88",
+  ]
+  assert [cell for cell in below if cell] == ["[269, 537]", "[1.2, 3.82]", "[0.85, 0.92]"]
+  assert "[steps]" in out and out.endswith("files in runs/x\n")
 
 
 def test_doctor(mjx):
