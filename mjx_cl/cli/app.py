@@ -413,7 +413,7 @@ COMMANDS = (
   List,
   Doctor,
 )  # Run is `mjx-cl run`, done by commands.do_run
-Command = Union[
+Command = Union[  # noqa: UP007  of a computed tuple
   tuple(
     Annotated[
       kind,

@@ -47,8 +47,9 @@ def scalar(factory: Callable[..., Detector]) -> Callable[..., Detector]:
 
 
 def demand(name: str, **rules: tuple[Any, bool, str]) -> None:
-  """Refuses settings out of range: demand("cusum", threshold=(threshold, above(threshold, 0),
-  "above 0")).
+  """Refuses settings out of range.
+
+  Example: demand("cusum", threshold=(threshold, above(threshold, 0), "above 0"))
   """
   for setting, (value, holds, rule) in rules.items():
     if not holds:

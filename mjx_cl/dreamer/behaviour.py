@@ -108,6 +108,7 @@ FIRST = ("mlp", "hidden0", "linear")  # where a head keeps its first layer
 
 
 def first_layer(head):
+  """Parameters of a head's first layer, of its parameters."""
   for name in FIRST:
     head = head[name]
   return head

@@ -64,5 +64,6 @@ class PolicyHead(nn.Module):
   def __call__(
     self, *features: jax.Array, pre: jax.Array | None = None
   ) -> tuple[jax.Array, jax.Array]:
+    """Mean and deviation before they are bounded, (..., act) each; `pre` as of the other heads."""
     x = MLP(3, self.units, name="mlp")(*features, pre=pre)
     return Linear(self.act, 0.01, name="mean")(x), Linear(self.act, 0.01, name="std")(x)

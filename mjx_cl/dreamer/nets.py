@@ -108,6 +108,7 @@ class Hidden(nn.Module):
 
   @nn.compact
   def __call__(self, *xs: jax.Array, pre: jax.Array | None = None) -> jax.Array:
+    """silu(norm(linear(inputs))); `pre`: what the linear layer gives, where that is known."""
     return nn.silu(
       Norm(name="norm")(Linear(self.units, name="linear")(*xs) if pre is None else pre)
     )
@@ -123,6 +124,7 @@ class MLP(nn.Module):
 
   @nn.compact
   def __call__(self, *xs: jax.Array, pre: jax.Array | None = None) -> jax.Array:
+    """Hidden layers one after another; `pre` is for the first."""
     for i in range(self.layers):
       xs, pre = (Hidden(self.units, name=f"hidden{i}")(*xs, pre=pre),), None
     return xs[0]

@@ -93,6 +93,7 @@ class RSSM(nn.Module):
   size: Size
 
   def setup(self) -> None:
+    """Declares the layers."""
     s = self.size
     self.in_deter, self.in_stoch, self.in_action = (
       Hidden(s.hidden, name=n) for n in ("in_deter", "in_stoch", "in_action")
@@ -111,7 +112,8 @@ class RSSM(nn.Module):
       Linear(s.stoch * s.classes, name="post_out"),
     )
 
-  def __call__(self, deter, stoch, action, tokens):  # touches every parameter, for initialisation
+  def __call__(self, deter, stoch, action, tokens):
+    """One step; touches every parameter, for initialisation."""
     deter = self.core(deter, stoch, action)
     return self.prior(deter), self.posterior(deter, tokens)
 

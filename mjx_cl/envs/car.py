@@ -38,6 +38,7 @@ TRACTION = 0.95  # share of the grip that drive or brake force may take
 SLOW = 1.0  # [m/s]; wheel speed below which slip is taken at this speed
 LIDAR_SIGMA = 0.01  # [m]
 REWARD_TERMS = {"speed": 0.2, "crash": -5.0}  # weights, see `reward`
+WEIGHTS = tuple(REWARD_TERMS.values())
 CONTROL_S, SUBSTEPS = 0.05, 5  # [s], RK4 steps in it
 EPISODE = 1200  # control steps: 60 s
 
@@ -127,7 +128,7 @@ def progress(course: Course, track, x, y, velocity_x, velocity_y) -> jax.Array:
   return velocity_x * jnp.cos(heading) + velocity_y * jnp.sin(heading)
 
 
-def reward(along: jax.Array, crashed: jax.Array, weights=tuple(REWARD_TERMS.values())) -> jax.Array:
+def reward(along: jax.Array, crashed: jax.Array, weights=WEIGHTS) -> jax.Array:
   """Reward, float32 (): 0.2 along - 5 [crashed], for the speed along the track [m/s]; 1 at the
   highest speed, negative the wrong way round.
 

@@ -74,13 +74,14 @@ def observe(qpos: jax.Array, qvel: jax.Array) -> jax.Array:
 
 
 REWARD_TERMS = {"standing": 3.0, "upright": 1.0, "move": 5.0}  # weights
+WEIGHTS = tuple(REWARD_TERMS.values())
 
 
 def reward(
   qpos: jax.Array,
   qvel: jax.Array,
   mass: jax.Array,
-  weights=tuple(REWARD_TERMS.values()),
+  weights=WEIGHTS,
   speed_asked=WALK_SPEED,
 ) -> jax.Array:
   """Walk reward in [0, 1], float32 (), for weights (3, 1, 5) of REWARD_TERMS and the speed asked

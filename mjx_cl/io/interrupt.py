@@ -42,7 +42,7 @@ class Lasting:
     """From now on nothing is kept for a reader that is gone, so that the interpreter's last flush
     finds nothing to fail on.
     """
-    self._stream = open(os.devnull, "w")
+    self._stream = open(os.devnull, "w")  # noqa: SIM115  for as long as the process lives
 
   def __getattr__(self, name: str) -> object:
     return getattr(self._stream, name)

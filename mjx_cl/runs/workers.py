@@ -8,6 +8,7 @@ so that none outlives its parent.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import pathlib
 import subprocess
@@ -85,10 +86,9 @@ class Worker:
       for line in self.process.stderr:
         if line.strip():
           self.last = line.strip()
-          try:
+          # where nobody listens any more a full pipe would stop the worker
+          with contextlib.suppress(OSError):
             tell(f"{name}: {self.last}")
-          except OSError:  # nobody listens any more; a full pipe would stop the worker
-            pass
 
     self.listener = threading.Thread(target=listen, daemon=True)
     self.listener.start()

@@ -129,7 +129,6 @@ def test_cool_down_drops_the_alarms_after_one(steps, want):
 
 def autoregressive(coefficients, steps, seed=0, level=0.0, streams=None):
   """Stationary up to a burn-in of 500; innovations of deviation 1."""
-  p = len(coefficients)
   noise = np.random.default_rng(seed).normal(
     size=(steps + 500,) + (() if streams is None else (streams,))
   )

@@ -463,7 +463,7 @@ def test_one_threshold_for_both_residuals_is_both_thresholds_in_proportion(robot
 @pytest.mark.parametrize("robot", detectors.board())
 def test_what_stands_on_the_board_takes_its_threshold_from_there(robot):
   """For just the board's settings, however they are written; whoever names a threshold keeps it."""
-  for name, row in detectors.board()[robot].items():
+  for row in detectors.board()[robot].values():
     own = dict(row["settings"])
     use = own.pop("use")
     assert (

@@ -256,7 +256,7 @@ def test_reach_holds_every_cell_that_is_seen_and_few_others(course):
   its cell's window, either way.
   """
   rng, spare = np.random.default_rng(4), []
-  for k, track in enumerate(course.tracks):
+  for track in course.tracks:
     first, count = lib.reach(track, course.max_range)
     num = len(track.centre)
     least = np.full(2, num)

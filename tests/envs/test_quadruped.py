@@ -808,7 +808,7 @@ def test_commands(native, many):
     double.physics.command[:, :2], 2 * after.physics.command[:, :2], rtol=1e-6
   )
   spun, last = native.at(pose(NUM, 3), np.eye(18)[5] * 2.0), None  # turns left at 2 rad/s
-  for k in range(5):
+  for _ in range(5):
     spun, _ = native.step(native.models, spun, np.zeros((NUM, 12), np.float32))
     rate = np.asarray(spun.physics.command[:, 2])
     free = (np.abs(rate) < 0.9) & ~np.asarray(spun.physics.draw.standing)

@@ -183,7 +183,7 @@ def test_160_robots_160_faults_one_trace(short):
   program = jax.jit(chex.assert_max_traces(run, n=1))
   signal = jnp.asarray(certificate.actions(short, 24, 0))
   seen = []
-  for call in range(2):
+  for _ in range(2):
     lanes = [
       Lane(
         names[i % len(names)],

@@ -307,7 +307,7 @@ def test_refused_robots(robots, agent):
 def test_presets_with_a_change_of_robots():
   found = {name: p for name, p in presets.PRESETS.items() if p.becomes}
   assert {"car/sim-to-real", "car/transfer-then-socks"} <= set(found)
-  for name, preset in presets.PRESETS.items():
+  for preset in presets.PRESETS.values():
     assert bool(preset.becomes) or not preset.then
   for preset in found.values():
     first, other = envs.make(preset.robot), envs.make(preset.becomes, "native")

@@ -47,6 +47,7 @@ class Puppet:
   def act(
     self, params: Any, carry: Carry, obs: jax.Array, key: jax.Array, deterministic: bool = False
   ) -> tuple[Carry, jax.Array]:
+    """An action drawn evenly within `spread`, whatever is observed."""
     action = self.spread * jax.random.uniform(key, (self.act_size,), minval=-1.0, maxval=1.0)
     return carry._replace(action=action), action
 
