@@ -1112,7 +1112,7 @@ def again(results: pathlib.Path) -> str:
   rows, words = [], ("the fault", "its repair", "the fault again")
   entries = load(results / "again" / "bench.json")["entries"]
   for part, entry in entries.items():
-    for change, (what, arms_) in enumerate(zip(words, [entry["arms"], *entry["later_changes"]])):
+    for _, (what, arms_) in enumerate(zip(words, [entry["arms"], *entry["later_changes"]])):
       for k, (arm, own) in enumerate(arms_.items()):
         rows.append(
           (
