@@ -8,9 +8,9 @@ import dataclasses
 import json
 import math
 import numbers
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
@@ -244,8 +244,6 @@ class TrainConfig:
     shake: Probability that a stretch of 16 control steps is driven by one random action, on
       `shake_share` of the robots: stumbles and falls to learn from.
     shake_share: Share of the robots that are shaken; the return of the others is reported.
-    jitter: Deviation of white noise on the actions of those same robots: the last of them gets all
-      of it, the others equal steps less.
     hold: Updates of the pure phase, from its start, without the policy's own gradient: critic and
       model learn what the robots do by themselves before the policy climbs on them.
     fall_cost: Taken off the reward of new records where an episode ends for good, but for the last
@@ -276,7 +274,6 @@ class TrainConfig:
   pure: int = 6000
   shake: float = 0.0
   shake_share: float = 0.5
-  jitter: float = 0.0
   hold: int = 0
   fall_cost: float = 0.0
   penalties: float = 1.0
@@ -309,7 +306,6 @@ class TrainConfig:
     positive(self, "clone_std")
     not_below_0(
       self,
-      "jitter",
       "fall_cost",
       "penalties",
       "demo_noise",
@@ -566,6 +562,23 @@ PRESETS = {
     "for tests: some 100,000 parameters, seconds per run",
   ),
 }
+
+
+# settings of earlier versions, with the one value that still means what is done today
+GONE = {"jitter": 0.0}
+
+
+def recorded(kind: type, record: Mapping[str, Any]) -> dict[str, Any]:
+  """Fields of `kind` that a card or a config.json of this or an earlier version holds.
+
+  Raises:
+    ValueError, one line: a field that this version has not, unless its value changes nothing.
+  """
+  names = {f.name for f in dataclasses.fields(kind)}
+  for name, value in record.items():
+    if name not in names and not (name in GONE and value == GONE[name]):
+      raise ValueError(f"{name}={value!r} is no setting of this version")
+  return {name: value for name, value in record.items() if name in names}
 
 
 def replace(config, **changes):

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_cl import faults
-from mjx_cl.config import CHUNK, DreamerConfig, TrainConfig
+from mjx_cl.config import CHUNK, DreamerConfig, TrainConfig, recorded
 from mjx_cl.dreamer import replay as replay_lib
 from mjx_cl.dreamer.agent import CAUSES, EXPLODED, Agent, TrainState, Weights, culprit
 from mjx_cl.errors import FileError, UserError, choose
@@ -747,16 +747,17 @@ def check_same(
     settings = (
       dataclasses.asdict(DreamerConfig())
       | dataclasses.asdict(TrainConfig())
-      | old["dreamer"]
-      | old["train"]
+      | recorded(DreamerConfig, old["dreamer"])
+      | recorded(TrainConfig, old["train"])
     )  # of a setting younger than the training
     before = flat(
       {"env": old["env"], "seed": old["seed"], "seeds": old.get("seeds", seeds)},
       settings,
       old.get("started_from"),
     )
-  except (OSError, ValueError, KeyError, TypeError):
-    raise FileError(f"{path} is not a training's; give --overwrite or another --out") from None
+  except (OSError, ValueError, KeyError, TypeError) as e:
+    why = f": {e}" if type(e) is ValueError else ""
+    raise FileError(f"{path} is not a training's{why}; give --overwrite or another --out") from None
   for key in (
     "demonstrator",
     "agent",

@@ -17,7 +17,7 @@ import ml_dtypes
 import numpy as np
 
 from mjx_cl import envs
-from mjx_cl.config import DreamerConfig
+from mjx_cl.config import DreamerConfig, recorded
 from mjx_cl.dreamer.agent import Agent, TrainState
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.io import arrays, folders
@@ -112,7 +112,7 @@ def load(
     )
   try:
     card = json.loads((folder / "card.json").read_text())
-    config = DreamerConfig(**card["dreamer"])
+    config = DreamerConfig(**recorded(DreamerConfig, card["dreamer"]))
   except (OSError, ValueError, KeyError, TypeError) as e:
     raise FileError(f"{folder / 'card.json'} is not an agent's card: {e}") from None
   if card.get("env") not in (env_name, related):

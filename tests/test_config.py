@@ -1,0 +1,15 @@
+"""Settings that earlier versions wrote."""
+
+import pytest
+
+from mjx_cl.config import TrainConfig, recorded
+
+
+def test_a_setting_that_is_gone_is_dropped_where_it_meant_nothing():
+  assert recorded(TrainConfig, {"envs": 8, "jitter": 0.0}) == {"envs": 8}
+
+
+@pytest.mark.parametrize("name, value", [("jitter", 0.1), ("ration", 4)])
+def test_a_setting_that_meant_something_is_named(name, value):
+  with pytest.raises(ValueError, match=f"{name}={value} is no setting of this version"):
+    recorded(TrainConfig, {"envs": 8, name: value})
