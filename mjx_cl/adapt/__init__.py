@@ -1,4 +1,4 @@
-"""Alarm, finetuning, stop: the phase machine (`phase.py`), its convergence test (`convergence.py`),
-and the step that joins monitor, detector, phase, replay and updates (`loop.py`), and what is
-compared (`arms.py`).
+"""Alarm, finetuning, stop: watch, decide, learn and act, joined in loop; arms are what is compared.
+
+Imports from detectors, rollout and below.
 """

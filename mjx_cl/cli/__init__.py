@@ -1,1 +1,4 @@
-"""The command line."""
+"""The command line: flags, commands, what is printed.
+
+Imports from every other room.
+"""

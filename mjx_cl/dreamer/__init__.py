@@ -1,3 +1,4 @@
-"""DreamerV3 (Hafner et al. 2025) for vector observations and continuous actions: pure functions
-over one seed; callers vmap.
+"""DreamerV3 (Hafner et al. 2025) in pure functions over one seed, which callers vmap; its replay.
+
+Imports config, sizes and below.
 """

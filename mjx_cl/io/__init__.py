@@ -1,3 +1,4 @@
-"""Files and machines: tables, arrays, checkpoints, folders, JAX's start, memory, plug-ins,
-interrupts.
+"""Files and machines: tables, arrays, checkpoints, folders, JAX set up, memory, plug-ins, signals.
+
+Imports types, errors and keys alone.
 """

@@ -1,1 +1,4 @@
-"""Logs of one's own as CSV files: reading them and watching them."""
+"""Logs of one's own as CSV files: reading them and watching them.
+
+Imports from runs and below.
+"""

@@ -1,1 +1,4 @@
-"""Pictures: robots at work as films, and the figures of a run."""
+"""Pictures: robots at work as films, and the figures of a run.
+
+Imports from training and below.
+"""

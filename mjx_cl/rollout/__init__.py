@@ -1,4 +1,4 @@
-"""Robots, agents and faults in one scan: acting, residuals of the predictions, transfers.
+"""Robots, agents and faults in one scan: acting, residuals, transfer to another robot.
 
-Imports faults and dreamer, and what lies below them.
+Imports from envs, faults, dreamer and below.
 """

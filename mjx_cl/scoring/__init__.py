@@ -1,1 +1,4 @@
-"""From traces to numbers, in NumPy on the host: alarms and latency, recovery, intervals."""
+"""From tables to numbers, alarms, recovery, survival, intervals, worth of the stop rule.
+
+Imports from adapt and below.
+"""

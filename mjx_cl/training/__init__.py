@@ -1,1 +1,4 @@
-"""Agents: training them, demonstrators, evaluation, and those that ship."""
+"""Agents: training them, demonstrators, evaluation, and those that ship.
+
+Imports from scoring and below.
+"""
