@@ -5,7 +5,7 @@ seeds, and how early the channel could tell.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -13,6 +13,10 @@ from mjx_cl.errors import UserError
 from mjx_cl.leaderboard.streams import StreamSet
 from mjx_cl.scoring import limits, metrics
 from mjx_cl.scoring import thresholds as healthy
+
+if TYPE_CHECKING:
+  from mjx_cl.leaderboard.score import Data
+  from mjx_cl.rollout.monitor import Residual
 
 ORDER = 8  # of the autoregressions
 CHANNELS = ("opr", "rpr")  # the declared channel: what the single-residual detectors see
@@ -48,7 +52,7 @@ class Oracle(NamedTuple):
   run: OracleRun | None
 
 
-def channels(residual, columns=slice(None)) -> np.ndarray:
+def channels(residual: Residual, columns: slice | np.ndarray = slice(None)) -> np.ndarray:
   """Ln of the oracle's channels, (T, S, C)."""
   return np.stack(
     [np.log(np.maximum(getattr(residual, c)[:, columns].astype(float), 1e-9)) for c in CHANNELS], -1
@@ -119,7 +123,7 @@ def _thresholds(ratio: np.ndarray, lanes: int, count_from: int, most: float) -> 
   return high
 
 
-def _ratios(x: np.ndarray, fits) -> np.ndarray:
+def _ratios(x: np.ndarray, fits: list[limits.Parameters]) -> np.ndarray:
   """Log-likelihood ratios (T, faults x S) of healthy channels (T, S, C), nan over the first ORDER
   steps; one healthy model stands in all fits.
   """
@@ -131,7 +135,7 @@ def _ratios(x: np.ndarray, fits) -> np.ndarray:
   return out
 
 
-def oracles(streams: StreamSet, data) -> dict[tuple[str, float], Oracle]:
+def oracles(streams: StreamSet, data: Data) -> dict[tuple[str, float], Oracle]:
   """The likelihood-ratio CUSUM of every fault: fitted on the seeds that tune, calibrated on their
   healthy streams, run on the seeds that score.
 
@@ -141,10 +145,10 @@ def oracles(streams: StreamSet, data) -> dict[tuple[str, float], Oracle]:
   lanes = data.tune.residual.opr.shape[1]
   each = lanes // len(dict.fromkeys(data.tune.seed.tolist()))
   tune, score = (channels(x.residual) for x in (data.tune, data.score))
-  normal = tune[data.count_from :, ::each]
+  normal: Any = tune[data.count_from :, ::each]
   normal, first, known = limits.Healthy(normal, ORDER), limits.Healthy(normal[..., 0], ORDER), {}
   for key in streams.faults(data.robot):
-    tuned = streams.get(data.robot, streams.find(data.robot, "fault", "tune", *key))
+    tuned: Any = streams.get(data.robot, streams.find(data.robot, "fault", "tune", *key))
     after = np.stack(
       [
         channels(tuned.residual, slice(s, s + 1))[o : o + data.horizon, 0]

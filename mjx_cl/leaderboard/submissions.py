@@ -8,6 +8,7 @@ import math
 import pathlib
 import time
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pyarrow.compute
@@ -20,6 +21,9 @@ from mjx_cl.io import tables
 from mjx_cl.leaderboard.score import CURVE, Data, Found, curve, found
 from mjx_cl.leaderboard.streams import COLUMNS, Streams, StreamSet
 from mjx_cl.scoring import thresholds
+
+if TYPE_CHECKING:
+  from collections.abc import Collection
 
 HIGHEST = 1e9  # threshold of a plain class above which its alarms must have ceased
 FINE = 1.01  # a plain class's threshold is found to this factor
@@ -78,14 +82,16 @@ def from_scores(scores: dict[int, np.ndarray]) -> Callable[[Data], Found]:
   return get
 
 
-def _numbers(path, table: dict, name: str) -> np.ndarray:
+def _numbers(path: pathlib.Path | str, table: dict, name: str) -> np.ndarray:
   try:
     return np.asarray(table[name], float)
   except (TypeError, ValueError):
     raise FileError(f"{path}: column {name!r} must hold numbers") from None
 
 
-def read_submission(path, streams: StreamSet, robots=()) -> dict[int, np.ndarray]:
+def read_submission(
+  path: pathlib.Path | str, streams: StreamSet, robots: Collection[str] = ()
+) -> dict[int, np.ndarray]:
   """Checks and reads a file of scores: Parquet with the columns stream, step, score, a row for
   every control step of every stream of the set but those of kind `past`; null where no score is
   known.
@@ -196,7 +202,10 @@ def _differ(whole: np.ndarray, cut: np.ndarray) -> int | None:
   return int(np.flatnonzero(differ)[0]) if differ.any() else None
 
 
-def from_host(host, threshold_name: str | None = None) -> Callable[[Data], Found]:
+def from_host(
+  host: host_lib.HostDetector | Callable[[float], host_lib.HostDetector],
+  threshold_name: str | None = None,
+) -> Callable[[Data], Found]:
   """Data -> Found for a plain Python class, see detectors.host; one that looks ahead is refused.
 
   Args:
@@ -260,7 +269,12 @@ def _least(alarms: Callable[[float], int], target: float, what: str) -> float:
   return high
 
 
-def export(streams: StreamSet, folder, robots=(), overwrite: bool = False) -> list[str]:
+def export(
+  streams: StreamSet,
+  folder: pathlib.Path | str,
+  robots: Collection[str] = (),
+  overwrite: bool = False,
+) -> list[str]:
   """Every stream that a submission needs, in full, as ROBOT.parquet with its past joined: for tools
   that know nothing of this package.
 
