@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import pathlib
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -24,6 +24,9 @@ from mjx_cl.scoring import alarms as alarm_score
 from mjx_cl.scoring import intervals, recovery
 from mjx_cl.types import Spec
 
+if TYPE_CHECKING:
+  from mjx_cl.faults.presets import Change
+
 # by decision: what a stream has come to
 OUTCOMES = {
   "stop": "converged",
@@ -35,7 +38,7 @@ OUTCOMES = {
 }
 
 
-def acts(change) -> bool:
+def acts(change: Change) -> bool:
   """Whether a change of the robot is one: a fault of a severity above 0."""
   return change.fault != "none" and change.severity > 0
 
@@ -82,7 +85,7 @@ class Ledger(NamedTuple):
           out[step] = kind
     return dict(sorted(out.items()))
 
-  def trace(self, trace) -> dict:
+  def trace(self, trace: dict[str, np.ndarray]) -> dict:
     """Columns of trace.parquet, stream by stream."""
     steps, groups = trace["reward"].shape
     flat = lambda x: np.ascontiguousarray(x.T).reshape(-1)
@@ -123,7 +126,7 @@ class Ledger(NamedTuple):
       table[column_name] = flat(values)
     return table | {"updates": flat(trace["updates"])}
 
-  def signals(self, trace) -> dict:
+  def signals(self, trace: dict[str, np.ndarray]) -> dict:
     """Per chunk what the stop rule read: the six signals, posture and the levels asked for."""
     chunks, groups = trace["decision"].shape
     flat = lambda x: np.ascontiguousarray(x.T).reshape(-1)
@@ -143,14 +146,21 @@ class Ledger(NamedTuple):
       "least_posture": np.full(chunks * groups, least, np.float32),
     }
 
-  def events(self, trace) -> list[dict]:
+  def events(self, trace: dict[str, np.ndarray]) -> list[dict]:
     """Every onset, alarm, start, stop, abort, rollback and repair, with its reason."""
     c, events = self.config, []
     for g, ((arm, seed), onset) in enumerate(zip(self.labels, self.onsets)):
       healthy = "on a healthy robot" if onset is None else "before onset"
       onset, trigger = c.steps if onset is None else onset, ARMS[arm].trigger
 
-      def add(step, kind, reason, cause=None, decision=None, since=None):
+      def add(
+        step: int,
+        kind: str,
+        reason: str,
+        cause: str | None = None,
+        decision: str | None = None,
+        since: int | None = None,
+      ) -> None:
         events.append(
           {
             "stream": g,
@@ -231,7 +241,7 @@ class Ledger(NamedTuple):
           )
     return sorted(events, key=lambda e: (e["stream"], e["step"]))
 
-  def rows(self, trace, events) -> list[dict]:
+  def rows(self, trace: dict[str, np.ndarray], events: list[dict]) -> list[dict]:
     """One row per stream and change, in order: the first change's row holds the stream from its
     start up to the next change, see `later`.
     """
@@ -325,7 +335,14 @@ class Ledger(NamedTuple):
         )
     return set_apart(rows, events)
 
-  def summary(self, rows, trace, seconds, quiet, chunks) -> dict:
+  def summary(
+    self,
+    rows: list[dict],
+    trace: dict[str, np.ndarray],
+    seconds: dict[str, float],
+    quiet: list[float],
+    chunks: int,
+  ) -> dict:
     """summary.json: per arm the aggregates, each with its interval; arm `detector` also at the top
     level.
 
@@ -400,7 +417,7 @@ def set_apart(rows: list[dict], events: list[dict]) -> list[dict]:
   return out
 
 
-def rescore(folder) -> dict:
+def rescore(folder: pathlib.Path | str) -> dict:
   """Writes runs.parquet and summary.json of a finished run anew by today's definitions, as far as
   they follow from its rows and events: `adapting_at_onset` and what is kept apart by it, and every
   aggregate of the rows. Returns summary.json's value. For results of an earlier version; what a run
@@ -472,10 +489,10 @@ def summarise(rows: list[dict], config: RunConfig, control_s: float) -> dict:
   ]
   out: dict = {"seeds": len(rows)}
 
-  def put(name, value, ci):
+  def put(name: str, value: float | None, ci: list[float] | None) -> None:
     out[name], out[name + "_ci"] = value, ci
 
-  def count(name, hits, n):
+  def count(name: str, hits: int, n: int) -> None:
     p = intervals.wilson(hits, n)
     put(name, hits, None if p is None else [p[0] * n, p[1] * n])
 

@@ -23,7 +23,7 @@ import pathlib
 import shutil
 import sys
 import time
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -58,6 +58,13 @@ from mjx_cl.scoring import stop_rule
 from mjx_cl.training import agents
 from mjx_cl.training import needs as bytes_of
 
+if TYPE_CHECKING:
+  from collections.abc import Callable
+  from typing import Any
+
+  from mjx_cl.adapt.loop import Digest
+  from mjx_cl.rollout.scan import Row
+
 
 class State(NamedTuple):
   """All arrays of a run: the robots and everything else, in blocks of streams, see crew.py."""
@@ -74,10 +81,10 @@ class Progress(NamedTuple):
   seconds: float
   arms: list[str]
   seeds: list[int]
-  phase: np.ndarray
-  reward: np.ndarray
+  phase: np.ndarray | jax.Array
+  reward: np.ndarray | jax.Array
   alarms: np.ndarray
-  updates: np.ndarray
+  updates: np.ndarray | jax.Array
   note: str = ""
 
 
@@ -105,7 +112,9 @@ class Runner:
   Another number of arms or seeds is another program, which rounds otherwise.
   """
 
-  def __init__(self, config: RunConfig, out, programs: Programs | None = None):
+  def __init__(
+    self, config: RunConfig, out: pathlib.Path | str, programs: Programs | None = None
+  ) -> None:
     self.config = config = check(config)
     self.out = pathlib.Path(out)
     self.env = envs.make(config.env, config.physics)
@@ -135,7 +144,9 @@ class Runner:
     detector = detectors.make(config.detector, **({"robot": robot} | settings))
     monitor = Monitor(agent, n=15, form=config.form, actions=config.actions, spec=spec)
     if self.other is None:
-      self.rollout = Rollout(self.env, agent, self.faults, self.repeat, config.deterministic)
+      self.rollout: Rollout | Transfer = Rollout(
+        self.env, agent, self.faults, self.repeat, config.deterministic
+      )
       begin = lambda k, breaks: start(
         self.env, agent, self.faults, k, target=target, plan=spared(plan, breaks)
       )
@@ -207,10 +218,10 @@ class Runner:
     self.seconds = {"physics": 0.0, "acting": 0.0, "digest": 0.0, "other": 0.0}
     self.quiet: list[float] = []  # digest time of chunks without an update
     self.parts: list[dict] = []
-    self.stream_seconds = np.zeros(self.groups)
-    self._updates = np.zeros(self.groups, int)
-    self._alarms = np.zeros(self.groups, int)
-    self._phase = np.zeros(self.groups, int)
+    self.stream_seconds: np.ndarray = np.zeros(self.groups)
+    self._updates: np.ndarray | jax.Array = np.zeros(self.groups, int)
+    self._alarms: np.ndarray = np.zeros(self.groups, int)
+    self._phase: np.ndarray | jax.Array = np.zeros(self.groups, int)
     self.work = self.out / "work"
     self.endless = any(never_stops(ARMS[arm]) for arm in config.arms)
     self.snapshots = (
@@ -297,7 +308,7 @@ class Runner:
       digest.updates,
     )
 
-  def _notice_failures(self, digest, now: int) -> None:
+  def _notice_failures(self, digest: Digest, now: int) -> None:
     """Says which streams are given up for a loss at fault; they live on without learning. A reward
     that is no number would spoil every figure: that ends the run.
     """
@@ -328,7 +339,7 @@ class Runner:
     }  # robots of one model share a host
     return sum(getattr(p, "seconds", 0.0) for p in clocks.values())
 
-  def _acceptance(self, streams, now: int):
+  def _acceptance(self, streams: Stream | Moving, now: int) -> jax.Array | None:
     """Level (groups,) of the robot that each stream has after `now` control steps; None where
     robots stay what they are.
     """
@@ -340,7 +351,7 @@ class Runner:
       jnp.float32(self.env.spec.acceptance),
     )
 
-  def _choices(self, streams) -> Choices:
+  def _choices(self, streams: Stream | Moving) -> Choices:
     """The arms, with every true onset of their robots that is known by now; arms that are told one
     begin there even where the fault's severity is 0.
     """
@@ -366,11 +377,13 @@ class Runner:
       for step in np.asarray(self.state.streams.after.enter)[:, 0]
     ]
 
-  def _log(self, rows, digest) -> None:
+  def _log(self, rows: Row, digest: Digest) -> None:
     """Keeps a chunk's rows, (control steps, groups), and its chunk values (groups,)."""
     control = lambda x: np.repeat(np.asarray(x)[:, :, 0], self.repeat, 0)
 
-    def at_end(x):  # a value per decision, known with its last control step
+    def at_end(
+      x: np.ndarray | jax.Array,
+    ) -> np.ndarray:  # a value per decision, known with its last control step
       out = np.full((CHUNK, self.repeat) + x.shape[1:], np.nan, np.float32)
       out[:, -1] = x
       return out.reshape((-1,) + x.shape[1:])
@@ -500,7 +513,7 @@ class Runner:
       **runtime.provenance(),
     }
 
-  def finish(self, tell=lambda text: None) -> dict:
+  def finish(self, tell: Callable[[str], Any] = lambda text: None) -> dict:
     """Writes trace, events, runs, summary and figure, of an arm that never stops also signals,
     snapshots and stop; removes the working files.
 
@@ -619,19 +632,19 @@ class Runner:
         ) from None
 
 
-def spared(plan: faults.Plan, breaks) -> faults.Plan:
+def spared(plan: faults.Plan, breaks: jax.Array) -> faults.Plan:
   """`plan` for a robot that breaks, bool (); without any severity for one that does not."""
   return plan._replace(severity=jnp.where(breaks, plan.severity, 0.0))
 
 
 def execute(
   config: RunConfig,
-  out,
+  out: pathlib.Path | str,
   resume: bool = False,
   overwrite: bool = False,
-  progress=lambda p: None,
+  progress: Callable[[Progress], Any] = lambda p: None,
   save_every_s: float = 60.0,
-  tell=lambda text: None,
+  tell: Callable[[str], Any] = lambda text: None,
   programs: Programs | None = None,
 ) -> dict:
   """Runs `config` into `out` and returns summary.json's value. A kill at any moment loses at most

@@ -29,7 +29,7 @@ import shutil
 import time
 import tomllib
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -48,6 +48,10 @@ from mjx_cl.runs.identity import arm_agents
 from mjx_cl.runs.records import acts
 from mjx_cl.scoring import normalised_recovery, stop_rule, survival
 from mjx_cl.training import agents, needs
+
+if TYPE_CHECKING:
+  from collections.abc import Collection, Iterable, Iterator
+  from typing import Any
 
 SUITES = pathlib.Path(__file__).parent / "suites"
 PUBLISHED = (
@@ -243,7 +247,7 @@ def config(where: str, values: dict) -> RunConfig:
     raise UserError(f"{where}: a value of the wrong kind ({e})") from None
 
 
-def check_kinds(where: str, of, values, before: str = "") -> None:
+def check_kinds(where: str, of: type, values: dict, before: str = "") -> None:
   """Raises UserError where a setting of the dataclass `of` has a value of another kind than its
   annotation says.
   """
@@ -313,7 +317,7 @@ def finetunings(
 class Robots:
   """What the parts of a plan share, each built once."""
 
-  def __init__(self):
+  def __init__(self) -> None:
     self.make = functools.cache(envs.make)
     self.learner = functools.cache(
       lambda name, agent: agents.of(self.make(name, "auto"), agent).agent.config
@@ -368,7 +372,7 @@ def estimate(part: Part, rate: float, robots: Robots | None = None) -> Estimate:
   )
 
 
-def estimates(parts, robots: Robots | None = None) -> dict[str, Estimate]:
+def estimates(parts: Iterable[Part], robots: Robots | None = None) -> dict[str, Estimate]:
   """Part -> Estimate on this machine."""
   rate, robots = matmul_rate(), robots or Robots()
   return {p.name: estimate(p, rate, robots) for p in parts}
@@ -389,7 +393,7 @@ def check(part: Part, robots: Robots | None = None) -> None:
     raise type(e)(f"part {part.name}: {e}") from None
 
 
-def notes(parts) -> list[tuple[str, str]]:
+def notes(parts: Iterable[Part]) -> list[tuple[str, str]]:
   """What `mjx-cl run` would say of these parts' settings before it starts (doubts.py),
   each with the parts that it holds for.
   """
@@ -424,7 +428,7 @@ def _complete(folder: pathlib.Path) -> bool:
   return (folder / "config.json").exists() and (folder / "summary.json").exists()
 
 
-def standing(out, parts) -> tuple[list[Part], dict[str, str]]:
+def standing(out: pathlib.Path | str, parts: Iterable[Part]) -> tuple[list[Part], dict[str, str]]:
   """What OUT holds of the parts: those that are finished, and name -> why, in a few words, of those
   that it holds with other settings.
   """
@@ -466,7 +470,10 @@ def pick(
 
 
 def offers(
-  out, parts, folders, tell: Callable[[str], None] = lambda text: None
+  out: pathlib.Path,
+  parts: Iterable[Part],
+  folders: Collection[pathlib.Path | str],
+  tell: Callable[[str], None] = lambda text: None,
 ) -> dict[str, list[pathlib.Path]]:
   """Part -> folders that its run can be taken from, of those that are not finished in OUT: one, or
   several whose seeds are to be joined, see pieces.py.
@@ -498,7 +505,7 @@ def offers(
   return found
 
 
-def take(out, parts, found: dict[str, list[pathlib.Path]]) -> None:
+def take(out: pathlib.Path, parts: Iterable[Part], found: dict[str, list[pathlib.Path]]) -> None:
   """Copies to OUT, or joins there, what `offers` has found of the parts."""
   for part in parts:
     if not (sources := found.get(part.name)):
@@ -522,7 +529,7 @@ def part_seeds(part: Part) -> list[int]:
   return list(range(part.config.first_seed, part.config.first_seed + part.config.seeds))
 
 
-def publish(out, plan: Suite, to) -> list[str]:
+def publish(out: pathlib.Path | str, plan: Suite, to: pathlib.Path | str) -> list[str]:
   """Copies the finished parts' small files, all but the trace, to the folder `to`, as they are
   committed, and writes there what `collect` does of them and of the parts that lie there already
   and OUT lacks, which stay as they are; returns the names of those copied.
@@ -559,7 +566,7 @@ def publish(out, plan: Suite, to) -> list[str]:
   return [p.name for p in done]
 
 
-def earlier(to, plan: Suite) -> dict[str, tuple[Part, dict]]:
+def earlier(to: pathlib.Path | str, plan: Suite) -> dict[str, tuple[Part, dict]]:
   """Name -> the part and its scores, of what was published in the folder `to` before.
 
   Raises:
@@ -598,7 +605,7 @@ PATIENCES = (
 )  # chunks over which signals must be settled, of the stop rule without its floor
 
 
-def scores(folder) -> dict:
+def scores(folder: pathlib.Path) -> dict:
   """What several arms of one finished part say together.
 
   Returns:
@@ -617,7 +624,7 @@ def scores(folder) -> dict:
   config, rows = tables.read_json(folder / "config.json"), tables.read_rows(folder / "runs.parquet")
   arms, watched = config["arms"], survival.watched(rows, config["steps"])
   scored = normalised_recovery.rows(rows) if "none" in arms else []
-  out = {
+  out: dict[str, Any] = {
     "normalised": normalised_recovery.summarise(scored) or None,
     "against_oracle": None,
     "recovery": {},
@@ -674,7 +681,12 @@ def collect(
   """
   known = {} if known is None else known
   columns: dict[str, list] = {}
-  value = {"suite": plan.name, "parts": len(plan.parts), "finished": 0, "entries": {}}
+  value: dict[str, Any] = {
+    "suite": plan.name,
+    "parts": len(plan.parts),
+    "finished": 0,
+    "entries": {},
+  }
   there = {p.name for p in standing(out, [p for p in plan.parts if p.name not in kept])[0]} | kept
   for part in plan.parts:
     if part.name not in there:
@@ -707,7 +719,7 @@ def collect(
   return value
 
 
-def draw(out, plan: Suite, value: dict) -> list[pathlib.Path]:
+def draw(out: pathlib.Path, plan: Suite, value: dict) -> list[pathlib.Path]:
   """OUT/recovery.png and OUT/ratio.png, as far as there is something to draw, from the rows of
   OUT's parts and what bench.json holds, `value`. Returns the files.
   """
@@ -724,7 +736,7 @@ def draw(out, plan: Suite, value: dict) -> list[pathlib.Path]:
   ]
 
 
-def redraw(results) -> list[pathlib.Path]:
+def redraw(results: pathlib.Path | str) -> list[pathlib.Path]:
   """The figures of every suite that is published in a subfolder of `results`, drawn anew from its
   files. Returns them.
 
@@ -783,7 +795,7 @@ def _points(part: Part, scores_: dict) -> list[dict]:
   ]
 
 
-def write_plan(plan: Suite, out) -> None:
+def write_plan(plan: Suite, out: pathlib.Path | str) -> None:
   """OUT/suite.json: name and the resolved settings of every part."""
   out = pathlib.Path(out)
   out.mkdir(parents=True, exist_ok=True)
@@ -797,18 +809,19 @@ def write_plan(plan: Suite, out) -> None:
 
 
 @contextlib.contextmanager
-def _silent():
+def _silent() -> Iterator[Callable[[run.Progress], Any]]:
   """A display that shows nothing."""
   yield lambda progress: None
 
 
 def execute(
   plan: Suite,
-  out,
-  parts,
+  out: pathlib.Path | str,
+  parts: Iterable[Part],
   estimates: dict[str, Estimate] | None = None,
   tell: Callable[[str], None] = lambda text: None,
-  display=None,
+  display: Callable[[], contextlib.AbstractContextManager[Callable[[run.Progress], Any]]]
+  | None = None,
   save_every_s: float = 60.0,
   jobs: int = 1,
   worker: str = "",
@@ -833,9 +846,11 @@ def execute(
     names = [p.name for p in todo]
     if estimates:
       names.sort(key=lambda name: -estimates[name].seconds)
+    over: list[str]
+    known: dict[str, dict]
     over, known, begin = [], {}, time.monotonic()
 
-    def end(name):
+    def end(name: str) -> None:
       over.append(name)
       collect(out, plan, known)
       left = ""
@@ -850,6 +865,7 @@ def execute(
 
     workers.together(worker, out, names, min(jobs, len(names)), end, tell)
     return collect(out, plan, known)
+  known: dict[str, dict]
   spent, expected, known, programs = 0.0, 0.0, {}, run.Programs()
   for i, part in enumerate(todo):
     guess = lambda p: estimates[p.name].seconds if estimates else 0.0

@@ -68,7 +68,7 @@ class Worker:
     share: int,
     own: list[int],
     tell: Callable[[str], None],
-  ):
+  ) -> None:
     self.name, self.share, self.last = name, share, ""
     command = [sys.executable, "-m", module, str(out), name, ",".join(map(str, own))]
     # a session of its own: Ctrl-C reaches the parent alone, which then closes the input
@@ -82,7 +82,7 @@ class Worker:
       start_new_session=True,
     )
 
-    def listen():
+    def listen() -> None:
       for line in self.process.stderr:
         if line.strip():
           self.last = line.strip()
@@ -140,6 +140,8 @@ def together(
     UserError, FileError as soon as one fails; KeyboardInterrupt on a signal. Before either is
     raised the others have saved what they had lived and ended.
   """
+  waiting: list[str]
+  running: list[Worker]
   out, waiting, running = pathlib.Path(out), list(names), []
   all_cores = cores()
   free = list(range(jobs))
