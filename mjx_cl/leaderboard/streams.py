@@ -28,6 +28,7 @@ from mjx_cl.rollout.monitor import CHANNELS, LATENT, Residual
 
 if TYPE_CHECKING:
   from collections.abc import Collection, Sequence
+  from typing import Any
 
 VERSION = 1
 HERE = pathlib.Path(__file__).parent
@@ -94,7 +95,8 @@ class Suite:
       if not holds:
         raise UserError(f"suite {self.name!r}: {text}")
 
-    whole = {
+    table: Any
+    whole: dict[str, list[Any]] = {
       "count_from": [self.count_from],
       "onset": list(self.onset),
       **{f"[seeds] {k}": list(v) for k, v in self.seeds.items()},

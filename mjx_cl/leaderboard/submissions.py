@@ -24,6 +24,7 @@ from mjx_cl.scoring import thresholds
 
 if TYPE_CHECKING:
   from collections.abc import Collection
+  from typing import Any
 
 HIGHEST = 1e9  # threshold of a plain class above which its alarms must have ceased
 FINE = 1.01  # a plain class's threshold is found to this factor
@@ -216,7 +217,7 @@ def from_host(
   """
 
   def get(data: Data) -> Found:
-    detector = host(1.0) if threshold_name else host
+    detector: Any = host(1.0) if threshold_name else host
     tune, score, fault = (
       host_lib.samples(detector, x.residual) for x in (data.tune, data.score, data.fault)
     )

@@ -46,7 +46,7 @@ FARTHEST = (
 # ---- detectors -----------------------------------------------------------------------------------
 
 
-def _rolling(threshold: float | jax.Array, warmup: int) -> Detector:
+def _rolling(threshold: float, warmup: int) -> Detector:
   """`rolling_sigma` as the paper has it, its window as long as the warm-up."""
   return rolling_sigma(threshold=threshold, window=warmup, warmup=warmup)
 
@@ -105,7 +105,7 @@ class Program:
   """
 
   def __init__(self, name: str, warmup: int, columns: int, chunk: int) -> None:
-    factory = choose("detector", name, table())
+    factory: Callable[..., Detector] = choose("detector", name, table())  # type: ignore[assignment]
     parameters = inspect.signature(factory).parameters
     settings = {"warmup": warmup} if "warmup" in parameters else {}
     some = (

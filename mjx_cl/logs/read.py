@@ -11,11 +11,14 @@ import pathlib
 import re
 import unicodedata
 import zlib
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from mjx_cl.errors import FileError, UserError
+
+if TYPE_CHECKING:
+  from typing import Any
 
 LEAST = 100  # finite nominal samples that a column needs
 SECONDS = frozenset(("s", "sec", "secs", "second", "seconds"))
@@ -100,7 +103,7 @@ def read(path: pathlib.Path | str) -> Log:
     )
   columns, ignored = {}, {}
   for name, column in zip(names, zip(*(row for _, row in cells)) if cells else [()] * len(names)):
-    values = [_number(cell, comma) for cell in column]
+    values: Any = [_number(cell, comma) for cell in column]
     if None in values:
       first = values.index(None)
       ignored[name] = cells[first][0], column[first]

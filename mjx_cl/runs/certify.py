@@ -26,7 +26,7 @@ from mjx_cl.training import agents
 from mjx_cl.training.episodes import Episodes
 
 if TYPE_CHECKING:
-  from collections.abc import Callable
+  from collections.abc import Callable, Sequence
   from typing import Any
 
 CHUNK = 50  # decisions
@@ -270,7 +270,9 @@ def certify(
   return rows
 
 
-def price(trained: agents.Trained, nominal: tuple, own: tuple) -> dict:
+def price(
+  trained: agents.Trained, nominal: Sequence[np.ndarray], own: Sequence[np.ndarray]
+) -> dict:
   """Columns of what a lane costs; of each life the returns (episodes,) and the residuals (samples,
   2). Lost: nominal minus own, paired by episode.
   """

@@ -198,7 +198,7 @@ def choose(folders: Iterable[pathlib.Path | str], config: RunConfig) -> list[pat
   return sorted(begins, key=begins.get)
 
 
-def join(folders: Iterable[pathlib.Path | str], out: pathlib.Path | str, config: RunConfig) -> dict:
+def join(folders: Iterable[pathlib.Path], out: pathlib.Path | str, config: RunConfig) -> dict:
   """Writes the run of all seeds of `folders` into the folder `out` and returns summary.json's
   value.
 

@@ -25,6 +25,8 @@ from mjx_cl.scoring import intervals, recovery
 from mjx_cl.types import Spec
 
 if TYPE_CHECKING:
+  from typing import Any
+
   from mjx_cl.faults.presets import Change
 
 # by decision: what a stream has come to
@@ -154,7 +156,7 @@ class Ledger(NamedTuple):
       onset, trigger = c.steps if onset is None else onset, ARMS[arm].trigger
 
       def add(
-        step: int,
+        step: int | np.integer,
         kind: str,
         reason: str,
         cause: str | None = None,
@@ -353,7 +355,7 @@ class Ledger(NamedTuple):
     severity = (
       1.0 if self.becomes is not None else max(c.severity if acts(c) else 0.0 for c in self.changes)
     )
-    out = {
+    out: dict[str, Any] = {
       "env": self.config.env,
       "fault": self.config.fault,
       "severity": severity,
@@ -365,7 +367,7 @@ class Ledger(NamedTuple):
     out["invalid_share"], out["invalid_share_ci"] = invalid(trace["valid"], self.repeat)
     wall = sum(seconds.values())
     quiet = float(np.median(quiet)) if quiet else 0.0
-    monitor = min(seconds["digest"], quiet * max(1, chunks - 1))
+    monitor: Any = min(seconds["digest"], quiet * max(1, chunks - 1))
     shares = {
       "physics": seconds["physics"],
       "acting": seconds["acting"],

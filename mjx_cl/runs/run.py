@@ -143,6 +143,7 @@ class Runner:
     settings = config.settings | ({"threshold": found.value} if found else {})
     detector = detectors.make(config.detector, **({"robot": robot} | settings))
     monitor = Monitor(agent, n=15, form=config.form, actions=config.actions, spec=spec)
+    begin: Callable[[jax.Array, jax.Array], Any]
     if self.other is None:
       self.rollout: Rollout | Transfer = Rollout(
         self.env, agent, self.faults, self.repeat, config.deterministic

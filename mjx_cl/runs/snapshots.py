@@ -135,7 +135,13 @@ class Snapshots:
   # ---- while the run lives -----------------------------------------------------------------------
 
   def take(
-    self, acting: Any, place: np.ndarray, before: np.ndarray, digest: Digest, now: int, length: int
+    self,
+    acting: Any,
+    place: np.ndarray,
+    before: np.ndarray | jax.Array,
+    digest: Digest,
+    now: int,
+    length: int,
   ) -> None:
     """Writes the snapshots that are due. acting: parameters, those of stream g at place[g]; digest:
     loop.Digest; the rest as in `due`.

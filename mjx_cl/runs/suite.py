@@ -50,7 +50,7 @@ from mjx_cl.scoring import normalised_recovery, stop_rule, survival
 from mjx_cl.training import agents, needs
 
 if TYPE_CHECKING:
-  from collections.abc import Collection, Iterable, Iterator
+  from collections.abc import Collection, Iterable, Iterator, Sequence
   from typing import Any
 
 SUITES = pathlib.Path(__file__).parent / "suites"
@@ -194,7 +194,9 @@ def grid(where: str, name: str, values: dict) -> list[Part]:
   for table in ("adapt", "settings"):
     if not isinstance(values.get(table, {}), dict):
       raise UserError(f"{where}: {table} is a table of settings; got {values[table]!r}")
-  lists = [((k,), v) for k, v in values.items() if isinstance(v, list) and k != "arms"]
+  lists: list[tuple[tuple[str, ...], list]] = [
+    ((k,), v) for k, v in values.items() if isinstance(v, list) and k != "arms"
+  ]
   lists += [(("adapt", k), v) for k, v in values.get("adapt", {}).items() if isinstance(v, list)]
   for path, choices in lists:
     if not choices:
@@ -284,6 +286,7 @@ def finetunings(
   """
   own, faulty = ARMS[arm], [change for change in changes(config) if change.fault != "none"]
   first = [config.onset] * (becomes(config) is not None)
+  starts: Sequence[int]
   if not own.breaks:
     starts = []
   elif own.trigger.listens:
@@ -865,7 +868,6 @@ def execute(
 
     workers.together(worker, out, names, min(jobs, len(names)), end, tell)
     return collect(out, plan, known)
-  known: dict[str, dict]
   spent, expected, known, programs = 0.0, 0.0, {}, run.Programs()
   for i, part in enumerate(todo):
     guess = lambda p: estimates[p.name].seconds if estimates else 0.0
