@@ -128,7 +128,7 @@ def _ratios(x: np.ndarray, fits: list[limits.Parameters]) -> np.ndarray:
   steps; one healthy model stands in all fits.
   """
   out, lanes = np.full((len(x), len(fits) * x.shape[1]), np.nan), x.shape[1]
-  x = limits.lagged(x, ORDER)
+  x = limits.lagged(x, ORDER)  # type: ignore[assignment]
   before = limits.log_density(x, fits[0].before)
   for k, one in enumerate(fits):
     out[ORDER:, k * lanes : (k + 1) * lanes] = limits.log_density(x, one.after) - before
@@ -179,6 +179,7 @@ def oracles(streams: StreamSet, data: Data) -> dict[tuple[str, float], Oracle]:
     arl0 = metrics.arl0(part(tuned, k), data.count_from)
     latency = metrics.latencies(fired, data.fault.onset[own], data.horizon)
     out[key] = Oracle(
-      out[key].limits, OracleRun(latency, fired, evidence, *nominal, float(levels[k]), arl0)
+      out[key].limits,
+      OracleRun(latency, fired, evidence, *nominal, float(levels[k]), arl0),  # type: ignore[arg-type, call-arg]
     )
   return out

@@ -678,7 +678,7 @@ def _write(
       ]  # streams are numbered in the order of `meta`
       for at in rng.choice(whole, min(5, len(whole)), replace=False):
         source = meta[int(at)]
-        cut = int(rng.integers(source["onset"], source["steps"]))
+        cut = int(rng.integers(source["onset"], source["steps"]))  # type: ignore[arg-type]
         add_meta(
           stream=number,
           kind="probe",
@@ -719,7 +719,7 @@ def _grain(healthy: dict) -> dict[str, float]:
     x = x[np.isfinite(x)].astype(np.float64)
     wide = float(np.std(x if absolute(name) else np.log(np.maximum(x, FLOOR)))) if len(x) else 0.0
     fineness = FINENESS["latent" if name[0] == "z" else name.split("_")[0]]
-    grain[name] = 2.0 ** min(
+    grain[name] = 2.0 ** min(  # type: ignore[operator]
       -1.0 if not absolute(name) else np.inf, np.round(np.log2(max(wide, 1e-9) / fineness))
     )
   return grain

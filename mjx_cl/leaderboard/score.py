@@ -169,7 +169,7 @@ def chosen(names: Collection[str], robot: str) -> list[Entry]:
     if name == detectors_lib.split(name)[0] and ":" not in name:
       choose("detector", name, known)
     one = entry(name, {"use": name})
-    _one_line(one, lambda: (one.own(robot) if one.own else one.build)(1.0).init())
+    _one_line(one, lambda: (one.own(robot) if one.own else one.build)(1.0).init())  # type: ignore[misc]
     more.append(one)
   return [entry(n, s) for n, s in known.items() if not names or n in names] + more
 
@@ -321,11 +321,11 @@ def found(
     thresholds.by_seed(x[:, tune:], data.score.seed, data.count_from, scored)
     for x in (fired, score)
   ]
-  return Found(
+  return Found(  # type: ignore[call-arg]
     threshold,
     metrics.arl0(fired[:, :tune][:, tuned], data.count_from),
     episode,
-    *stacked,
+    *stacked,  # type: ignore[arg-type]
     fault_fired,
     fault_score,
     us,
@@ -506,7 +506,7 @@ def score(
   begin = time.perf_counter()
   robots = streams.choose(robots)
   room = sweep.room(streams, robots)
-  runners = {e.name: sweep.Runner(e.build, room) for e in entries if not e.own}
+  runners = {e.name: sweep.Runner(e.build, room) for e in entries if not e.own}  # type: ignore[arg-type]
   rows: list[dict]
   curves: dict[str, dict[str, list[dict]]]
   pages: list[dict]

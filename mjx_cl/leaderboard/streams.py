@@ -422,13 +422,13 @@ class StreamSet:
     residual = Residual(
       out["opr"],
       out["rpr"],
-      none,
+      none,  # type: ignore[arg-type]
       valid,
-      groups,
+      groups,  # type: ignore[arg-type]
       out["reward"],
       out["terminated"],
       out["surprise"],
-      z,
+      z,  # type: ignore[arg-type]
     )
     onset = np.where(
       m["kind"][at] == "fault", np.nan_to_num(m["onset"][at].astype(float), nan=steps), steps

@@ -217,7 +217,7 @@ def from_host(
   """
 
   def get(data: Data) -> Found:
-    detector: Any = host(1.0) if threshold_name else host
+    detector: Any = host(1.0) if threshold_name else host  # type: ignore[operator]
     tune, score, fault = (
       host_lib.samples(detector, x.residual) for x in (data.tune, data.score, data.fault)
     )
@@ -227,10 +227,10 @@ def from_host(
     if threshold_name:
       target = tune.shape[1] * (len(tune) - data.count_from) / data.arl0
       alarms = lambda v: int(
-        host_lib.run_host(host(v).factory, tune, detector.host_name)[0][data.count_from :].sum()
+        host_lib.run_host(host(v).factory, tune, detector.host_name)[0][data.count_from :].sum()  # type: ignore[operator]
       )
       value = _least(alarms, target, f"--threshold {threshold_name}")
-      detector = host(value)
+      detector = host(value)  # type: ignore[operator]
     steps = min(len(tune), len(score))
     fired, found_score = host_lib.run_host(
       detector.factory, np.concatenate([tune[:steps], score[:steps]], 1), detector.host_name

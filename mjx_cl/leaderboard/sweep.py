@@ -527,7 +527,7 @@ class Counter:
     """Alarms of all streams at each threshold, int (len(levels),). target: only runs around the
     least threshold above all with more are kept.
     """
-    levels = [float(t) for t in levels.astype(np.float32)]
+    levels = [float(t) for t in levels.astype(np.float32)]  # type: ignore[assignment]
     each = {t: [self._known(s, t) for s in range(self.streams)] for t in dict.fromkeys(levels)}
     self._run(
       [
@@ -537,7 +537,7 @@ class Counter:
       ]
     )
     self.tried |= {
-      t: sum(self._known(s, t) if k is None else k for s, k in enumerate(known))
+      t: sum(self._known(s, t) if k is None else k for s, k in enumerate(known))  # type: ignore[misc]
       for t, known in each.items()
     }
     low = max((t for t, alarms in self.tried.items() if alarms > target), default=-math.inf)

@@ -307,7 +307,7 @@ def detect(
   for k, name in enumerate(names):
     tell(f"{k + 1}/{len(names)} {name}")
     run = (
-      _host(hosts[name], xs, past) if name in hosts else _registered(name, *standard, warmup, arl0)
+      _host(hosts[name], xs, past) if name in hosts else _registered(name, *standard, warmup, arl0)  # type: ignore[call-arg]
     )
     threshold, calibrated, before[name], fired[name], scores[name] = run
     rows.append(
@@ -394,7 +394,7 @@ def _examined(
   levels = np.full(LEVELS, threshold)
   states, _, before, _ = program(levels, program.start, past)
   _, _, fired, scores = program(levels, states, xs)
-  return threshold, calibrated, before.any(1), fired, scores
+  return threshold, calibrated, before.any(1), fired, scores  # type: ignore[return-value]
 
 
 def _host(
@@ -402,7 +402,7 @@ def _host(
 ) -> tuple[None, None, np.ndarray, np.ndarray, np.ndarray]:
   """As `_registered`, of a detector that brings its own threshold."""
   fired, scores = python_class.run_host(one.factory, np.concatenate([past, xs]), one.host_name)
-  return None, None, fired[: len(past)].any(1), fired[len(past) :], scores[len(past) :]
+  return None, None, fired[: len(past)].any(1), fired[len(past) :], scores[len(past) :]  # type: ignore[return-value]
 
 
 def _row(
@@ -427,7 +427,7 @@ def _row(
     "alarms": len(at),
     "columns": [
       c
-      for c, some in zip(columns if fired.shape[1] == len(columns) else [ALL], fired.any(0))
+      for c, some in zip(columns if fired.shape[1] == len(columns) else [ALL], fired.any(0))  # type: ignore[arg-type]
       if some
     ],
   }

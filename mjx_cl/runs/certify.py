@@ -93,7 +93,7 @@ class Cost:
       kept.append(lived.add(rows)[:, 0] & warm[:, None])
       if not lived.alive.any():
         break
-    values, kept = np.concatenate(residuals), np.concatenate(kept)
+    values, kept = np.concatenate(residuals), np.concatenate(kept)  # type: ignore[assignment]
     good = kept & np.isfinite(values).all(-1)
     logs = np.log(np.maximum(values, 1e-9))
     mine = lambda i: slice(i * self.episodes, (i + 1) * self.episodes)
@@ -194,7 +194,7 @@ def become(
   size = np.sqrt(
     np.mean(((robots[1] - robots[0]) / np.asarray([v.scale for v in env.spec.obs])) ** 2, -1)
   )
-  return certificate.Certificate(
+  return certificate.Certificate(  # type: ignore[call-arg]
     env.spec.name,
     preset,
     "preset",
@@ -203,7 +203,7 @@ def become(
     not at.size,
     first is not None and first < 0,
     first,
-    *(float(size[k - 1]) for k in certificate.AFTER),
+    *(float(size[k - 1]) for k in certificate.AFTER),  # type: ignore[arg-type]
     None,
     "",
     bool(np.isfinite(robots).all()),
@@ -256,7 +256,7 @@ def certify(
       row |= found.get(certificate.Lane(row["fault"], row["target"], row["severity"]), {})
   for preset in moves:
     progress(f"{name}: {preset}")
-    other = envs.make(presets.PRESETS[preset].becomes, physics)
+    other = envs.make(presets.PRESETS[preset].becomes, physics)  # type: ignore[arg-type]
     row = become(env, other, preset)._asdict() | unknown
     if trained:
       whole = [

@@ -195,7 +195,7 @@ def choose(folders: Iterable[pathlib.Path | str], config: RunConfig) -> list[pat
       f"missing with --first-seed {missing[0]} --seeds N and "
       "another --out, or ask for fewer --seeds"
     )
-  return sorted(begins, key=begins.get)
+  return sorted(begins, key=begins.get)  # type: ignore[arg-type]
 
 
 def join(folders: Iterable[pathlib.Path], out: pathlib.Path | str, config: RunConfig) -> dict:

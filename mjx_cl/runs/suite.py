@@ -549,7 +549,7 @@ def publish(out: pathlib.Path | str, plan: Suite, to: pathlib.Path | str) -> lis
       if (out / part.name / name).exists():
         folders.atomic(
           to / part.name / name,
-          lambda file, source=out / part.name / name: file.write(source.read_bytes()),
+          lambda file, source=out / part.name / name: file.write(source.read_bytes()),  # type: ignore[misc]
         )
       else:  # of an earlier run, as the figure where seeds were joined without their traces
         (to / part.name / name).unlink(missing_ok=True)
@@ -655,10 +655,10 @@ def scores(folder: pathlib.Path) -> dict:
     )
     median, median_ci = survival.quantile(survival.kaplan_meier(time_, seen))
     enough = len(seen) > 3  # three streams or fewer give no interval
-    horizon = min(
+    horizon = min(  # type: ignore[type-var]
       HORIZON, *(w for w, r in zip(watched, rows) if not r["change"] and r["onset"] is not None)
     )
-    mean, mean_ci = survival.restricted_mean(time_, seen, horizon) if horizon > 0 else (None, None)
+    mean, mean_ci = survival.restricted_mean(time_, seen, horizon) if horizon > 0 else (None, None)  # type: ignore[arg-type, operator]
     out["recovery"][arm] = {
       "n": len(seen),
       "recovered": int(seen.sum()),
@@ -712,7 +712,7 @@ def collect(
       }
       | rows
     ).items():
-      columns.setdefault(name, [None] * before).extend(cells)
+      columns.setdefault(name, [None] * before).extend(cells)  # type: ignore[arg-type]
     for cells in columns.values():
       cells.extend([None] * (before + count - len(cells)))
   if columns:

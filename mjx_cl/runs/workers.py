@@ -83,7 +83,7 @@ class Worker:
     )
 
     def listen() -> None:
-      for line in self.process.stderr:
+      for line in self.process.stderr:  # type: ignore[union-attr]
         if line.strip():
           self.last = line.strip()
           # where nobody listens any more a full pipe would stop the worker
@@ -103,7 +103,7 @@ class Worker:
     if code is None:
       return False
     self.listener.join()
-    self.process.stdin.close()
+    self.process.stdin.close()  # type: ignore[union-attr]
     if code < 0:
       raise FileError(
         f"part {self.name} was ended by signal {-code}; where memory ran out, --jobs 1 needs "
@@ -161,6 +161,6 @@ def together(
   finally:
     running = [worker for worker in running if worker.process.poll() is None]
     for worker in running:  # all at once, then wait for all
-      worker.process.stdin.close()
+      worker.process.stdin.close()  # type: ignore[union-attr]
     for worker in running:
       worker.process.wait()
