@@ -1,6 +1,6 @@
 """Digests of small fixed runs of every command, to tell whether a change of code changed a result.
 
-  python benchmarks/reference.py run [--checkout DIR] [--only CASE ...] [--out FILE] [--work DIR]
+  python benchmarks/reference.py run [--checkout DIR] [--all | --only CASE ...] [--out FILE]
   python benchmarks/reference.py compare BEFORE.json AFTER.json [--only CASE ...]
 
 `run` calls `python -m mjx_cl ...` as reference.toml says, in fresh processes that import the
@@ -44,6 +44,7 @@ EXCLUDED = {
   "learn_s": "wall time of a training's updates",
   "us_per_sample": "wall time of a detector",
   "stream_steps_per_s": "speed of a recording",
+  "bytes": "size of a recording, its config.json with what stands here included",
   "machine": "where it ran",
   "versions": "packages that it ran with",
   "python": "version that it ran with",
@@ -96,7 +97,7 @@ def entry(values, kind: str) -> dict:
     content, number = json.dumps(values, default=float).encode(), len(values)
     known = numbers(values)
   out = {"type": kind, "number": number, "sha256": hashlib.sha256(content).hexdigest()}
-  if isinstance(values, list) and len(values) == 1:
+  if isinstance(values, list) and len(values) == 1 and not isinstance(values[0], list):
     return out | {"value": values[0]}
   known = np.asarray(known, float)
   known = known[np.isfinite(known)]
@@ -238,7 +239,8 @@ def run(args: argparse.Namespace) -> int:
   signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's `&` lets children ignore it
   commit = subprocess.getoutput(f"git -C {shlex.quote(str(checkout))} rev-parse HEAD")
   cases, walls, wrong, total = {}, {}, [], collections.Counter()
-  for name in args.only or CASES:
+  usual = [name for name in CASES if args.all or name not in CONFIG["long"]]
+  for name in args.only or usual:
     begin = time.monotonic()
     try:
       cases[name] = live(name, work / name, checkout)
@@ -279,6 +281,7 @@ def main(argv: list[str] | None = None) -> int:
   one.add_argument("--checkout", default=here, help="source tree to check; default: this one")
   one.add_argument("--out", default="reference.json", help="file for the digests")
   one.add_argument("--work", default="runs/reference", help="folder that the commands work in")
+  one.add_argument("--all", action="store_true", help="long cases too")
   two.add_argument("a", help="digests of the older checkout")
   two.add_argument("b", help="digests of the newer one")
   for command, do in ((one, run), (two, compare)):
