@@ -584,9 +584,9 @@ def _workers() -> concurrent.futures.ThreadPoolExecutor:
   return concurrent.futures.ThreadPoolExecutor(min(8, os.cpu_count() or 1), "detector")
 
 
-def _guarded(one: Entry, data: Data, runner: sweep.Runner, samples: Any) -> Found:
+def _guarded(one: Entry, data: Data, runner: sweep.Runner, samples: sweep.Samples | None) -> Found:
   """`examine`, see `_one_line`."""
-  return _one_line(one, lambda: examine(one, data, runner, samples))
+  return _one_line(one, lambda: examine(one, data, runner, samples))  # type: ignore[arg-type]
 
 
 def _one_line(one: Entry, run: Callable[[], Any]) -> Any:
