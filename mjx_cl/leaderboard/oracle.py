@@ -5,7 +5,7 @@ seeds, and how early the channel could tell.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -13,6 +13,10 @@ from mjx_cl.errors import UserError
 from mjx_cl.leaderboard.streams import StreamSet
 from mjx_cl.scoring import limits, metrics
 from mjx_cl.scoring import thresholds as healthy
+
+if TYPE_CHECKING:
+  from mjx_cl.leaderboard.score import Data
+  from mjx_cl.rollout.monitor import Residual
 
 ORDER = 8  # of the autoregressions
 CHANNELS = ("opr", "rpr")  # the declared channel: what the single-residual detectors see
@@ -48,7 +52,7 @@ class Oracle(NamedTuple):
   run: OracleRun | None
 
 
-def channels(residual, columns=slice(None)) -> np.ndarray:
+def channels(residual: Residual, columns: slice | np.ndarray = slice(None)) -> np.ndarray:
   """Ln of the oracle's channels, (T, S, C)."""
   return np.stack(
     [np.log(np.maximum(getattr(residual, c)[:, columns].astype(float), 1e-9)) for c in CHANNELS], -1
@@ -119,19 +123,19 @@ def _thresholds(ratio: np.ndarray, lanes: int, count_from: int, most: float) -> 
   return high
 
 
-def _ratios(x: np.ndarray, fits) -> np.ndarray:
+def _ratios(x: np.ndarray, fits: list[limits.Parameters]) -> np.ndarray:
   """Log-likelihood ratios (T, faults x S) of healthy channels (T, S, C), nan over the first ORDER
   steps; one healthy model stands in all fits.
   """
   out, lanes = np.full((len(x), len(fits) * x.shape[1]), np.nan), x.shape[1]
-  x = limits.lagged(x, ORDER)
+  x = limits.lagged(x, ORDER)  # type: ignore[assignment]
   before = limits.log_density(x, fits[0].before)
   for k, one in enumerate(fits):
     out[ORDER:, k * lanes : (k + 1) * lanes] = limits.log_density(x, one.after) - before
   return out
 
 
-def oracles(streams: StreamSet, data) -> dict[tuple[str, float], Oracle]:
+def oracles(streams: StreamSet, data: Data) -> dict[tuple[str, float], Oracle]:
   """The likelihood-ratio CUSUM of every fault: fitted on the seeds that tune, calibrated on their
   healthy streams, run on the seeds that score.
 
@@ -141,10 +145,10 @@ def oracles(streams: StreamSet, data) -> dict[tuple[str, float], Oracle]:
   lanes = data.tune.residual.opr.shape[1]
   each = lanes // len(dict.fromkeys(data.tune.seed.tolist()))
   tune, score = (channels(x.residual) for x in (data.tune, data.score))
-  normal = tune[data.count_from :, ::each]
+  normal: Any = tune[data.count_from :, ::each]
   normal, first, known = limits.Healthy(normal, ORDER), limits.Healthy(normal[..., 0], ORDER), {}
   for key in streams.faults(data.robot):
-    tuned = streams.get(data.robot, streams.find(data.robot, "fault", "tune", *key))
+    tuned: Any = streams.get(data.robot, streams.find(data.robot, "fault", "tune", *key))
     after = np.stack(
       [
         channels(tuned.residual, slice(s, s + 1))[o : o + data.horizon, 0]
@@ -175,6 +179,7 @@ def oracles(streams: StreamSet, data) -> dict[tuple[str, float], Oracle]:
     arl0 = metrics.arl0(part(tuned, k), data.count_from)
     latency = metrics.latencies(fired, data.fault.onset[own], data.horizon)
     out[key] = Oracle(
-      out[key].limits, OracleRun(latency, fired, evidence, *nominal, float(levels[k]), arl0)
+      out[key].limits,
+      OracleRun(latency, fired, evidence, *nominal, float(levels[k]), arl0),  # type: ignore[arg-type, call-arg]
     )
   return out

@@ -7,10 +7,14 @@ from __future__ import annotations
 import json
 import math
 import pathlib
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.io import folders
+
+if TYPE_CHECKING:
+  from collections.abc import Iterable
+  from typing import Any
 
 ASSETS = pathlib.Path(__file__).parent / "assets"
 REFERENCES = ("never", "always", "periodic", "random", "oracle")  # drawn in grey and not ranked
@@ -223,7 +227,12 @@ COLUMNS = (
 
 
 def write(
-  path, rows: list[dict], overall: list[dict], curves: dict, faults: list[dict], meta: dict
+  path: pathlib.Path | str,
+  rows: list[dict],
+  overall: list[dict],
+  curves: dict,
+  faults: list[dict],
+  meta: dict,
 ) -> None:
   """Writes the leaderboard to a temporary name and renames it. nan becomes null and is shown as a
   dash; infinity is refused.
@@ -288,7 +297,7 @@ def write(
   folders.atomic(path, lambda file: file.write(text.encode()))
 
 
-def embed(value) -> str:
+def embed(value: object) -> str:
   """JSON that may stand inside a script element: no <, > or & is left in it, so no name can end the
   element or open a comment.
   """
@@ -296,7 +305,7 @@ def embed(value) -> str:
   return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
-def _clean(value, where: str):
+def _clean(value: Any, where: str) -> Any:
   """Plain Python values, floats of DIGITS digits, nan as None."""
   if hasattr(value, "tolist"):
     value = value.tolist()
@@ -317,7 +326,7 @@ def _keys(table: str) -> list[str]:
   return [c.key for c in COLUMNS if table in c.tables]
 
 
-def _demand(where: str, row: dict, keys) -> None:
+def _demand(where: str, row: dict, keys: Iterable[str]) -> None:
   missing = [key for key in keys if key not in row]
   if missing:
     raise UserError(f"page: {where} lacks {', '.join(missing)}")

@@ -12,7 +12,7 @@ import pathlib
 import shutil
 import time
 import zlib
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -31,6 +31,13 @@ from mjx_cl.rollout.frozen import stream_keys
 from mjx_cl.rollout.monitor import Monitor, watched
 from mjx_cl.rollout.scan import Rollout, nest, start
 from mjx_cl.training import agents
+
+if TYPE_CHECKING:
+  from collections.abc import Callable, Collection, Iterable
+  from typing import Any
+
+  from mjx_cl.rollout.monitor import History
+  from mjx_cl.rollout.scan import Row
 
 TILE = 16  # lanes are filled up to a multiple of it
 MADE = (
@@ -82,30 +89,39 @@ class Behind:
     call, or at the end
   """
 
-  def __init__(self, function):
+  _last: concurrent.futures.Future | None
+
+  def __init__(self, function: Callable[..., Any]) -> None:
     self._function, self._pool, self._last = (
       function,
       concurrent.futures.ThreadPoolExecutor(1, "behind"),
       None,
     )
 
-  def __enter__(self):
+  def __enter__(self) -> Behind:
     return self
 
-  def __call__(self, *args) -> None:
+  def __call__(self, *args: Any) -> None:
     """Begins the next one once the last has ended."""
     if self._last is not None:
       self._last.result()
     self._last = self._pool.submit(self._function, *args)
 
-  def __exit__(self, kind, *_):
+  def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
     self._pool.shutdown()
     if kind is None and self._last is not None:
       self._last.result()
 
 
 def _record(
-  env, trained, lanes_: list[Lane], keys, onsets, steps: int, watch_from: int, progress
+  env: Any,
+  trained: agents.Trained,
+  lanes_: list[Lane],
+  keys: jax.Array,
+  onsets: np.ndarray,
+  steps: int,
+  watch_from: int,
+  progress: Callable[[int, int, int], Any],
 ) -> dict[str, np.ndarray]:
   """Lives `steps` control steps of every lane; the monitor looks at healthy lanes all the time, at
   the others from `watch_from` on.
@@ -159,7 +175,7 @@ def _record(
   history = monitor.init(1, len(lanes_))
   out: dict[str, list] = {c: [] for c in COLUMNS + ("episode", "terminated", "latent")}
 
-  def look(chunk, history, rows):
+  def look(chunk: int, history: History, rows: Row) -> None:
     """One chunk, seen and stored."""
     everyone = (chunk + 1) * CHUNK > watch_from
     take = (lambda x: x) if everyone else (lambda x: x[:, :, :healthy])
@@ -191,7 +207,9 @@ def _record(
   }
 
 
-def claim(suite_: Suite, out, overwrite: bool, robots=()) -> None:
+def claim(
+  suite_: Suite, out: pathlib.Path | str, overwrite: bool, robots: Collection[str] = ()
+) -> None:
   """Makes sure that `out` may take a recording of the suite; with `overwrite` the set that it holds
   is removed, and no other file; where it has more than the `robots` named, and is of this very
   suite, it stays until theirs are recorded, see `record`.
@@ -237,7 +255,7 @@ def claim(suite_: Suite, out, overwrite: bool, robots=()) -> None:
     raise foreign
 
 
-def beside(suite_: Suite, out, robots) -> dict | None:
+def beside(suite_: Suite, out: pathlib.Path | str, robots: Collection[str]) -> dict | None:
   """config.json of the set in `out` that holds more than `robots`, whose other streams stay there;
   None where it holds no more, or is none.
 
@@ -276,7 +294,7 @@ def beside(suite_: Suite, out, robots) -> dict | None:
   return config
 
 
-def _plain(suite_: Suite, robots) -> dict:
+def _plain(suite_: Suite, robots: Iterable[str]) -> dict:
   """The suite as config.json has it, with these robots alone."""
   return {f.name: getattr(suite_, f.name) for f in dataclasses.fields(Suite)} | {
     "robots": {r: suite_.robots[r] for r in robots}
@@ -301,7 +319,7 @@ def _others(work: pathlib.Path) -> list[pathlib.Path]:
   )
 
 
-def clear(out) -> None:
+def clear(out: pathlib.Path | str) -> None:
   """Removes the parts of a recording."""
   work = pathlib.Path(out) / "work"
   if work.is_dir() and not _others(work):
@@ -319,7 +337,9 @@ def _publish(staged: pathlib.Path, out: pathlib.Path) -> None:
   os.replace(staged / "config.json", out / "config.json")
 
 
-def prepare(suite_: Suite, robots, physics: str, agent: str | None) -> dict[str, tuple]:
+def prepare(
+  suite_: Suite, robots: Collection[str], physics: str, agent: str | None
+) -> dict[str, tuple]:
   """Robot -> (env, agents.Trained) of a recording; all robots of the suite where none is named.
 
   Raises:
@@ -352,12 +372,12 @@ def prepare(suite_: Suite, robots, physics: str, agent: str | None) -> dict[str,
 
 def record(
   suite_: Suite,
-  out,
-  robots=(),
+  out: pathlib.Path | str,
+  robots: Collection[str] = (),
   physics: str = "auto",
   agent: str | None = None,
   command: str = "",
-  progress=lambda part, done, steps, lanes: None,
+  progress: Callable[[str, int, int, int], Any] = lambda part, done, steps, lanes: None,
 ) -> dict:
   """Records a suite into the folder `out`; parts that are finished already are kept, so a recording
   that was cut off goes on.
@@ -493,7 +513,7 @@ def healthy_probes(rows: list[dict]) -> list[dict]:
   return out
 
 
-def write_meta(out, rows: list[dict]) -> None:
+def write_meta(out: pathlib.Path | str, rows: list[dict]) -> None:
   """Writes streams.parquet, a row of META a stream, in the order of their numbers."""
   types = {
     "stream": np.int32,
@@ -511,7 +531,7 @@ def write_meta(out, rows: list[dict]) -> None:
   )
 
 
-def _digest(params) -> int:
+def _digest(params: Any) -> int:
   """CRC-32 of an agent's weights, which tells agents apart; config.json of a set holds it for each
   robot's.
   """
@@ -531,7 +551,15 @@ def _part(path: pathlib.Path, tag: str, of: str) -> dict | None:
   return part
 
 
-def _write(suite_, out, robot, parts, number, control_s, groups) -> tuple[dict, list[dict]]:
+def _write(
+  suite_: Suite,
+  out: pathlib.Path,
+  robot: str,
+  parts: dict[tuple[str, str], tuple[list[Lane], np.ndarray, dict[str, np.ndarray]]],
+  number: int,
+  control_s: float,
+  groups: str,
+) -> tuple[dict, list[dict]]:
   """Writes ROBOT.parquet and ROBOT_latents.parquet, streams numbered from `number` on. Returns the
   rounding steps, and the streams' rows of META.
   """
@@ -542,10 +570,17 @@ def _write(suite_, out, robot, parts, number, control_s, groups) -> tuple[dict, 
   }
   meta, begin = [], number
 
-  def add_meta(**values):
+  def add_meta(**values: Any) -> None:
     meta.append({k: values.get(k) for k in META})
 
-  def add_rows(stream, data, lane, first, last, columns):
+  def add_rows(
+    stream: int,
+    data: dict[str, np.ndarray],
+    lane: int,
+    first: int,
+    last: int,
+    columns: tuple[str, ...],
+  ) -> None:
     at = slice(first, last)
     rows["stream"].append(np.full(last - first, stream, np.int32))
     rows["step"].append(np.arange(first, last, dtype=np.int32))
@@ -558,7 +593,9 @@ def _write(suite_, out, robot, parts, number, control_s, groups) -> tuple[dict, 
         else np.full(last - first, np.nan, np.float32)
       )
 
-  def add_latents(stream, data, lane, first, last):
+  def add_latents(
+    stream: int, data: dict[str, np.ndarray], lane: int, first: int, last: int
+  ) -> None:
     latents["stream"].append(np.full(last - first, stream, np.int32))
     latents["step"].append(np.arange(first, last, dtype=np.int32))
     for k in range(LATENT):
@@ -641,7 +678,7 @@ def _write(suite_, out, robot, parts, number, control_s, groups) -> tuple[dict, 
       ]  # streams are numbered in the order of `meta`
       for at in rng.choice(whole, min(5, len(whole)), replace=False):
         source = meta[int(at)]
-        cut = int(rng.integers(source["onset"], source["steps"]))
+        cut = int(rng.integers(source["onset"], source["steps"]))  # type: ignore[arg-type]
         add_meta(
           stream=number,
           kind="probe",
@@ -654,7 +691,7 @@ def _write(suite_, out, robot, parts, number, control_s, groups) -> tuple[dict, 
         )
         number += 1
   table = {k: np.concatenate(v) for k, v in rows.items()}
-  how = {
+  how: dict[str, Any] = {
     "codec": "brotli",
     "level": 11 if len(table["step"]) < 2_000_000 else 5,
   }  # 11: 9 % smaller than zstd at its best; but half a MB a second
@@ -682,7 +719,7 @@ def _grain(healthy: dict) -> dict[str, float]:
     x = x[np.isfinite(x)].astype(np.float64)
     wide = float(np.std(x if absolute(name) else np.log(np.maximum(x, FLOOR)))) if len(x) else 0.0
     fineness = FINENESS["latent" if name[0] == "z" else name.split("_")[0]]
-    grain[name] = 2.0 ** min(
+    grain[name] = 2.0 ** min(  # type: ignore[operator]
       -1.0 if not absolute(name) else np.inf, np.round(np.log2(max(wide, 1e-9) / fineness))
     )
   return grain

@@ -16,7 +16,7 @@ import os
 import pathlib
 import time
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import numpy as np
@@ -29,6 +29,11 @@ from mjx_cl.leaderboard import page, sweep
 from mjx_cl.leaderboard.streams import Streams, StreamSet
 from mjx_cl.rollout.monitor import CHANNELS
 from mjx_cl.scoring import limits, metrics, thresholds
+
+if TYPE_CHECKING:
+  from collections.abc import Collection, Iterable, Sequence
+
+  from mjx_cl.rollout.monitor import Residual
 
 ORACLES = (
   "true onset (oracle)",
@@ -112,7 +117,7 @@ def variants() -> dict[str, dict]:
   """Settings by name on the board: every registered detector at its defaults, and the usual other
   channels and a whitened form.
   """
-  own = {name: {"use": name} for name in detectors_lib.DETECTORS}
+  own: dict[str, dict[str, Any]] = {name: {"use": name} for name in detectors_lib.DETECTORS}
   scalar = lambda n: getattr(detectors_lib.DETECTORS.get(n), "takes", "") == "scalar"
   for name in ("cusum", "ewma", "glr", "conformal"):
     if scalar(name):
@@ -145,7 +150,7 @@ def entry(name: str, settings: dict) -> Entry:
   return Entry(name, build, calibrated, bool(getattr(factory, "reference", False)), about, own)
 
 
-def chosen(names, robot: str) -> list[Entry]:
+def chosen(names: Collection[str], robot: str) -> list[Entry]:
   """Entries of these names on the board, in its order, all where there is none; behind them those
   that `detectors.make` takes beside: name@channel, path/to/file.py:factory, module:factory. The
   name `none` stands for no detector.
@@ -164,7 +169,7 @@ def chosen(names, robot: str) -> list[Entry]:
     if name == detectors_lib.split(name)[0] and ":" not in name:
       choose("detector", name, known)
     one = entry(name, {"use": name})
-    _one_line(one, lambda: (one.own(robot) if one.own else one.build)(1.0).init())
+    _one_line(one, lambda: (one.own(robot) if one.own else one.build)(1.0).init())  # type: ignore[misc]
     more.append(one)
   return [entry(n, s) for n, s in known.items() if not names or n in names] + more
 
@@ -197,7 +202,7 @@ def load(streams: StreamSet, robot: str) -> Data:
 # ---- running -------------------------------------------------------------------------------------
 
 
-def joined(a, b):
+def joined(a: Residual, b: Residual) -> Residual:
   """Two residuals side by side, cut to the shorter."""
   steps = min(len(a.opr), len(b.opr))
   return jax.tree.map(lambda x, y: np.concatenate([x[:steps], y[:steps]], 1), a, b)
@@ -210,6 +215,8 @@ def examine(one: Entry, data: Data, runner: sweep.Runner, samples: sweep.Samples
     runner: of the detector, compiled once for all robots. samples: of `data`.
   """
   tune, streams = data.tune.residual.opr.shape[1], len(samples.healthy)
+  tried: list[tuple[float, int]]
+  counter: sweep.Counter | None
   threshold, tried, counted, counter = math.nan if one.calibrated else 0.0, [], 0, None
   every = lambda t: list(zip(range(streams), np.full((streams, runner.together), t, np.float32)))
   runner.prepare(samples)
@@ -258,7 +265,7 @@ def examine(one: Entry, data: Data, runner: sweep.Runner, samples: sweep.Samples
   )
 
 
-def _placed(x: np.ndarray, onset: np.ndarray, shape: tuple[int, int], unknown) -> np.ndarray:
+def _placed(x: np.ndarray, onset: np.ndarray, shape: tuple[int, ...], unknown: float) -> np.ndarray:
   """(T, F) from rows (H, F) that begin at the onsets; `unknown` before and behind, where nothing
   counts.
   """
@@ -268,7 +275,7 @@ def _placed(x: np.ndarray, onset: np.ndarray, shape: tuple[int, int], unknown) -
   return out
 
 
-def curve(pairs, data: Data, counted: float) -> list[dict]:
+def curve(pairs: Iterable[tuple[int, np.ndarray]], data: Data, counted: float) -> list[dict]:
   """Latency against false alarms: mean over fault streams of min(delay, horizon), a miss counts the
   horizon.
 
@@ -289,7 +296,14 @@ def curve(pairs, data: Data, counted: float) -> list[dict]:
 
 
 def found(
-  data: Data, threshold, fired, score, fault_fired, fault_score, us=None, points=()
+  data: Data,
+  threshold: float | None,
+  fired: np.ndarray,
+  score: np.ndarray,
+  fault_fired: np.ndarray,
+  fault_score: np.ndarray,
+  us: float | None = None,
+  points: Iterable[dict] = (),
 ) -> Found:
   """Found from raw alarms and scores: (N, tuning + scoring streams) on healthy streams, (T, F) on
   fault streams. points: of `curve`.
@@ -307,11 +321,11 @@ def found(
     thresholds.by_seed(x[:, tune:], data.score.seed, data.count_from, scored)
     for x in (fired, score)
   ]
-  return Found(
+  return Found(  # type: ignore[call-arg]
     threshold,
     metrics.arl0(fired[:, :tune][:, tuned], data.count_from),
     episode,
-    *stacked,
+    *stacked,  # type: ignore[arg-type]
     fault_fired,
     fault_score,
     us,
@@ -346,7 +360,16 @@ def rows_of(name: str, reference: bool, result: Found, data: Data, oracle: dict)
 
 
 def _row(
-  name, reference, data, key, alarms, oracle, threshold=None, arl0=None, episode=None, us=None
+  name: str,
+  reference: bool,
+  data: Data,
+  key: tuple[str, float],
+  alarms: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+  oracle: oracles.Oracle,
+  threshold: float | None = None,
+  arl0: dict | None = None,
+  episode: dict | None = None,
+  us: float | None = None,
 ) -> dict:
   """One row; alarms: fired and score on the fault streams, fired and score on healthy
   ones by seed.
@@ -469,9 +492,9 @@ class Board(NamedTuple):
 def score(
   streams: StreamSet,
   entries: list[Entry],
-  robots=(),
-  extra=(),
-  progress=lambda robot, name, k, n, seconds: None,
+  robots: Collection[str] = (),
+  extra: Sequence[tuple[str, Callable[[Data], Found]]] = (),
+  progress: Callable[[str, str, int, int, float], Any] = lambda robot, name, k, n, seconds: None,
 ) -> Board:
   """Scores detectors on a recorded set.
 
@@ -483,7 +506,10 @@ def score(
   begin = time.perf_counter()
   robots = streams.choose(robots)
   room = sweep.room(streams, robots)
-  runners = {e.name: sweep.Runner(e.build, room) for e in entries if not e.own}
+  runners = {e.name: sweep.Runner(e.build, room) for e in entries if not e.own}  # type: ignore[arg-type]
+  rows: list[dict]
+  curves: dict[str, dict[str, list[dict]]]
+  pages: list[dict]
   rows, curves, pages, n = [], {}, [], len(robots) * (len(entries) + len(extra) + 1)
   done = lived = 0
   took: dict[str, float] = {}  # seconds of each detector on the robot before
@@ -506,7 +532,7 @@ def score(
       name, next((e.reference for e in entries if e.name == name), False), result, data, known
     )
 
-    def rated(name, get):
+    def rated(name: str, get: Callable[[Data], Found]) -> tuple[Found, list[dict] | None]:
       started = time.perf_counter()
       result = get(data)
       took[name] = time.perf_counter() - started
@@ -558,12 +584,12 @@ def _workers() -> concurrent.futures.ThreadPoolExecutor:
   return concurrent.futures.ThreadPoolExecutor(min(8, os.cpu_count() or 1), "detector")
 
 
-def _guarded(one: Entry, data: Data, runner: sweep.Runner, samples) -> Found:
+def _guarded(one: Entry, data: Data, runner: sweep.Runner, samples: sweep.Samples | None) -> Found:
   """`examine`, see `_one_line`."""
-  return _one_line(one, lambda: examine(one, data, runner, samples))
+  return _one_line(one, lambda: examine(one, data, runner, samples))  # type: ignore[arg-type]
 
 
-def _one_line(one: Entry, run: Callable[[], Any]):
+def _one_line(one: Entry, run: Callable[[], Any]) -> Any:
   """run(); whatever goes wrong inside a detector, which may be anybody's, becomes one line that
   names it.
   """
@@ -590,7 +616,7 @@ def _pages(data: Data, oracle: dict, alarms: dict) -> list[dict]:
   """
   out, horizon = [], data.horizon
   for key, o in oracle.items():
-    lives = []
+    lives: list[dict] = []
     for j, k in enumerate(int(k) for k in data.own(key)):
       onset = int(data.fault.onset[k])
       window = slice(max(0, onset - horizon // 2), onset + horizon)
@@ -608,6 +634,8 @@ def _pages(data: Data, oracle: dict, alarms: dict) -> list[dict]:
       lanes = {name: fired[:, k] for name, fired in alarms.items()} | (
         {ORACLES[1]: o.run.fired[:, j]} if o.run else {}
       )
+      first: dict[str, int | None]
+      early: dict[str, int]
       first, early = {}, {}
       for name, fired in lanes.items():
         hit, ahead = (
@@ -639,7 +667,7 @@ def _pages(data: Data, oracle: dict, alarms: dict) -> list[dict]:
 # ---- writing -------------------------------------------------------------------------------------
 
 
-def write(board: Board, out, meta: dict) -> list[str]:
+def write(board: Board, out: pathlib.Path | str, meta: dict) -> list[str]:
   """leaderboard.parquet (x_ci as x_low, x_high), leaderboard_overall.parquet and leaderboard.html
   in the folder `out`.
   """
@@ -675,7 +703,7 @@ def write(board: Board, out, meta: dict) -> list[str]:
 
 def _flat(row: dict) -> dict:
   """x_ci -> x_low, x_high."""
-  out = {}
+  out: dict = {}
   for k, v in row.items():
     if k.endswith("_ci"):
       out |= {f"{k[:-3]}_low": v[0] if v else None, f"{k[:-3]}_high": v[1] if v else None}

@@ -18,13 +18,17 @@ from __future__ import annotations
 import dataclasses
 import json
 import pathlib
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.io import tables
 from mjx_cl.rollout.monitor import CHANNELS, LATENT, Residual
+
+if TYPE_CHECKING:
+  from collections.abc import Collection, Sequence
+  from typing import Any
 
 VERSION = 1
 HERE = pathlib.Path(__file__).parent
@@ -86,12 +90,13 @@ class Suite:
   latents: dict[str, float]
   robots: dict[str, dict[str, dict[str, tuple[float, ...]]]]
 
-  def __post_init__(self):
-    def need(holds, text):
+  def __post_init__(self) -> None:
+    def need(holds: object, text: str) -> None:
       if not holds:
         raise UserError(f"suite {self.name!r}: {text}")
 
-    whole = {
+    table: Any
+    whole: dict[str, list[Any]] = {
       "count_from": [self.count_from],
       "onset": list(self.onset),
       **{f"[seeds] {k}": list(v) for k, v in self.seeds.items()},
@@ -255,7 +260,7 @@ class StreamSet:
     FileError for a folder that holds none, or one of another version.
   """
 
-  def __init__(self, folder=None):
+  def __init__(self, folder: pathlib.Path | str | None = None) -> None:
     self.folder = pathlib.Path(folder) if folder else RECORDINGS / "leaderboard"
     try:
       self.config = json.loads((self.folder / "config.json").read_text())
@@ -293,7 +298,7 @@ class StreamSet:
     """Robots of the set, in its order."""
     return list(dict.fromkeys(self.meta["robot"].tolist()))
 
-  def choose(self, robots=()) -> list[str]:
+  def choose(self, robots: Collection[str] = ()) -> list[str]:
     """These robots, each once; all where none is named. UserError for one that the set lacks."""
     for robot in robots:
       if robot not in self.robots:
@@ -327,7 +332,7 @@ class StreamSet:
     numbers = np.isin(self.meta["stream"], self.find(robot, "fault", "score"))
     return int(self.meta["steps"][numbers].max()), int(numbers.sum())
 
-  def scored(self, robots=()) -> dict[int, int]:
+  def scored(self, robots: Collection[str] = ()) -> dict[int, int]:
     """{stream: control steps} of all that a file of scores must hold: nominal, fault and probe
     streams; all robots where none is named.
     """
@@ -361,7 +366,15 @@ class StreamSet:
       }
     return self._rows[robot]
 
-  def _fill(self, robot, number, limit, out, z, column):
+  def _fill(
+    self,
+    robot: str,
+    number: int,
+    limit: int,
+    out: dict[str, np.ndarray],
+    z: np.ndarray | None,
+    column: int,
+  ) -> None:
     """Writes the rows of stream `number` before step `limit` into column `column` of the arrays,
     its past first.
     """
@@ -386,7 +399,7 @@ class StreamSet:
       elif z is not None:
         z[step[keep], column] = np.stack([rows[f"z{k}"][own][keep] for k in range(LATENT)], -1)
 
-  def get(self, robot: str, numbers) -> Streams:
+  def get(self, robot: str, numbers: Sequence[int] | np.ndarray) -> Streams:
     """Streams of one robot, the shorter ones filled up with unknown values to the longest."""
     m = self.meta
     at = [int(np.flatnonzero(m["stream"] == n)[0]) for n in numbers]
@@ -409,13 +422,13 @@ class StreamSet:
     residual = Residual(
       out["opr"],
       out["rpr"],
-      none,
+      none,  # type: ignore[arg-type]
       valid,
-      groups,
+      groups,  # type: ignore[arg-type]
       out["reward"],
       out["terminated"],
       out["surprise"],
-      z,
+      z,  # type: ignore[arg-type]
     )
     onset = np.where(
       m["kind"][at] == "fault", np.nan_to_num(m["onset"][at].astype(float), nan=steps), steps

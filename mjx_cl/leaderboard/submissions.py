@@ -8,6 +8,7 @@ import math
 import pathlib
 import time
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pyarrow.compute
@@ -20,6 +21,10 @@ from mjx_cl.io import tables
 from mjx_cl.leaderboard.score import CURVE, Data, Found, curve, found
 from mjx_cl.leaderboard.streams import COLUMNS, Streams, StreamSet
 from mjx_cl.scoring import thresholds
+
+if TYPE_CHECKING:
+  from collections.abc import Collection
+  from typing import Any
 
 HIGHEST = 1e9  # threshold of a plain class above which its alarms must have ceased
 FINE = 1.01  # a plain class's threshold is found to this factor
@@ -78,14 +83,16 @@ def from_scores(scores: dict[int, np.ndarray]) -> Callable[[Data], Found]:
   return get
 
 
-def _numbers(path, table: dict, name: str) -> np.ndarray:
+def _numbers(path: pathlib.Path | str, table: dict, name: str) -> np.ndarray:
   try:
     return np.asarray(table[name], float)
   except (TypeError, ValueError):
     raise FileError(f"{path}: column {name!r} must hold numbers") from None
 
 
-def read_submission(path, streams: StreamSet, robots=()) -> dict[int, np.ndarray]:
+def read_submission(
+  path: pathlib.Path | str, streams: StreamSet, robots: Collection[str] = ()
+) -> dict[int, np.ndarray]:
   """Checks and reads a file of scores: Parquet with the columns stream, step, score, a row for
   every control step of every stream of the set but those of kind `past`; null where no score is
   known.
@@ -196,7 +203,10 @@ def _differ(whole: np.ndarray, cut: np.ndarray) -> int | None:
   return int(np.flatnonzero(differ)[0]) if differ.any() else None
 
 
-def from_host(host, threshold_name: str | None = None) -> Callable[[Data], Found]:
+def from_host(
+  host: host_lib.HostDetector | Callable[[float], host_lib.HostDetector],
+  threshold_name: str | None = None,
+) -> Callable[[Data], Found]:
   """Data -> Found for a plain Python class, see detectors.host; one that looks ahead is refused.
 
   Args:
@@ -207,7 +217,7 @@ def from_host(host, threshold_name: str | None = None) -> Callable[[Data], Found
   """
 
   def get(data: Data) -> Found:
-    detector = host(1.0) if threshold_name else host
+    detector: Any = host(1.0) if threshold_name else host  # type: ignore[operator]
     tune, score, fault = (
       host_lib.samples(detector, x.residual) for x in (data.tune, data.score, data.fault)
     )
@@ -217,10 +227,10 @@ def from_host(host, threshold_name: str | None = None) -> Callable[[Data], Found
     if threshold_name:
       target = tune.shape[1] * (len(tune) - data.count_from) / data.arl0
       alarms = lambda v: int(
-        host_lib.run_host(host(v).factory, tune, detector.host_name)[0][data.count_from :].sum()
+        host_lib.run_host(host(v).factory, tune, detector.host_name)[0][data.count_from :].sum()  # type: ignore[operator]
       )
       value = _least(alarms, target, f"--threshold {threshold_name}")
-      detector = host(value)
+      detector = host(value)  # type: ignore[operator]
     steps = min(len(tune), len(score))
     fired, found_score = host_lib.run_host(
       detector.factory, np.concatenate([tune[:steps], score[:steps]], 1), detector.host_name
@@ -260,7 +270,12 @@ def _least(alarms: Callable[[float], int], target: float, what: str) -> float:
   return high
 
 
-def export(streams: StreamSet, folder, robots=(), overwrite: bool = False) -> list[str]:
+def export(
+  streams: StreamSet,
+  folder: pathlib.Path | str,
+  robots: Collection[str] = (),
+  overwrite: bool = False,
+) -> list[str]:
   """Every stream that a submission needs, in full, as ROBOT.parquet with its past joined: for tools
   that know nothing of this package.
 

@@ -15,13 +15,20 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from mjx_cl.scoring import thresholds as healthy
+
+if TYPE_CHECKING:
+  from collections.abc import Iterable, Iterator
+
+  from mjx_cl.detectors.base import Detector
+  from mjx_cl.leaderboard.streams import StreamSet
+  from mjx_cl.rollout.monitor import Residual
 
 LANES, LANES_SHARED = 80, 20  # side by side: of one threshold each, or of healthy.TOGETHER
 LEVELS = 5  # thresholds that fault streams are run at: the calibrated one and those of the curve
@@ -58,7 +65,7 @@ class Room(NamedTuple):
   pasts: int
 
 
-def room(streams, robots) -> Room:
+def room(streams: StreamSet, robots: Iterable[str]) -> Room:
   """Room for these robots of a StreamSet; a robot whose streams share fewer pasts than their seeds
   takes more, and compiles anew.
   """
@@ -81,7 +88,12 @@ def room(streams, robots) -> Room:
 
 
 def samples(
-  nominal, fault, onset: np.ndarray, seed: np.ndarray, horizon: int, most: int = 0
+  nominal: Residual,
+  fault: Residual,
+  onset: np.ndarray,
+  seed: np.ndarray,
+  horizon: int,
+  most: int = 0,
 ) -> Samples:
   """Samples of healthy streams (T, S) and fault streams (T, F).
 
@@ -93,6 +105,8 @@ def samples(
   same = lambda a, b, steps: all(
     np.array_equal(x[:steps, a], x[:steps, b], equal_nan=x.dtype.kind == "f") for x in leaves
   )
+  lanes: list[int]
+  owner: list[int]
   lanes, owner = [], []
   for column, (first, number) in enumerate(zip(onset, seed)):
     known = next(
@@ -111,7 +125,7 @@ def samples(
   starts = np.concatenate([[0], np.cumsum(np.concatenate([np.full(streams, steps), past, after]))])
   total = max(int(starts[-1]) + 1, most)
 
-  def flat(a, b):
+  def flat(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     out = (
       np.zeros((total,) + a.shape[2:], bool)
       if a.dtype == bool
@@ -139,13 +153,15 @@ def samples(
   )
 
 
-def updates(detector):
+def updates(
+  detector: Detector,
+) -> Callable[[Any, Residual], tuple[Any, tuple[jax.Array, jax.Array]]]:
   """Update that gives (state, (fired (), scores (M,))): the score of each member of `any_of`, since
   each restarts by itself; else the one score.
   """
   members = getattr(detector.update, "members", None)
 
-  def update(state, x):
+  def update(state: Any, x: Residual) -> tuple[Any, tuple[jax.Array, jax.Array]]:
     out = (
       [d.update(s, x) for d, s in zip(members, state)] if members else [detector.update(state, x)]
     )
@@ -156,12 +172,12 @@ def updates(detector):
   return update
 
 
-def shared(build: Callable, sample) -> bool:
+def shared(build: Callable, sample: Residual) -> bool:
   """Whether the scores are free of the threshold, by the structure of the program; sample:
   monitor.Residual of one row.
   """
 
-  def scores(threshold, xs):
+  def scores(threshold: jax.Array, xs: Residual) -> jax.Array:
     detector = build(threshold)
     return jax.lax.scan(updates(detector), detector.init(), xs)[1][1]
 
@@ -174,7 +190,7 @@ def shared(build: Callable, sample) -> bool:
   return True
 
 
-def program(build: Callable, rows: int, pool: int):
+def program(build: Callable, rows: int, pool: int) -> jax.stages.Wrapped:
   """The one program of a detector, jitted: stretches of lanes one after the other, each from a
   state that is held and into one.
 
@@ -193,22 +209,35 @@ def program(build: Callable, rows: int, pool: int):
     reached are False, nan.
   """
 
-  def run(thresholds, first, steps, row, source, into, stretches, residual):
+  def run(
+    thresholds: jax.Array,
+    first: jax.Array,
+    steps: jax.Array,
+    row: jax.Array,
+    source: jax.Array,
+    into: jax.Array,
+    stretches: jax.Array,
+    residual: Residual,
+  ) -> tuple[jax.Array, jax.Array]:
     lanes = first.shape[1]
 
-    def one(thresholds):  # (G, L)
+    def one(thresholds: jax.Array) -> tuple[jax.Array, jax.Array]:  # (G, L)
       init = jax.vmap(lambda t: build(t).init())
       move = jax.vmap(lambda t, state, x: updates(build(t))(state, x))
       like = jax.eval_shape(
         move, thresholds[0], init(thresholds[0]), jax.tree.map(lambda r: r[first[0]], residual)
       )[1][1]
 
-      def stretch(g, carry):
+      def stretch(
+        g: jax.Array, carry: tuple[Any, jax.Array, jax.Array]
+      ) -> tuple[Any, jax.Array, jax.Array]:
         held, fired, scores = carry
         start, before = init(thresholds[g]), jax.tree.map(lambda p: p[source[g]], held)
         fresh = lambda a, b: jnp.where((source[g] == 0).reshape((-1,) + (1,) * (a.ndim - 1)), a, b)
 
-        def step(i, carry):
+        def step(
+          i: jax.Array, carry: tuple[Any, jax.Array, jax.Array]
+        ) -> tuple[Any, jax.Array, jax.Array]:
           state, fired, scores = carry
           state, (f, s) = move(
             thresholds[g], state, jax.tree.map(lambda r: r[first[g] + i], residual)
@@ -263,7 +292,10 @@ class Runner:
     room: of the set; None: that of the first robot.
   """
 
-  def __init__(self, build: Callable, room: Room | None = None):
+  shape: tuple[int, int, int, int]
+  compiled: Any
+
+  def __init__(self, build: Callable, room: Room | None = None) -> None:
     self.build, self.room, self.together = build, room, 0
 
   def prepare(self, data: Samples) -> None:
@@ -298,7 +330,7 @@ class Runner:
     if self.compiled is None:
       self.compiled = self.run_program.lower(*self._filled([]), 0, data.residual).compile()
 
-  def _filled(self, stretches: list[Stretch]):
+  def _filled(self, stretches: list[Stretch]) -> tuple[np.ndarray, ...]:
     """Arrays of `program`, lanes without use at the first row and into nowhere."""
     g, k, n, nowhere = self.shape[2], self.together, self.lanes, self.shape[1] - 1
     thresholds, first = np.zeros((g, k, n), np.float32), np.zeros((g, n), np.int32)
@@ -324,7 +356,9 @@ class Runner:
     fired, scores = self.compiled(*self._filled(stretches), len(stretches), data.residual)
     return np.asarray(fired), np.asarray(scores)
 
-  def healthy(self, lanes: list[tuple[int, np.ndarray]], data: Samples):
+  def healthy(
+    self, lanes: list[tuple[int, np.ndarray]], data: Samples
+  ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Lanes (stream, thresholds (K,)), K = `together`: yields fired (K, T), scores (K, T, M) of
     each.
     """
@@ -359,6 +393,9 @@ class Runner:
       np.float32
     )  # (groups, K)
     groups, pasts = len(vectors), len(data.past)
+    begin: float
+    stretches: list[Stretch]
+    ahead: list[tuple[int, int]]
     stretches, done, row, last, ahead = [], 0, 0, int(data.onset.max(initial=0)), []
     lanes = [(g, p) for g in range(groups) for p in range(pasts)]
     for at in range(0, len(lanes), self.lanes):
@@ -380,6 +417,7 @@ class Runner:
         begin = end
       ahead += [(row, i) for i in range(len(g))]
       row += last
+    where: list[tuple[int, int]]
     tails, where = [(g, f) for g in range(groups) for f in range(len(data.fault))], []
     for at in range(0, len(tails), self.lanes):
       g, f = np.asarray(tails[at : at + self.lanes]).T
@@ -442,7 +480,7 @@ class Counter:
 
   def __init__(
     self, runner: Runner, data: Samples, streams: int, count_from: int, reuse: bool = True
-  ):
+  ) -> None:
     self.runner, self.data, self.streams, self.count_from, self.reuse = (
       runner,
       data,
@@ -489,7 +527,7 @@ class Counter:
     """Alarms of all streams at each threshold, int (len(levels),). target: only runs around the
     least threshold above all with more are kept.
     """
-    levels = [float(t) for t in levels.astype(np.float32)]
+    levels = [float(t) for t in levels.astype(np.float32)]  # type: ignore[assignment]
     each = {t: [self._known(s, t) for s in range(self.streams)] for t in dict.fromkeys(levels)}
     self._run(
       [
@@ -499,7 +537,7 @@ class Counter:
       ]
     )
     self.tried |= {
-      t: sum(self._known(s, t) if k is None else k for s, k in enumerate(known))
+      t: sum(self._known(s, t) if k is None else k for s, k in enumerate(known))  # type: ignore[misc]
       for t, known in each.items()
     }
     low = max((t for t, alarms in self.tried.items() if alarms > target), default=-math.inf)

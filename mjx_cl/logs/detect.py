@@ -13,7 +13,7 @@ from __future__ import annotations
 import inspect
 import pathlib
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,6 +24,9 @@ from mjx_cl.errors import FileError, UserError, choose
 from mjx_cl.io import folders, tables
 from mjx_cl.logs.read import Log, choose_columns, read
 from mjx_cl.rollout.monitor import unknown
+
+if TYPE_CHECKING:
+  from typing import BinaryIO
 
 EXPECTED = 3  # nominal alarms below which the wanted ARL0 cannot be read off the nominal log
 FEW = 50  # alarms below which a measured run length is marked
@@ -43,7 +46,7 @@ FARTHEST = (
 # ---- detectors -----------------------------------------------------------------------------------
 
 
-def _rolling(threshold, warmup: int) -> Detector:
+def _rolling(threshold: float, warmup: int) -> Detector:
   """`rolling_sigma` as the paper has it, its window as long as the warm-up."""
   return rolling_sigma(threshold=threshold, window=warmup, warmup=warmup)
 
@@ -66,7 +69,7 @@ def table() -> dict[str, Callable[..., Detector]]:
   )
 
 
-def _joint(factory) -> bool:
+def _joint(factory: Callable[..., Detector]) -> bool:
   """Whether a factory is told its channels: then one detector watches all columns."""
   return getattr(factory, "takes", "") == "residual" and {
     "channels",
@@ -76,7 +79,9 @@ def _joint(factory) -> bool:
   } <= set(inspect.signature(factory).parameters)
 
 
-def _together(factory, threshold, warmup: int, columns: int) -> Detector:
+def _together(
+  factory: Callable[..., Detector], threshold: float | jax.Array, warmup: int, columns: int
+) -> Detector:
   """A detector of several channels on a row of `columns` numbers; a row with a missing one is
   passed over.
   """
@@ -99,8 +104,8 @@ class Program:
   and samples are its arguments.
   """
 
-  def __init__(self, name: str, warmup: int, columns: int, chunk: int):
-    factory = choose("detector", name, table())
+  def __init__(self, name: str, warmup: int, columns: int, chunk: int) -> None:
+    factory: Callable[..., Detector] = choose("detector", name, table())  # type: ignore[assignment]
     parameters = inspect.signature(factory).parameters
     settings = {"warmup": warmup} if "warmup" in parameters else {}
     some = (
@@ -120,7 +125,7 @@ class Program:
     )
     self.chunk = chunk
 
-    def single(threshold, state, x):
+    def single(threshold: jax.Array, state: Any, x: jax.Array) -> tuple[Any, Alarm]:
       known = jnp.isfinite(x)
       if joint:
         known = jnp.all(known)
@@ -129,10 +134,12 @@ class Program:
         alarm.fired & known, jnp.where(known, alarm.score, jnp.nan)
       )
 
-    def run(thresholds, states, xs):
+    def run(
+      thresholds: jax.Array, states: Any, xs: jax.Array
+    ) -> tuple[Any, tuple[jax.Array, jax.Array, jax.Array]]:
       every = jax.vmap(jax.vmap(single, (None, 0, 0)), (0, 0, None))
 
-      def step(states, x):
+      def step(states: Any, x: jax.Array) -> tuple[Any, tuple[jax.Array, jax.Array, jax.Array]]:
         states, alarm = every(thresholds, states, x[None] if joint else x)
         return states, (alarm.fired.any(-1), alarm.fired[0], alarm.score[0])
 
@@ -140,7 +147,9 @@ class Program:
 
     self.run = jax.jit(run)
 
-  def __call__(self, thresholds, states, xs: np.ndarray):
+  def __call__(
+    self, thresholds: np.ndarray | jax.Array, states: Any, xs: np.ndarray
+  ) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray]:
     """Over xs (T, C), in calls of equal shape; rows that fill up the last are missing samples,
     which change nothing.
 
@@ -225,8 +234,8 @@ class Detection(NamedTuple):
 
 
 def detect(
-  path,
-  nominal_path,
+  path: pathlib.Path | str,
+  nominal_path: pathlib.Path | str,
   columns: tuple[str, ...] = (),
   detectors: tuple[str, ...] = (),
   arl0: float = 10_000,
@@ -298,7 +307,7 @@ def detect(
   for k, name in enumerate(names):
     tell(f"{k + 1}/{len(names)} {name}")
     run = (
-      _host(hosts[name], xs, past) if name in hosts else _registered(name, *standard, warmup, arl0)
+      _host(hosts[name], xs, past) if name in hosts else _registered(name, *standard, warmup, arl0)  # type: ignore[call-arg]
     )
     threshold, calibrated, before[name], fired[name], scores[name] = run
     rows.append(
@@ -325,7 +334,7 @@ def detect(
   return Detection(summary, xs, past, fired, scores, before, seconds)
 
 
-def _logarithm(x: np.ndarray, names: list[str], path) -> np.ndarray:
+def _logarithm(x: np.ndarray, names: list[str], path: pathlib.Path | str) -> np.ndarray:
   """Ln max(x, 1e-9) of x (T, C); nan stays, anything else that is not positive is refused."""
   for name, column in zip(names, x.T):
     if (column <= 0).any():
@@ -345,7 +354,9 @@ def _clock(log: Log, rate: float | None, samples: int) -> tuple[np.ndarray | Non
   return (None if rate is None else at / rate), rate
 
 
-def _registered(name: str, xs: np.ndarray, past: np.ndarray, warmup: int, arl0: float):
+def _registered(
+  name: str, xs: np.ndarray, past: np.ndarray, warmup: int, arl0: float
+) -> tuple[float | None, bool, np.ndarray, np.ndarray, np.ndarray]:
   """(threshold, calibrated, nominal alarms (N,), alarms (T, C), scores (T, C)); what goes wrong
   inside a detector, which may be anybody's, becomes one line that names it.
   """
@@ -366,7 +377,9 @@ def _registered(name: str, xs: np.ndarray, past: np.ndarray, warmup: int, arl0: 
     ) from e
 
 
-def _examined(name: str, xs: np.ndarray, past: np.ndarray, warmup: int, arl0: float):
+def _examined(
+  name: str, xs: np.ndarray, past: np.ndarray, warmup: int, arl0: float
+) -> tuple[float | None, bool, np.ndarray, np.ndarray, np.ndarray]:
   """`_registered`, as it goes."""
   program = Program(name, warmup, xs.shape[1], min(CHUNK, len(past)))
   threshold, calibrated = calibrate(program, past, warmup, arl0)
@@ -381,13 +394,15 @@ def _examined(name: str, xs: np.ndarray, past: np.ndarray, warmup: int, arl0: fl
   levels = np.full(LEVELS, threshold)
   states, _, before, _ = program(levels, program.start, past)
   _, _, fired, scores = program(levels, states, xs)
-  return threshold, calibrated, before.any(1), fired, scores
+  return threshold, calibrated, before.any(1), fired, scores  # type: ignore[return-value]
 
 
-def _host(one: python_class.HostDetector, xs: np.ndarray, past: np.ndarray):
+def _host(
+  one: python_class.HostDetector, xs: np.ndarray, past: np.ndarray
+) -> tuple[None, None, np.ndarray, np.ndarray, np.ndarray]:
   """As `_registered`, of a detector that brings its own threshold."""
   fired, scores = python_class.run_host(one.factory, np.concatenate([past, xs]), one.host_name)
-  return None, None, fired[: len(past)].any(1), fired[len(past) :], scores[len(past) :]
+  return None, None, fired[: len(past)].any(1), fired[len(past) :], scores[len(past) :]  # type: ignore[return-value]
 
 
 def _row(
@@ -412,7 +427,7 @@ def _row(
     "alarms": len(at),
     "columns": [
       c
-      for c, some in zip(columns if fired.shape[1] == len(columns) else [ALL], fired.any(0))
+      for c, some in zip(columns if fired.shape[1] == len(columns) else [ALL], fired.any(0))  # type: ignore[arg-type]
       if some
     ],
   }
@@ -451,7 +466,7 @@ ALL = "(all)"  # in the place of a column: one detector watches all
 FILES = ("detect.json", "alarms.csv", "detect.png")
 
 
-def claim(out, overwrite: bool) -> pathlib.Path:
+def claim(out: pathlib.Path | str, overwrite: bool) -> pathlib.Path:
   """Makes the folder of the results; an earlier detection in it is refused unless `overwrite`."""
   out = pathlib.Path(out)
   if out.exists() and not out.is_dir():
@@ -469,7 +484,7 @@ def claim(out, overwrite: bool) -> pathlib.Path:
   return out
 
 
-def write(result: Detection, out) -> None:
+def write(result: Detection, out: pathlib.Path | str) -> None:
   """Writes detect.json, alarms.csv (one line per detector, column and alarm) and detect.png into
   folder `out`.
   """
@@ -499,7 +514,7 @@ def _quoted(cell: str) -> str:
   return '"' + cell.replace('"', '""') + '"' if set(cell) & set(',"\r\n') else cell
 
 
-def figure(result: Detection, file, panels: int = 8) -> None:
+def figure(result: Detection, file: pathlib.Path | str | BinaryIO, panels: int = 8) -> None:
   """Draws the columns, before sample 0 the end of the nominal log in grey, and beneath them each
   detector's alarms as marks.
 

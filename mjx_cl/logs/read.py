@@ -11,11 +11,14 @@ import pathlib
 import re
 import unicodedata
 import zlib
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from mjx_cl.errors import FileError, UserError
+
+if TYPE_CHECKING:
+  from typing import Any
 
 LEAST = 100  # finite nominal samples that a column needs
 SECONDS = frozenset(("s", "sec", "secs", "second", "seconds"))
@@ -63,7 +66,7 @@ class Log(NamedTuple):
 # ---- files ---------------------------------------------------------------------------------------
 
 
-def read(path) -> Log:
+def read(path: pathlib.Path | str) -> Log:
   """Reads a CSV file, also one compressed by gzip: a header row, then numbers; an empty cell, `nan`
   or anything infinite is a missing sample.
 
@@ -100,7 +103,7 @@ def read(path) -> Log:
     )
   columns, ignored = {}, {}
   for name, column in zip(names, zip(*(row for _, row in cells)) if cells else [()] * len(names)):
-    values = [_number(cell, comma) for cell in column]
+    values: Any = [_number(cell, comma) for cell in column]
     if None in values:
       first = values.index(None)
       ignored[name] = cells[first][0], column[first]
@@ -125,7 +128,7 @@ def read(path) -> Log:
   return Log(columns, told.get("time"), told.get("step"), ignored, clocks, labels, tuple(notes))
 
 
-def _text(path) -> tuple[str, list[str]]:
+def _text(path: pathlib.Path | str) -> tuple[str, list[str]]:
   """What a file says, and a note if it had to be guessed how it is written."""
   try:
     raw = pathlib.Path(path).read_bytes()
@@ -158,7 +161,7 @@ def _first_line(text: str) -> str:
   return re.split(r"\r\n?|\n", text, maxsplit=1)[0]
 
 
-def _header(path, head: str, names: list[str]) -> list[str]:
+def _header(path: pathlib.Path | str, head: str, names: list[str]) -> list[str]:
   """Names of the columns, or a FileError that says what is wrong with them."""
   if not names:
     raise FileError(f"{path} has no header row with the names of its columns")
@@ -185,7 +188,7 @@ def _header(path, head: str, names: list[str]) -> list[str]:
 
 
 def _cells(
-  path, names: list[str], rows: list[tuple[int, list[str]]]
+  path: pathlib.Path | str, names: list[str], rows: list[tuple[int, list[str]]]
 ) -> list[tuple[int, list[str]]]:
   """(line, a cell per name) of each sample."""
   cells = []
@@ -214,7 +217,7 @@ def _number(cell: str, comma: bool = False) -> float | None:
     return None
 
 
-def _decimal_comma(cells) -> bool:
+def _decimal_comma(cells: list[tuple[int, list[str]]]) -> bool:
   """Whether more numbers are written 0,5 than 0.5."""
   commas = points = 0
   for _, row in cells:
@@ -226,7 +229,7 @@ def _decimal_comma(cells) -> bool:
   return commas > points
 
 
-def _units(cells, comma: bool) -> bool:
+def _units(cells: list[tuple[int, list[str]]], comma: bool) -> bool:
   """Whether the second line holds text alone, and somewhere beneath its text are numbers."""
   if len(cells) < 2 or cells[0][0] != 2:
     return False
@@ -324,7 +327,11 @@ def _clocks(log: Log, nominal: Log) -> list[str]:
 
 
 def choose_columns(
-  log: Log, nominal: Log, names: tuple[str, ...], path, nominal_path
+  log: Log,
+  nominal: Log,
+  names: tuple[str, ...],
+  path: pathlib.Path | str,
+  nominal_path: pathlib.Path | str,
 ) -> tuple[list[str], list[str]]:
   """Columns that are watched, and notes on those that are not: those named, or all that both files
   hold as numbers, less clocks and what is unfit.
@@ -363,7 +370,7 @@ def choose_columns(
   return found, [] if names else _left_out(files, clocks, unfit)
 
 
-def _there(one: Log, at, name: str) -> None:
+def _there(one: Log, at: pathlib.Path | str, name: str) -> None:
   """Refuses a name that is no column of numbers of the file."""
   if name in one.ignored:
     line, cell = one.ignored[name]
@@ -385,7 +392,9 @@ def _because(one: Log) -> str:
   )
 
 
-def _unfit(name: str, log: Log, nominal: Log, path, nominal_path) -> tuple[str, str] | None:
+def _unfit(
+  name: str, log: Log, nominal: Log, path: pathlib.Path | str, nominal_path: pathlib.Path | str
+) -> tuple[str, str] | None:
   """Why a column cannot be watched, for a note and as an error; None if it can."""
   known, now = (x[np.isfinite(x)] for x in (nominal.columns[name], log.columns[name]))
   if len(known) < LEAST:
@@ -399,7 +408,11 @@ def _unfit(name: str, log: Log, nominal: Log, path, nominal_path) -> tuple[str, 
   return None if len(now) else (f"no sample in {path}", f"{path}: column {name} has no sample")
 
 
-def _left_out(files, clocks: list[str], unfit: dict[str, tuple[str, str]]) -> list[str]:
+def _left_out(
+  files: tuple[tuple[Log, pathlib.Path | str], ...],
+  clocks: list[str],
+  unfit: dict[str, tuple[str, str]],
+) -> list[str]:
   """A note for each reason not to watch columns, with their names."""
   reasons = {name: "rising like a clock or counter" for name in clocks}
   for (one, at), (other, _) in zip(files, files[::-1]):

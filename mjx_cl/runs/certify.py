@@ -5,6 +5,7 @@ and what it costs an agent that does not adapt.
 from __future__ import annotations
 
 import pathlib
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +24,10 @@ from mjx_cl.rollout.transfer import Transfer
 from mjx_cl.scoring import intervals
 from mjx_cl.training import agents
 from mjx_cl.training.episodes import Episodes
+
+if TYPE_CHECKING:
+  from collections.abc import Callable, Sequence
+  from typing import Any
 
 CHUNK = 50  # decisions
 WARM = 30  # decisions at an episode's start whose residuals are not compared
@@ -48,7 +53,7 @@ class Cost:
     episodes: per lane; episode e starts from seed e, for every lane alike.
   """
 
-  def __init__(self, env, trained, faults: dict, episodes: int):
+  def __init__(self, env: Any, trained: agents.Trained, faults: dict, episodes: int) -> None:
     self.env, self.agent, self.faults, self.episodes = env, trained.agent, faults, episodes
     self.params = jax.tree.map(lambda x: x[None], trained.train.params)
     self.repeat = int(trained.card.get("repeat", 1))
@@ -88,7 +93,7 @@ class Cost:
       kept.append(lived.add(rows)[:, 0] & warm[:, None])
       if not lived.alive.any():
         break
-    values, kept = np.concatenate(residuals), np.concatenate(kept)
+    values, kept = np.concatenate(residuals), np.concatenate(kept)  # type: ignore[assignment]
     good = kept & np.isfinite(values).all(-1)
     logs = np.log(np.maximum(values, 1e-9))
     mine = lambda i: slice(i * self.episodes, (i + 1) * self.episodes)
@@ -133,7 +138,9 @@ def changes(robot: str) -> list[str]:
   ]
 
 
-def become(env, other, preset: str, onset: int = 25, seed: int = 0) -> certificate.Certificate:
+def become(
+  env: Any, other: Any, preset: str, onset: int = 25, seed: int = 0
+) -> certificate.Certificate:
   """Certificate of a change of robots.
 
   diff_1, diff_10 and diff_100 are of the episode that begins with it: `other` against `env` from
@@ -156,6 +163,7 @@ def become(env, other, preset: str, onset: int = 25, seed: int = 0) -> certifica
       lambda k: start(env, agent, (none,), k),
     )
   )
+  lives: tuple[list[np.ndarray], list[np.ndarray]]
   lives = [], []
   while int(moving.after.enter[0, 0]) == faults_lib.FOREVER or len(lives[0]) * CHUNK < int(
     moving.after.enter[0, 0]
@@ -186,7 +194,7 @@ def become(env, other, preset: str, onset: int = 25, seed: int = 0) -> certifica
   size = np.sqrt(
     np.mean(((robots[1] - robots[0]) / np.asarray([v.scale for v in env.spec.obs])) ** 2, -1)
   )
-  return certificate.Certificate(
+  return certificate.Certificate(  # type: ignore[call-arg]
     env.spec.name,
     preset,
     "preset",
@@ -195,7 +203,7 @@ def become(env, other, preset: str, onset: int = 25, seed: int = 0) -> certifica
     not at.size,
     first is not None and first < 0,
     first,
-    *(float(size[k - 1]) for k in certificate.AFTER),
+    *(float(size[k - 1]) for k in certificate.AFTER),  # type: ignore[arg-type]
     None,
     "",
     bool(np.isfinite(robots).all()),
@@ -208,7 +216,7 @@ def certify(
   episodes: int = 20,
   agent: str | None = None,
   only: tuple[str, ...] = (),
-  progress=lambda text: None,
+  progress: Callable[[str], Any] = lambda text: None,
 ) -> list[dict]:
   """Certificates of one robot as rows of results/certificates.parquet.
 
@@ -248,7 +256,7 @@ def certify(
       row |= found.get(certificate.Lane(row["fault"], row["target"], row["severity"]), {})
   for preset in moves:
     progress(f"{name}: {preset}")
-    other = envs.make(presets.PRESETS[preset].becomes, physics)
+    other = envs.make(presets.PRESETS[preset].becomes, physics)  # type: ignore[arg-type]
     row = become(env, other, preset)._asdict() | unknown
     if trained:
       whole = [
@@ -262,7 +270,9 @@ def certify(
   return rows
 
 
-def price(trained, nominal: tuple, own: tuple) -> dict:
+def price(
+  trained: agents.Trained, nominal: Sequence[np.ndarray], own: Sequence[np.ndarray]
+) -> dict:
   """Columns of what a lane costs; of each life the returns (episodes,) and the residuals (samples,
   2). Lost: nominal minus own, paired by episode.
   """
@@ -280,13 +290,16 @@ def price(trained, nominal: tuple, own: tuple) -> dict:
   }
 
 
-def costs(env, trained, faults: dict, episodes: int, progress) -> dict[certificate.Lane, dict]:
+def costs(
+  env: Any, trained: agents.Trained, faults: dict, episodes: int, progress: Callable[[str], Any]
+) -> dict[certificate.Lane, dict]:
   """Columns of `price` for every lane above severity 0."""
   cost, first = Cost(env, trained, faults, episodes), next(iter(faults))
   chosen = [certificate.Lane(first, faults[first].targets[0], 0.0)]  # the nominal robot
   chosen += [
     lane for lane in certificate.lanes(faults, targets=False) if lane.severity > 0
   ] + certificate.preset_lanes(env, faults)
+  found: dict[certificate.Lane, dict]
   at_once, found = max(2, AT_ONCE // episodes), {}
   nominal = None
   for i in range(0, len(chosen), at_once):
@@ -298,7 +311,7 @@ def costs(env, trained, faults: dict, episodes: int, progress) -> dict[certifica
   return found
 
 
-def old_rows(folder) -> list[dict]:
+def old_rows(folder: pathlib.Path | str) -> list[dict]:
   """Rows of certificates.parquet in `folder`, [] where there is none; FileError for one that is no
   such table or a folder that cannot be written.
   """
@@ -326,7 +339,7 @@ def old_rows(folder) -> list[dict]:
   return rows
 
 
-def guard(folder, names: tuple[str, ...], episodes: int) -> None:
+def guard(folder: pathlib.Path | str, names: tuple[str, ...], episodes: int) -> None:
   """Refuses what would lose measured costs, before anything is measured."""
   costly = {r["robot"] for r in old_rows(folder) if r["episodes"]} & {
     envs.make(name).spec.name if ":" in name else name for name in names
@@ -338,7 +351,7 @@ def guard(folder, names: tuple[str, ...], episodes: int) -> None:
     )
 
 
-def write(folder, rows: list[dict]) -> None:
+def write(folder: pathlib.Path | str, rows: list[dict]) -> None:
   """Writes certificates.parquet and certificates.md; rows of other robots, faults and backends that
   are there already are kept.
   """
@@ -383,7 +396,7 @@ def table(rows: list[dict]) -> str:
       and r["fault"] != "none"
       and r["severity"] > 0
     ]
-    top = {}
+    top: dict[tuple[str, str], dict] = {}
     for r in mine:
       key = (r["fault"], r["target"])
       if key not in top or r["severity"] > top[key]["severity"]:

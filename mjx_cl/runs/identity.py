@@ -8,6 +8,7 @@ import dataclasses
 import hashlib
 import json
 import pathlib
+from typing import TYPE_CHECKING
 
 from mjx_cl import detectors, envs
 from mjx_cl.adapt.arms import ARMS
@@ -18,8 +19,11 @@ from mjx_cl.io import folders, plugins, tables
 from mjx_cl.scoring import stop_rule
 from mjx_cl.training import agents
 
+if TYPE_CHECKING:
+  from typing import Any
 
-def arm_agents(config: RunConfig, env) -> dict[str, agents.Trained]:
+
+def arm_agents(config: RunConfig, env: Any) -> dict[str, agents.Trained]:
   """Arm -> its own agent, of the arms that bring one: the run's with the arm's word behind its
   name, or beside the folder that --agent gives.
 
@@ -45,7 +49,7 @@ def arm_agents(config: RunConfig, env) -> dict[str, agents.Trained]:
   return out
 
 
-def known_as(env) -> str:
+def known_as(env: Any) -> str:
   """The robot whose agents and figures `env` takes: its own name, or that of the one that it is
   another fidelity of.
   """

@@ -14,6 +14,7 @@ from __future__ import annotations
 import functools
 import pathlib
 import shutil
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pyarrow
@@ -30,6 +31,9 @@ from mjx_cl.runs.identity import arm_agents, differing, identity
 from mjx_cl.scoring import events
 from mjx_cl.scoring import stop_rule as stop
 from mjx_cl.training import agents
+
+if TYPE_CHECKING:
+  from collections.abc import Iterable
 
 ORDER = {
   "trace": "step",
@@ -64,7 +68,7 @@ SUMMED = (
 )  # what `join` takes from summary.json
 
 
-def differs(folder, config: RunConfig, but: tuple[str, ...] = ()) -> str | None:
+def differs(folder: pathlib.Path | str, config: RunConfig, but: tuple[str, ...] = ()) -> str | None:
   """How the run in `folder` differs from `config`, as the rest of a line that begins with it; None
   where it does not, or there is none.
 
@@ -119,7 +123,9 @@ def cards(config: RunConfig) -> dict[str, dict]:
 
 
 @functools.lru_cache(maxsize=64)
-def _cards(env_name, agent, arms, written) -> dict[str, dict]:
+def _cards(
+  env_name: str, agent: str | None, arms: tuple[str, ...], written: int | None
+) -> dict[str, dict]:
   """written: when the card of an agent by folder was; it stands for its content."""
   try:
     env = envs.make(env_name, "auto")
@@ -134,7 +140,7 @@ def _cards(env_name, agent, arms, written) -> dict[str, dict]:
     return {}
 
 
-def seeds_of(folder, config: RunConfig) -> list[int] | None:
+def seeds_of(folder: pathlib.Path | str, config: RunConfig) -> list[int] | None:
   """Seeds of the finished run in `folder` if it is `config` but for its seeds; None where there is
   no finished run.
 
@@ -149,7 +155,7 @@ def seeds_of(folder, config: RunConfig) -> list[int] | None:
   return list(_seeds(folder, store.read_json(folder / "config.json")))
 
 
-def _seeds(folder, values: dict) -> range:
+def _seeds(folder: pathlib.Path, values: dict) -> range:
   """Seeds of a run by its config.json, `values`."""
   try:
     return range(values["first_seed"], values["first_seed"] + values["seeds"])
@@ -157,7 +163,7 @@ def _seeds(folder, values: dict) -> range:
     raise FileError(f"{folder / 'config.json'} is not a run's: it does not say its seeds") from None
 
 
-def choose(folders, config: RunConfig) -> list[pathlib.Path]:
+def choose(folders: Iterable[pathlib.Path | str], config: RunConfig) -> list[pathlib.Path]:
   """Of `folders` those whose seeds make up the seeds of `config`, in the order of their seeds;
   empty where none of them holds any.
 
@@ -189,10 +195,10 @@ def choose(folders, config: RunConfig) -> list[pathlib.Path]:
       f"missing with --first-seed {missing[0]} --seeds N and "
       "another --out, or ask for fewer --seeds"
     )
-  return sorted(begins, key=begins.get)
+  return sorted(begins, key=begins.get)  # type: ignore[arg-type]
 
 
-def join(folders, out, config: RunConfig) -> dict:
+def join(folders: Iterable[pathlib.Path], out: pathlib.Path | str, config: RunConfig) -> dict:
   """Writes the run of all seeds of `folders` into the folder `out` and returns summary.json's
   value.
 
@@ -304,7 +310,9 @@ def copy_agents(folder: pathlib.Path, out: pathlib.Path) -> None:
     shutil.copytree(folder / "agents", out / "agents", dirs_exist_ok=True)
 
 
-def joined(tables, number: dict[tuple[str, int], int], key: str):
+def joined(
+  tables: list[pyarrow.Table], number: dict[tuple[str, int], int], key: str
+) -> pyarrow.Table:
   """Pyarrow Tables one below the other, `stream` counted anew, ordered by stream and `key`. A
   column that a piece lacks is null there.
   """

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import pathlib
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -24,6 +24,11 @@ from mjx_cl.scoring import alarms as alarm_score
 from mjx_cl.scoring import intervals, recovery
 from mjx_cl.types import Spec
 
+if TYPE_CHECKING:
+  from typing import Any
+
+  from mjx_cl.faults.presets import Change
+
 # by decision: what a stream has come to
 OUTCOMES = {
   "stop": "converged",
@@ -35,7 +40,7 @@ OUTCOMES = {
 }
 
 
-def acts(change) -> bool:
+def acts(change: Change) -> bool:
   """Whether a change of the robot is one: a fault of a severity above 0."""
   return change.fault != "none" and change.severity > 0
 
@@ -82,7 +87,7 @@ class Ledger(NamedTuple):
           out[step] = kind
     return dict(sorted(out.items()))
 
-  def trace(self, trace) -> dict:
+  def trace(self, trace: dict[str, np.ndarray]) -> dict:
     """Columns of trace.parquet, stream by stream."""
     steps, groups = trace["reward"].shape
     flat = lambda x: np.ascontiguousarray(x.T).reshape(-1)
@@ -123,7 +128,7 @@ class Ledger(NamedTuple):
       table[column_name] = flat(values)
     return table | {"updates": flat(trace["updates"])}
 
-  def signals(self, trace) -> dict:
+  def signals(self, trace: dict[str, np.ndarray]) -> dict:
     """Per chunk what the stop rule read: the six signals, posture and the levels asked for."""
     chunks, groups = trace["decision"].shape
     flat = lambda x: np.ascontiguousarray(x.T).reshape(-1)
@@ -143,14 +148,21 @@ class Ledger(NamedTuple):
       "least_posture": np.full(chunks * groups, least, np.float32),
     }
 
-  def events(self, trace) -> list[dict]:
+  def events(self, trace: dict[str, np.ndarray]) -> list[dict]:
     """Every onset, alarm, start, stop, abort, rollback and repair, with its reason."""
     c, events = self.config, []
     for g, ((arm, seed), onset) in enumerate(zip(self.labels, self.onsets)):
       healthy = "on a healthy robot" if onset is None else "before onset"
       onset, trigger = c.steps if onset is None else onset, ARMS[arm].trigger
 
-      def add(step, kind, reason, cause=None, decision=None, since=None):
+      def add(
+        step: int | np.integer,
+        kind: str,
+        reason: str,
+        cause: str | None = None,
+        decision: str | None = None,
+        since: int | None = None,
+      ) -> None:
         events.append(
           {
             "stream": g,
@@ -205,7 +217,7 @@ class Ledger(NamedTuple):
             why = "arm does not adapt" if trigger is NEVER else "arm does not listen"
           add(step, "alarm", f"logged, not acted on: {why}" + false, why)
       for i in np.flatnonzero(decisions):
-        end = min((i + 1) * self.chunk_steps, c.steps) - 1
+        end = min((i + 1) * self.chunk_steps, c.steps) - 1  # type: ignore[operator]
         decision = int(decisions[i])
         kind = {phase_lib.START: "start", phase_lib.STOP: "stop", phase_lib.END: "stop"}.get(
           decision, "abort"
@@ -231,7 +243,7 @@ class Ledger(NamedTuple):
           )
     return sorted(events, key=lambda e: (e["stream"], e["step"]))
 
-  def rows(self, trace, events) -> list[dict]:
+  def rows(self, trace: dict[str, np.ndarray], events: list[dict]) -> list[dict]:
     """One row per stream and change, in order: the first change's row holds the stream from its
     start up to the next change, see `later`.
     """
@@ -325,7 +337,14 @@ class Ledger(NamedTuple):
         )
     return set_apart(rows, events)
 
-  def summary(self, rows, trace, seconds, quiet, chunks) -> dict:
+  def summary(
+    self,
+    rows: list[dict],
+    trace: dict[str, np.ndarray],
+    seconds: dict[str, float],
+    quiet: list[float],
+    chunks: int,
+  ) -> dict:
     """summary.json: per arm the aggregates, each with its interval; arm `detector` also at the top
     level.
 
@@ -336,7 +355,7 @@ class Ledger(NamedTuple):
     severity = (
       1.0 if self.becomes is not None else max(c.severity if acts(c) else 0.0 for c in self.changes)
     )
-    out = {
+    out: dict[str, Any] = {
       "env": self.config.env,
       "fault": self.config.fault,
       "severity": severity,
@@ -347,8 +366,8 @@ class Ledger(NamedTuple):
     out |= by_arm(rows, self.config, self.spec.control_s)
     out["invalid_share"], out["invalid_share_ci"] = invalid(trace["valid"], self.repeat)
     wall = sum(seconds.values())
-    quiet = float(np.median(quiet)) if quiet else 0.0
-    monitor = min(seconds["digest"], quiet * max(1, chunks - 1))
+    quiet = float(np.median(quiet)) if quiet else 0.0  # type: ignore[assignment]
+    monitor: Any = min(seconds["digest"], quiet * max(1, chunks - 1))
     shares = {
       "physics": seconds["physics"],
       "acting": seconds["acting"],
@@ -370,7 +389,7 @@ def invalid(valid: np.ndarray, repeat: int) -> tuple[float | None, list | None]:
   """
   known = valid[15 * repeat :][repeat - 1 :: repeat]
   each = 1.0 - known.mean(0) if len(known) else []
-  return (float(np.mean(each)), intervals.interval(each, np.mean)) if len(each) else (None, None)
+  return (float(np.mean(each)), intervals.interval(each, np.mean)) if len(each) else (None, None)  # type: ignore[arg-type]
 
 
 def set_apart(rows: list[dict], events: list[dict]) -> list[dict]:
@@ -400,7 +419,7 @@ def set_apart(rows: list[dict], events: list[dict]) -> list[dict]:
   return out
 
 
-def rescore(folder) -> dict:
+def rescore(folder: pathlib.Path | str) -> dict:
   """Writes runs.parquet and summary.json of a finished run anew by today's definitions, as far as
   they follow from its rows and events: `adapting_at_onset` and what is kept apart by it, and every
   aggregate of the rows. Returns summary.json's value. For results of an earlier version; what a run
@@ -427,7 +446,7 @@ def rescore(folder) -> dict:
       }
     )
     run = RunConfig(
-      **{
+      **{  # type: ignore[arg-type]
         k: tuple(v) if k == "arms" else v
         for k, v in config.items()
         if k in own and k not in ("adapt", "physics")
@@ -472,10 +491,10 @@ def summarise(rows: list[dict], config: RunConfig, control_s: float) -> dict:
   ]
   out: dict = {"seeds": len(rows)}
 
-  def put(name, value, ci):
+  def put(name: str, value: float | None, ci: list[float] | None) -> None:
     out[name], out[name + "_ci"] = value, ci
 
-  def count(name, hits, n):
+  def count(name: str, hits: int, n: int) -> None:
     p = intervals.wilson(hits, n)
     put(name, hits, None if p is None else [p[0] * n, p[1] * n])
 
@@ -498,11 +517,11 @@ def summarise(rows: list[dict], config: RunConfig, control_s: float) -> dict:
     false / hours if hours else None,
     [x / hours for x in intervals.poisson(false)] if hours else None,
   )
-  median = lambda x: intervals.finite(intervals.censored_median(x)) if len(x) else None
+  median = lambda x: intervals.finite(intervals.censored_median(x)) if len(x) else None  # type: ignore[arg-type]
   put(
     "latency_median_steps",
     median(latency),
-    intervals.interval(latency, intervals.censored_median) if latency else None,
+    intervals.interval(latency, intervals.censored_median) if latency else None,  # type: ignore[arg-type]
   )
   put(
     "miss_probability",
@@ -525,14 +544,14 @@ def summarise(rows: list[dict], config: RunConfig, control_s: float) -> dict:
   put(
     "recovery_median_steps",
     median(back),
-    intervals.interval(back, intervals.censored_median) if len(back) > 1 else None,
+    intervals.interval(back, intervals.censored_median) if len(back) > 1 else None,  # type: ignore[arg-type]
   )
   for name in ("reward_pre", "reward_drop", "reward_final", "return_lost"):
     values = [r[name] for r in rows if r[name] is not None]
     put(
       name,
-      float(intervals.iqm(values)) if values else None,
-      intervals.interval(values) if values else None,
+      float(intervals.iqm(values)) if values else None,  # type: ignore[arg-type]
+      intervals.interval(values) if values else None,  # type: ignore[arg-type]
     )
   for name in (
     "return_lost_healthy",
@@ -544,12 +563,12 @@ def summarise(rows: list[dict], config: RunConfig, control_s: float) -> dict:
     put(
       f"{name}_mean",
       float(np.mean(values)) if values else None,
-      intervals.interval(values, np.mean) if values else None,
+      intervals.interval(values, np.mean) if values else None,  # type: ignore[arg-type]
     )
   values = [r["reward_final"] for r in affected]
   put(
     "reward_final_affected",
-    float(intervals.iqm(values)) if values else None,
-    intervals.interval(values) if values else None,
+    float(intervals.iqm(values)) if values else None,  # type: ignore[arg-type]
+    intervals.interval(values) if values else None,  # type: ignore[arg-type]
   )
   return out

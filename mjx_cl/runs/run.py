@@ -23,7 +23,7 @@ import pathlib
 import shutil
 import sys
 import time
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -58,6 +58,13 @@ from mjx_cl.scoring import stop_rule
 from mjx_cl.training import agents
 from mjx_cl.training import needs as bytes_of
 
+if TYPE_CHECKING:
+  from collections.abc import Callable
+  from typing import Any
+
+  from mjx_cl.adapt.loop import Digest
+  from mjx_cl.rollout.scan import Row
+
 
 class State(NamedTuple):
   """All arrays of a run: the robots and everything else, in blocks of streams, see crew.py."""
@@ -74,10 +81,10 @@ class Progress(NamedTuple):
   seconds: float
   arms: list[str]
   seeds: list[int]
-  phase: np.ndarray
-  reward: np.ndarray
+  phase: np.ndarray | jax.Array
+  reward: np.ndarray | jax.Array
   alarms: np.ndarray
-  updates: np.ndarray
+  updates: np.ndarray | jax.Array
   note: str = ""
 
 
@@ -105,12 +112,14 @@ class Runner:
   Another number of arms or seeds is another program, which rounds otherwise.
   """
 
-  def __init__(self, config: RunConfig, out, programs: Programs | None = None):
+  def __init__(
+    self, config: RunConfig, out: pathlib.Path | str, programs: Programs | None = None
+  ) -> None:
     self.config = config = check(config)
     self.out = pathlib.Path(out)
     self.env = envs.make(config.env, config.physics)
     self.other = (
-      envs.make(becomes(config), config.physics) if becomes(config) else None
+      envs.make(becomes(config), config.physics) if becomes(config) else None  # type: ignore[arg-type]
     )  # what the robot becomes
     self.robots = [self.env] + [self.other] * (self.other is not None)
     spec = self.env.spec
@@ -134,8 +143,11 @@ class Runner:
     settings = config.settings | ({"threshold": found.value} if found else {})
     detector = detectors.make(config.detector, **({"robot": robot} | settings))
     monitor = Monitor(agent, n=15, form=config.form, actions=config.actions, spec=spec)
+    begin: Callable[[jax.Array, jax.Array], Any]
     if self.other is None:
-      self.rollout = Rollout(self.env, agent, self.faults, self.repeat, config.deterministic)
+      self.rollout: Rollout | Transfer = Rollout(
+        self.env, agent, self.faults, self.repeat, config.deterministic
+      )
       begin = lambda k, breaks: start(
         self.env, agent, self.faults, k, target=target, plan=spared(plan, breaks)
       )
@@ -143,7 +155,7 @@ class Runner:
       self.rollout = Transfer(
         self.env, self.other, agent, self.faults, self.repeat, config.deterministic
       )
-      begin = lambda k, breaks: self.rollout.start(
+      begin = lambda k, breaks: self.rollout.start(  # type: ignore[union-attr]
         k, target, spared(plan, breaks), jnp.where(breaks, config.onset, FOREVER)
       )
     self.chunk_steps = CHUNK * self.repeat
@@ -207,10 +219,10 @@ class Runner:
     self.seconds = {"physics": 0.0, "acting": 0.0, "digest": 0.0, "other": 0.0}
     self.quiet: list[float] = []  # digest time of chunks without an update
     self.parts: list[dict] = []
-    self.stream_seconds = np.zeros(self.groups)
-    self._updates = np.zeros(self.groups, int)
-    self._alarms = np.zeros(self.groups, int)
-    self._phase = np.zeros(self.groups, int)
+    self.stream_seconds: np.ndarray = np.zeros(self.groups)
+    self._updates: np.ndarray | jax.Array = np.zeros(self.groups, int)
+    self._alarms: np.ndarray = np.zeros(self.groups, int)
+    self._phase: np.ndarray | jax.Array = np.zeros(self.groups, int)
     self.work = self.out / "work"
     self.endless = any(never_stops(ARMS[arm]) for arm in config.arms)
     self.snapshots = (
@@ -280,7 +292,7 @@ class Runner:
       if self.quiet and updates.sum()
       else 0.0
     )
-    self.stream_seconds += (digested - begin - learning) / self.groups + learning * updates / max(
+    self.stream_seconds += (digested - begin - learning) / self.groups + learning * updates / max(  # type: ignore[operator]
       1, updates.sum()
     )
     self.seconds["other"] += time.perf_counter() - digested
@@ -297,7 +309,7 @@ class Runner:
       digest.updates,
     )
 
-  def _notice_failures(self, digest, now: int) -> None:
+  def _notice_failures(self, digest: Digest, now: int) -> None:
     """Says which streams are given up for a loss at fault; they live on without learning. A reward
     that is no number would spoil every figure: that ends the run.
     """
@@ -328,19 +340,19 @@ class Runner:
     }  # robots of one model share a host
     return sum(getattr(p, "seconds", 0.0) for p in clocks.values())
 
-  def _acceptance(self, streams, now: int):
+  def _acceptance(self, streams: Stream | Moving, now: int) -> jax.Array | None:
     """Level (groups,) of the robot that each stream has after `now` control steps; None where
     robots stay what they are.
     """
     if self.other is None:
       return None
     return jnp.where(
-      streams.after.enter[:, 0] < now,
+      streams.after.enter[:, 0] < now,  # type: ignore[union-attr]
       jnp.float32(self.other.spec.acceptance),
       jnp.float32(self.env.spec.acceptance),
     )
 
-  def _choices(self, streams) -> Choices:
+  def _choices(self, streams: Stream | Moving) -> Choices:
     """The arms, with every true onset of their robots that is known by now; arms that are told one
     begin there even where the fault's severity is 0.
     """
@@ -349,7 +361,7 @@ class Runner:
     moves = (
       [()] * self.groups
       if self.other is None
-      else [(int(step),) for step in np.asarray(streams.after.enter)[:, 0]]
+      else [(int(step),) for step in np.asarray(streams.after.enter)[:, 0]]  # type: ignore[union-attr]
     )
     return choices(self.labels, c.adapt, c.steps, [own + onsets for own in moves], self.stops)
 
@@ -363,14 +375,16 @@ class Runner:
       return [self.config.onset if breaks and met else None for breaks in self.breaks]
     return [
       int(step) if step < self.config.steps else None
-      for step in np.asarray(self.state.streams.after.enter)[:, 0]
+      for step in np.asarray(self.state.streams.after.enter)[:, 0]  # type: ignore[union-attr]
     ]
 
-  def _log(self, rows, digest) -> None:
+  def _log(self, rows: Row, digest: Digest) -> None:
     """Keeps a chunk's rows, (control steps, groups), and its chunk values (groups,)."""
     control = lambda x: np.repeat(np.asarray(x)[:, :, 0], self.repeat, 0)
 
-    def at_end(x):  # a value per decision, known with its last control step
+    def at_end(
+      x: np.ndarray | jax.Array,
+    ) -> np.ndarray:  # a value per decision, known with its last control step
       out = np.full((CHUNK, self.repeat) + x.shape[1:], np.nan, np.float32)
       out[:, -1] = x
       return out.reshape((-1,) + x.shape[1:])
@@ -400,7 +414,7 @@ class Runner:
       "since": digest.since[None],
       "settled": digest.settled[None],
       **(
-        {"back": digest.back[None], "earned": digest.earned[None], "earns": digest.earns[None]}
+        {"back": digest.back[None], "earned": digest.earned[None], "earns": digest.earns[None]}  # type: ignore[index]
         if digest.back is not None
         else {}
       ),
@@ -441,7 +455,9 @@ class Runner:
       "phase": self._phase.tolist(),
     }
     self.checkpoints.save(
-      number, State(self.state.streams, held(self.crew.join(self.state.loop))), meta
+      number,
+      State(self.state.streams, held(self.crew.join(self.state.loop))),  # type: ignore[arg-type]
+      meta,
     )
     runtime.give_back()
     for old in sorted(self.work.glob("trace-*.npz"))[:-2]:
@@ -456,8 +472,8 @@ class Runner:
     """Goes on from the newest checkpoint; without one, from the start."""
     if self.checkpoints.latest() is None:
       return
-    like = State(self.state.streams, held(self.crew.shapes(self.state.loop)))
-    self.state = self.acting = (
+    like = State(self.state.streams, held(self.crew.shapes(self.state.loop)))  # type: ignore[arg-type]
+    self.state = self.acting = (  # type: ignore[assignment]
       None  # what the run began with need not lie beside what it goes on with
     )
     (streams, loop), meta = self.checkpoints.load(like)
@@ -465,7 +481,7 @@ class Runner:
     self.state = State(streams, self.crew.split(LoopState(**loop)))
     self.acting = self.crew.acting(self.state.loop, self.lanes)
     self.parts = [arrays.read(self.work / f"trace-{number:06d}.npz")]
-    self.done_chunks = number
+    self.done_chunks = number  # type: ignore[assignment]
     self.seconds, self.quiet, self.stream_seconds = (
       meta["seconds"],
       meta["quiet"],
@@ -500,7 +516,7 @@ class Runner:
       **runtime.provenance(),
     }
 
-  def finish(self, tell=lambda text: None) -> dict:
+  def finish(self, tell: Callable[[str], Any] = lambda text: None) -> dict:
     """Writes trace, events, runs, summary and figure, of an arm that never stops also signals,
     snapshots and stop; removes the working files.
 
@@ -515,7 +531,7 @@ class Runner:
     )  # the last chunk lives on to its end
     trace["decision"] = np.where(outside, phase_lib.NOTHING, trace["decision"])
     if self.other is None:
-      targets = np.asarray(self.state.streams.injection.target)[:, 0]  # (groups, F)
+      targets = np.asarray(self.state.streams.injection.target)[:, 0]  # type: ignore[union-attr]  # (groups, F)
       names = [
         "+".join(f"{f.name}:{f.targets[t]}" for f, t in zip(self.faults, row)) for row in targets
       ]
@@ -542,9 +558,11 @@ class Runner:
     summary = ledger.summary(runs, trace, self.seconds, self.quiet, self.done_chunks)
     taken = self.snapshots.taken(trace, self.chunk_steps) if self.snapshots else []
     if taken:
-      last = self.state.streams if self.other is None else self.state.streams.after
-      columns, summary["wall_s_snapshots"] = self.snapshots.evaluate(
-        taken, np.asarray(last.injection.target)[:, 0], tell
+      last = self.state.streams if self.other is None else self.state.streams.after  # type: ignore[union-attr]
+      columns, summary["wall_s_snapshots"] = self.snapshots.evaluate(  # type: ignore[union-attr]
+        taken,
+        np.asarray(last.injection.target)[:, 0],  # type: ignore[union-attr]
+        tell,
       )
       tables.write_table(self.out / "snapshots.parquet", columns)
       judged = stop_rule.of_folder(self.out)
@@ -571,7 +589,7 @@ class Runner:
       self.breaks,
       names,
       self.onsets(),
-      self._updates,
+      self._updates,  # type: ignore[arg-type]
       self.stream_seconds,
     )
 
@@ -619,19 +637,19 @@ class Runner:
         ) from None
 
 
-def spared(plan: faults.Plan, breaks) -> faults.Plan:
+def spared(plan: faults.Plan, breaks: jax.Array) -> faults.Plan:
   """`plan` for a robot that breaks, bool (); without any severity for one that does not."""
   return plan._replace(severity=jnp.where(breaks, plan.severity, 0.0))
 
 
 def execute(
   config: RunConfig,
-  out,
+  out: pathlib.Path | str,
   resume: bool = False,
   overwrite: bool = False,
-  progress=lambda p: None,
+  progress: Callable[[Progress], Any] = lambda p: None,
   save_every_s: float = 60.0,
-  tell=lambda text: None,
+  tell: Callable[[str], Any] = lambda text: None,
   programs: Programs | None = None,
 ) -> dict:
   """Runs `config` into `out` and returns summary.json's value. A kill at any moment loses at most

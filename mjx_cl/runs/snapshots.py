@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import pathlib
 import time
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +25,16 @@ from mjx_cl.io.interrupt import Interruptible
 from mjx_cl.keys import OfSeed
 from mjx_cl.rollout.scan import Rollout, nest, start
 from mjx_cl.training.episodes import Episodes
+
+if TYPE_CHECKING:
+  from collections.abc import Callable
+  from typing import Any
+
+  from mjx_cl.adapt.loop import Digest
+  from mjx_cl.config import RunConfig
+  from mjx_cl.dreamer.agent import Agent
+  from mjx_cl.faults.presets import Change
+  from mjx_cl.rollout.scan import Stream
 
 ACTS = ("enc", "dyn", "pol")  # of the parameters: what Agent.act reads
 EPISODES = 5
@@ -44,7 +54,14 @@ class Snapshot(NamedTuple):
   step: int
 
 
-def due(before, decision, since, now: int, length: int, every: int) -> np.ndarray:
+def due(
+  before: np.ndarray | jax.Array,
+  decision: np.ndarray | jax.Array,
+  since: np.ndarray | jax.Array,
+  now: int,
+  length: int,
+  every: int,
+) -> np.ndarray:
   """Streams of which a snapshot is taken after a chunk.
 
     one of since, since + every, since + 2 every, ...  lies in now - length .. now - 1, and the
@@ -77,7 +94,18 @@ class Snapshots:
     UserError where the run would take more than LIMIT_MIB of them.
   """
 
-  def __init__(self, config, env, agent, faults, changes, repeat: int, labels, params, folder):
+  def __init__(
+    self,
+    config: RunConfig,
+    env: Any,
+    agent: Agent,
+    faults: tuple[faults_lib.Fault, ...],
+    changes: tuple[Change, ...],
+    repeat: int,
+    labels: list[tuple[str, int]],
+    params: Any,
+    folder: pathlib.Path | str,
+  ) -> None:
     self.config, self.env, self.agent, self.faults, self.changes, self.repeat = (
       config,
       env,
@@ -106,7 +134,15 @@ class Snapshots:
 
   # ---- while the run lives -----------------------------------------------------------------------
 
-  def take(self, acting, place, before, digest, now: int, length: int) -> None:
+  def take(
+    self,
+    acting: Any,
+    place: np.ndarray,
+    before: np.ndarray | jax.Array,
+    digest: Digest,
+    now: int,
+    length: int,
+  ) -> None:
     """Writes the snapshots that are due. acting: parameters, those of stream g at place[g]; digest:
     loop.Digest; the rest as in `due`.
     """
@@ -120,7 +156,7 @@ class Snapshots:
     for g in wanted:
       self._write(
         self._path(Snapshot(int(g), int(digest.since[g]), min(now, self.config.steps) - 1)),
-        {name: x[place[g]] for name, x in weights.items()},
+        {name: x[place[g]] for name, x in weights.items()},  # type: ignore[index]
       )
 
   def _path(self, s: Snapshot) -> pathlib.Path:
@@ -130,14 +166,14 @@ class Snapshots:
     folders.make(self.folder)
     arrays.write(path, values)
 
-  def _read(self, s: Snapshot):
+  def _read(self, s: Snapshot) -> Any:
     path = self._path(s)
     stored, like = arrays.read(path), arrays.named(self.like)
-    if {k: x.shape for k, x in stored.items()} != {k: x.shape for k, x in like.items()}:
+    if {k: x.shape for k, x in stored.items()} != {k: x.shape for k, x in like.items()}:  # type: ignore[attr-defined]
       raise FileError(f"snapshot {path} belongs to another size or robot")
     return jax.tree.unflatten(jax.tree.structure(self.like), [stored[k] for k in like])
 
-  def taken(self, trace, length: int) -> list[Snapshot]:
+  def taken(self, trace: dict[str, np.ndarray], length: int) -> list[Snapshot]:
     """All snapshots of a run, from its trace: `phase` (steps, groups), `decision`, `since` (chunks,
     groups); no other file counts.
     """
@@ -171,7 +207,10 @@ class Snapshots:
     ]
 
   def evaluate(
-    self, wanted: list[Snapshot], targets, tell=lambda text: None
+    self,
+    wanted: list[Snapshot],
+    targets: np.ndarray,
+    tell: Callable[[str], Any] = lambda text: None,
   ) -> tuple[dict[str, np.ndarray], float]:
     """Lives EPISODES episodes with each snapshot: weights frozen, the stream's own fault in full
     force from step 0, whatever its schedule.
@@ -214,7 +253,9 @@ class Snapshots:
     returns, steps = (np.concatenate([p[k] for p in parts]) for k in ("returns", "steps"))
     return self._columns(wanted, returns, steps), float(sum(p["seconds"] for p in parts))
 
-  def _columns(self, wanted, returns, steps) -> dict[str, np.ndarray]:
+  def _columns(
+    self, wanted: list[Snapshot], returns: np.ndarray, steps: np.ndarray
+  ) -> dict[str, np.ndarray]:
     stream, since, step = np.array(wanted).T
     return {
       "stream": stream.astype(np.int32),
@@ -227,7 +268,7 @@ class Snapshots:
       **{f"return_{i}": returns[:, i] for i in range(EPISODES)},
     }
 
-  def _program(self):
+  def _program(self) -> tuple[Callable[..., Stream], Rollout]:
     begin = lambda key, target, severity: start(
       self.env, self.agent, self.faults, key, target=target, plan=faults_lib.plan(severity)
     )
@@ -235,7 +276,13 @@ class Snapshots:
       self.env, self.agent, self.faults, self.repeat, self.config.deterministic
     )
 
-  def _live(self, program, batch, targets, interrupt):
+  def _live(
+    self,
+    program: tuple[Callable[..., Stream], Rollout],
+    batch: list[Snapshot],
+    targets: np.ndarray,
+    interrupt: Interruptible,
+  ) -> tuple[np.ndarray, np.ndarray]:
     """Returns and control steps of one episode per key, float64 and int (snapshots, EPISODES)."""
     begin, rollout = program
     params = jax.tree.map(lambda *x: jnp.stack(x), *map(self._read, batch))

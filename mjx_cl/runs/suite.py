@@ -29,7 +29,7 @@ import shutil
 import time
 import tomllib
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -48,6 +48,10 @@ from mjx_cl.runs.identity import arm_agents
 from mjx_cl.runs.records import acts
 from mjx_cl.scoring import normalised_recovery, stop_rule, survival
 from mjx_cl.training import agents, needs
+
+if TYPE_CHECKING:
+  from collections.abc import Collection, Iterable, Iterator, Sequence
+  from typing import Any
 
 SUITES = pathlib.Path(__file__).parent / "suites"
 PUBLISHED = (
@@ -190,7 +194,9 @@ def grid(where: str, name: str, values: dict) -> list[Part]:
   for table in ("adapt", "settings"):
     if not isinstance(values.get(table, {}), dict):
       raise UserError(f"{where}: {table} is a table of settings; got {values[table]!r}")
-  lists = [((k,), v) for k, v in values.items() if isinstance(v, list) and k != "arms"]
+  lists: list[tuple[tuple[str, ...], list]] = [
+    ((k,), v) for k, v in values.items() if isinstance(v, list) and k != "arms"
+  ]
   lists += [(("adapt", k), v) for k, v in values.get("adapt", {}).items() if isinstance(v, list)]
   for path, choices in lists:
     if not choices:
@@ -243,7 +249,7 @@ def config(where: str, values: dict) -> RunConfig:
     raise UserError(f"{where}: a value of the wrong kind ({e})") from None
 
 
-def check_kinds(where: str, of, values, before: str = "") -> None:
+def check_kinds(where: str, of: type, values: dict, before: str = "") -> None:
   """Raises UserError where a setting of the dataclass `of` has a value of another kind than its
   annotation says.
   """
@@ -280,6 +286,7 @@ def finetunings(
   """
   own, faulty = ARMS[arm], [change for change in changes(config) if change.fault != "none"]
   first = [config.onset] * (becomes(config) is not None)
+  starts: Sequence[int]
   if not own.breaks:
     starts = []
   elif own.trigger.listens:
@@ -313,7 +320,7 @@ def finetunings(
 class Robots:
   """What the parts of a plan share, each built once."""
 
-  def __init__(self):
+  def __init__(self) -> None:
     self.make = functools.cache(envs.make)
     self.learner = functools.cache(
       lambda name, agent: agents.of(self.make(name, "auto"), agent).agent.config
@@ -368,7 +375,7 @@ def estimate(part: Part, rate: float, robots: Robots | None = None) -> Estimate:
   )
 
 
-def estimates(parts, robots: Robots | None = None) -> dict[str, Estimate]:
+def estimates(parts: Iterable[Part], robots: Robots | None = None) -> dict[str, Estimate]:
   """Part -> Estimate on this machine."""
   rate, robots = matmul_rate(), robots or Robots()
   return {p.name: estimate(p, rate, robots) for p in parts}
@@ -389,7 +396,7 @@ def check(part: Part, robots: Robots | None = None) -> None:
     raise type(e)(f"part {part.name}: {e}") from None
 
 
-def notes(parts) -> list[tuple[str, str]]:
+def notes(parts: Iterable[Part]) -> list[tuple[str, str]]:
   """What `mjx-cl run` would say of these parts' settings before it starts (doubts.py),
   each with the parts that it holds for.
   """
@@ -424,7 +431,7 @@ def _complete(folder: pathlib.Path) -> bool:
   return (folder / "config.json").exists() and (folder / "summary.json").exists()
 
 
-def standing(out, parts) -> tuple[list[Part], dict[str, str]]:
+def standing(out: pathlib.Path | str, parts: Iterable[Part]) -> tuple[list[Part], dict[str, str]]:
   """What OUT holds of the parts: those that are finished, and name -> why, in a few words, of those
   that it holds with other settings.
   """
@@ -466,7 +473,10 @@ def pick(
 
 
 def offers(
-  out, parts, folders, tell: Callable[[str], None] = lambda text: None
+  out: pathlib.Path,
+  parts: Iterable[Part],
+  folders: Collection[pathlib.Path | str],
+  tell: Callable[[str], None] = lambda text: None,
 ) -> dict[str, list[pathlib.Path]]:
   """Part -> folders that its run can be taken from, of those that are not finished in OUT: one, or
   several whose seeds are to be joined, see pieces.py.
@@ -498,7 +508,7 @@ def offers(
   return found
 
 
-def take(out, parts, found: dict[str, list[pathlib.Path]]) -> None:
+def take(out: pathlib.Path, parts: Iterable[Part], found: dict[str, list[pathlib.Path]]) -> None:
   """Copies to OUT, or joins there, what `offers` has found of the parts."""
   for part in parts:
     if not (sources := found.get(part.name)):
@@ -522,7 +532,7 @@ def part_seeds(part: Part) -> list[int]:
   return list(range(part.config.first_seed, part.config.first_seed + part.config.seeds))
 
 
-def publish(out, plan: Suite, to) -> list[str]:
+def publish(out: pathlib.Path | str, plan: Suite, to: pathlib.Path | str) -> list[str]:
   """Copies the finished parts' small files, all but the trace, to the folder `to`, as they are
   committed, and writes there what `collect` does of them and of the parts that lie there already
   and OUT lacks, which stay as they are; returns the names of those copied.
@@ -539,7 +549,7 @@ def publish(out, plan: Suite, to) -> list[str]:
       if (out / part.name / name).exists():
         folders.atomic(
           to / part.name / name,
-          lambda file, source=out / part.name / name: file.write(source.read_bytes()),
+          lambda file, source=out / part.name / name: file.write(source.read_bytes()),  # type: ignore[misc]
         )
       else:  # of an earlier run, as the figure where seeds were joined without their traces
         (to / part.name / name).unlink(missing_ok=True)
@@ -559,7 +569,7 @@ def publish(out, plan: Suite, to) -> list[str]:
   return [p.name for p in done]
 
 
-def earlier(to, plan: Suite) -> dict[str, tuple[Part, dict]]:
+def earlier(to: pathlib.Path | str, plan: Suite) -> dict[str, tuple[Part, dict]]:
   """Name -> the part and its scores, of what was published in the folder `to` before.
 
   Raises:
@@ -598,7 +608,7 @@ PATIENCES = (
 )  # chunks over which signals must be settled, of the stop rule without its floor
 
 
-def scores(folder) -> dict:
+def scores(folder: pathlib.Path) -> dict:
   """What several arms of one finished part say together.
 
   Returns:
@@ -617,7 +627,7 @@ def scores(folder) -> dict:
   config, rows = tables.read_json(folder / "config.json"), tables.read_rows(folder / "runs.parquet")
   arms, watched = config["arms"], survival.watched(rows, config["steps"])
   scored = normalised_recovery.rows(rows) if "none" in arms else []
-  out = {
+  out: dict[str, Any] = {
     "normalised": normalised_recovery.summarise(scored) or None,
     "against_oracle": None,
     "recovery": {},
@@ -645,10 +655,10 @@ def scores(folder) -> dict:
     )
     median, median_ci = survival.quantile(survival.kaplan_meier(time_, seen))
     enough = len(seen) > 3  # three streams or fewer give no interval
-    horizon = min(
+    horizon = min(  # type: ignore[type-var]
       HORIZON, *(w for w, r in zip(watched, rows) if not r["change"] and r["onset"] is not None)
     )
-    mean, mean_ci = survival.restricted_mean(time_, seen, horizon) if horizon > 0 else (None, None)
+    mean, mean_ci = survival.restricted_mean(time_, seen, horizon) if horizon > 0 else (None, None)  # type: ignore[arg-type, operator]
     out["recovery"][arm] = {
       "n": len(seen),
       "recovered": int(seen.sum()),
@@ -674,7 +684,12 @@ def collect(
   """
   known = {} if known is None else known
   columns: dict[str, list] = {}
-  value = {"suite": plan.name, "parts": len(plan.parts), "finished": 0, "entries": {}}
+  value: dict[str, Any] = {
+    "suite": plan.name,
+    "parts": len(plan.parts),
+    "finished": 0,
+    "entries": {},
+  }
   there = {p.name for p in standing(out, [p for p in plan.parts if p.name not in kept])[0]} | kept
   for part in plan.parts:
     if part.name not in there:
@@ -697,7 +712,7 @@ def collect(
       }
       | rows
     ).items():
-      columns.setdefault(name, [None] * before).extend(cells)
+      columns.setdefault(name, [None] * before).extend(cells)  # type: ignore[arg-type]
     for cells in columns.values():
       cells.extend([None] * (before + count - len(cells)))
   if columns:
@@ -707,7 +722,7 @@ def collect(
   return value
 
 
-def draw(out, plan: Suite, value: dict) -> list[pathlib.Path]:
+def draw(out: pathlib.Path, plan: Suite, value: dict) -> list[pathlib.Path]:
   """OUT/recovery.png and OUT/ratio.png, as far as there is something to draw, from the rows of
   OUT's parts and what bench.json holds, `value`. Returns the files.
   """
@@ -724,7 +739,7 @@ def draw(out, plan: Suite, value: dict) -> list[pathlib.Path]:
   ]
 
 
-def redraw(results) -> list[pathlib.Path]:
+def redraw(results: pathlib.Path | str) -> list[pathlib.Path]:
   """The figures of every suite that is published in a subfolder of `results`, drawn anew from its
   files. Returns them.
 
@@ -783,7 +798,7 @@ def _points(part: Part, scores_: dict) -> list[dict]:
   ]
 
 
-def write_plan(plan: Suite, out) -> None:
+def write_plan(plan: Suite, out: pathlib.Path | str) -> None:
   """OUT/suite.json: name and the resolved settings of every part."""
   out = pathlib.Path(out)
   out.mkdir(parents=True, exist_ok=True)
@@ -797,18 +812,19 @@ def write_plan(plan: Suite, out) -> None:
 
 
 @contextlib.contextmanager
-def _silent():
+def _silent() -> Iterator[Callable[[run.Progress], Any]]:
   """A display that shows nothing."""
   yield lambda progress: None
 
 
 def execute(
   plan: Suite,
-  out,
-  parts,
+  out: pathlib.Path | str,
+  parts: Iterable[Part],
   estimates: dict[str, Estimate] | None = None,
   tell: Callable[[str], None] = lambda text: None,
-  display=None,
+  display: Callable[[], contextlib.AbstractContextManager[Callable[[run.Progress], Any]]]
+  | None = None,
   save_every_s: float = 60.0,
   jobs: int = 1,
   worker: str = "",
@@ -833,9 +849,11 @@ def execute(
     names = [p.name for p in todo]
     if estimates:
       names.sort(key=lambda name: -estimates[name].seconds)
+    over: list[str]
+    known: dict[str, dict]
     over, known, begin = [], {}, time.monotonic()
 
-    def end(name):
+    def end(name: str) -> None:
       over.append(name)
       collect(out, plan, known)
       left = ""

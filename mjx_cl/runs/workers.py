@@ -68,7 +68,7 @@ class Worker:
     share: int,
     own: list[int],
     tell: Callable[[str], None],
-  ):
+  ) -> None:
     self.name, self.share, self.last = name, share, ""
     command = [sys.executable, "-m", module, str(out), name, ",".join(map(str, own))]
     # a session of its own: Ctrl-C reaches the parent alone, which then closes the input
@@ -82,8 +82,8 @@ class Worker:
       start_new_session=True,
     )
 
-    def listen():
-      for line in self.process.stderr:
+    def listen() -> None:
+      for line in self.process.stderr:  # type: ignore[union-attr]
         if line.strip():
           self.last = line.strip()
           # where nobody listens any more a full pipe would stop the worker
@@ -103,7 +103,7 @@ class Worker:
     if code is None:
       return False
     self.listener.join()
-    self.process.stdin.close()
+    self.process.stdin.close()  # type: ignore[union-attr]
     if code < 0:
       raise FileError(
         f"part {self.name} was ended by signal {-code}; where memory ran out, --jobs 1 needs "
@@ -140,6 +140,8 @@ def together(
     UserError, FileError as soon as one fails; KeyboardInterrupt on a signal. Before either is
     raised the others have saved what they had lived and ended.
   """
+  waiting: list[str]
+  running: list[Worker]
   out, waiting, running = pathlib.Path(out), list(names), []
   all_cores = cores()
   free = list(range(jobs))
@@ -159,6 +161,6 @@ def together(
   finally:
     running = [worker for worker in running if worker.process.poll() is None]
     for worker in running:  # all at once, then wait for all
-      worker.process.stdin.close()
+      worker.process.stdin.close()  # type: ignore[union-attr]
     for worker in running:
       worker.process.wait()
