@@ -31,7 +31,7 @@ print(json.dumps([{"name": w, "value": VALUE} for w in words if w != "--resume"]
 
 @pytest.fixture(scope="module")
 def reference():
-  file = pathlib.Path(__file__).parent.parent / "benchmarks" / "reference.py"
+  file = pathlib.Path(__file__).parents[2] / "benchmarks" / "reference.py"
   spec = importlib.util.spec_from_file_location("benchmark_reference", file)
   module = importlib.util.module_from_spec(spec)
   spec.loader.exec_module(module)
