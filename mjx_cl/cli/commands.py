@@ -39,7 +39,7 @@ from mjx_cl.config import (
 from mjx_cl.errors import FileError, UserError, choose
 
 if TYPE_CHECKING:
-  from mjx_cl.cli.app import (
+  from mjx_cl.cli.flags import (
     Bench,
     Certify,
     Detect,

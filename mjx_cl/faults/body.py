@@ -1,5 +1,5 @@
 """Faults of the body: masses, where they sit, joints. Masses bring their derived constants
-(mj_setConst, physics.DERIVING).
+(mj_setConst, physics.fields).
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ from mjx_cl.scoring import limits, metrics
 from mjx_cl.scoring import thresholds as healthy
 
 if TYPE_CHECKING:
-  from mjx_cl.leaderboard.score import Data
+  from mjx_cl.leaderboard.streams import Data
   from mjx_cl.rollout.monitor import Residual
 
 ORDER = 8  # of the autoregressions

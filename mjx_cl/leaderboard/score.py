@@ -26,7 +26,7 @@ from mjx_cl.errors import FileError, UserError, choose
 from mjx_cl.io import tables
 from mjx_cl.leaderboard import oracle as oracles
 from mjx_cl.leaderboard import page, sweep
-from mjx_cl.leaderboard.streams import Streams, StreamSet
+from mjx_cl.leaderboard.streams import Data, StreamSet
 from mjx_cl.rollout.monitor import CHANNELS
 from mjx_cl.scoring import limits, metrics, thresholds
 
@@ -86,31 +86,6 @@ class Found(NamedTuple):
   score: np.ndarray
   us_per_sample: float | None
   curve: list[dict]
-
-
-class Data(NamedTuple):
-  """The streams of one robot. tune, score: healthy ones of either split. fault: of the seeds that
-  score; its labels are per stream.
-  """
-
-  robot: str
-  tune: Streams
-  score: Streams
-  fault: Streams
-  count_from: int
-  arl0: float
-  horizon_s: float
-
-  @property
-  def horizon(self) -> int:
-    """Control steps after an onset in which an alarm counts."""
-    return metrics.steps_in(self.horizon_s, self.fault.control_s)
-
-  def own(self, key: tuple[str, float]) -> np.ndarray:
-    """Columns of `fault` with this fault and severity, seed by seed as in `score`."""
-    return np.flatnonzero(
-      [f == key[0] and s == key[1] for f, s in zip(self.fault.fault, self.fault.severity)]
-    )
 
 
 def variants() -> dict[str, dict]:

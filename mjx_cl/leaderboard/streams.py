@@ -25,6 +25,7 @@ import numpy as np
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.io import tables
 from mjx_cl.rollout.monitor import CHANNELS, LATENT, Residual
+from mjx_cl.scoring import metrics
 
 if TYPE_CHECKING:
   from collections.abc import Collection, Sequence
@@ -443,4 +444,29 @@ class StreamSet:
       m["target"][at].tolist(),
       m["severity"][at].astype(float),
       float(m["control_s"][at[0]]),
+    )
+
+
+class Data(NamedTuple):
+  """The streams of one robot. tune, score: healthy ones of either split. fault: of the seeds that
+  score; its labels are per stream.
+  """
+
+  robot: str
+  tune: Streams
+  score: Streams
+  fault: Streams
+  count_from: int
+  arl0: float
+  horizon_s: float
+
+  @property
+  def horizon(self) -> int:
+    """Control steps after an onset in which an alarm counts."""
+    return metrics.steps_in(self.horizon_s, self.fault.control_s)
+
+  def own(self, key: tuple[str, float]) -> np.ndarray:
+    """Columns of `fault` with this fault and severity, seed by seed as in `score`."""
+    return np.flatnonzero(
+      [f == key[0] and s == key[1] for f, s in zip(self.fault.fault, self.fault.severity)]
     )

@@ -19,9 +19,6 @@ written with `xp` alone and with `...` indices. `task` holds the leaves of types
 from mjx_cl.errors import UserError
 from mjx_cl.io import runtime
 
-# model fields after whose change MuJoCo asks for mj_setConst
-DERIVING = ("body_mass", "body_inertia", "body_ipos", "body_iquat", "dof_armature", "qpos0")
-
 
 def make(name: str, mj_model, substeps: int, outputs: tuple[str, ...] = ("qpos", "qvel"), law=None):
   """Builds a backend. `auto` is `runtime.default_physics()`."""

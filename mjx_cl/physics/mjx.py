@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from mjx_cl.errors import UserError
-from mjx_cl.physics import DERIVING
+from mjx_cl.physics.fields import DERIVING
 
 with contextlib.redirect_stdout(
   io.StringIO()

@@ -23,7 +23,8 @@ import mujoco
 import numpy as np
 
 from mjx_cl.errors import UserError
-from mjx_cl.physics import DERIVING, host_call
+from mjx_cl.physics import host_call
+from mjx_cl.physics.fields import DERIVING
 
 
 def float64_bits(x: jax.Array) -> jax.Array:
