@@ -115,7 +115,7 @@ def bocpd(
   )
   tail = run == last
 
-  def start(warm):
+  def start(warm: Warm) -> BocpdState:
     return BocpdState(
       warm,
       jnp.where(run == 0, 0.0, -jnp.inf).astype(jnp.float32),
@@ -126,7 +126,7 @@ def bocpd(
       jnp.int32(0),
     )
 
-  def update(state, x):
+  def update(state: BocpdState, x: jax.Array) -> tuple[BocpdState, Alarm]:
     warm, z, ready = standardise(state.warm, jnp.asarray(x, jnp.float32), warmup)
     z = jnp.clip(z, -FAR, FAR)
     k = jnp.where(tail, state.tail_kappa, k_fixed)
