@@ -108,7 +108,12 @@ def bocpd(
     warmup=(warmup, warmup == 0 or warmup >= 2, "0, or at least 2"),
   )
   run, last = np.arange(max_run), max_run - 1
-  k_fixed, a_fixed = np.float32(kappa + run), np.float32(alpha + run / 2)
+  k_fixed: np.ndarray
+  a_fixed: np.ndarray
+  k_fixed, a_fixed = (
+    np.float32(kappa + run),  # type: ignore[assignment]
+    np.float32(alpha + run / 2),  # type: ignore[assignment]
+  )
   g_fixed = np.array(
     [math.exp(math.lgamma(alpha + r / 2 + 0.5) - math.lgamma(alpha + r / 2)) for r in run],
     np.float32,
