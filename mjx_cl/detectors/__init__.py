@@ -8,7 +8,8 @@ import functools
 import inspect
 import json
 import pathlib
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 
@@ -41,7 +42,7 @@ from mjx_cl.io.plugins import Registry
 
 
 def paper_rule(
-  threshold: float = 3.0, threshold_rpr: float | None = None, unit_rpr: float = 1.0, **settings
+  threshold: float = 3.0, threshold_rpr: float | None = None, unit_rpr: float = 1.0, **settings: Any
 ) -> Detector:
   """The paper's rule as written: `rolling_sigma` on OPR and on RPR, beyond three deviations of the
   mean, either one. `threshold_rpr`: another threshold for RPR, None: the same. `unit_rpr`:
@@ -59,7 +60,7 @@ def paper_rule(
   )
 
 
-def calibrated_rule(**settings) -> Detector:
+def calibrated_rule(**settings: Any) -> Detector:
   """The paper's rule calibrated to ARL0 = 100,000 steps on nominal robots, seeds 100 to 109:
   trailing mean of the logarithms, a lagged reference, one side, a threshold for each residual.
   Figures of the walker; `make` takes those of the robot where it is told which.
@@ -118,7 +119,7 @@ def one_threshold(robot: str | None) -> dict:
   deviations counted in the proportion of its calibrated threshold to that of OPR. A single
   threshold can then be calibrated, as the leaderboard does.
   """
-  own = dict(CALIBRATED.get(robot, CALIBRATED["walker"]))
+  own = dict(CALIBRATED.get(robot, CALIBRATED["walker"]))  # type: ignore[arg-type]
   threshold = own.pop("threshold")
   return own | {"threshold_rpr": None, "unit_rpr": own.get("threshold_rpr", threshold) / threshold}
 
@@ -179,7 +180,7 @@ def calibrated(name: str, robot: str, settings: dict) -> Threshold | None:
   )
 
 
-def _check_channel(name: str, channel) -> None:
+def _check_channel(name: str, channel: Any) -> None:
   if channel is not None and not (channel and isinstance(channel, str)):
     raise UserError(f"detector {name!r}: {channel!r} is no channel; choose from: {combine.NAMES}")
 
@@ -203,7 +204,10 @@ def _told(use: str, settings: dict) -> dict:
   } | {"channel": channels}
 
 
-DETECTORS = {"rolling_sigma": calibrated_rule, "rolling_sigma_plain": paper_rule}
+DETECTORS: dict[str, Callable[..., Detector]] | Registry = {
+  "rolling_sigma": calibrated_rule,
+  "rolling_sigma_plain": paper_rule,
+}
 DETECTORS |= {
   "z_score": z_score,
   "ewma": ewma,
@@ -242,10 +246,12 @@ DETECTORS |= {
 DETECTORS = Registry("mjx_cl.detectors", "detector", DETECTORS)
 
 
-def known_settings(build) -> list[str]:
+def known_settings(build: Callable[..., Any]) -> list[str]:
   """Names of the settings of a factory; those of the paper's rule go on to `rolling_sigma`."""
   own = inspect.signature(build).parameters.values()
-  more = [paper_rule, rolling_sigma] if build in (calibrated_rule, paper_rule) else []
+  more: list[Callable[..., Any]] = (
+    [paper_rule, rolling_sigma] if build in (calibrated_rule, paper_rule) else []
+  )
   found = [
     p.name
     for f in (build, *more)
@@ -257,13 +263,13 @@ def known_settings(build) -> list[str]:
   )
 
 
-def _pure(name: str, factory):
+def _pure(name: str, factory: Callable[..., Any]) -> Callable[..., Detector]:
   """`factory`, held to giving Detectors; a class in plain Python is told where it can go
   instead.
   """
 
   @functools.wraps(factory)
-  def build(*args, **settings):
+  def build(*args: Any, **settings: Any) -> Detector:
     detector = factory(*args, **settings)
     if not isinstance(detector, Detector):
       plain = callable(getattr(detector, "update", None))
@@ -288,12 +294,12 @@ def split(name: str) -> tuple[str, str | None]:
   return found, channel
 
 
-def factory(name: str):
+def factory(name: str) -> Callable[..., Any]:
   """What builds detector `name`, its channel left aside."""
-  return choose("detector", split(name)[0], DETECTORS)
+  return choose("detector", split(name)[0], DETECTORS)  # type: ignore[return-value]
 
 
-def check_kinds(name: str, settings: dict, *builds) -> None:
+def check_kinds(name: str, settings: dict, *builds: Callable[..., Any]) -> None:
   """Refuses a setting of another kind than its annotation in one of `builds` says, before a program
   is traced with it. Words are the factories' own to read, and numbers of JAX pass.
   """
@@ -318,7 +324,7 @@ def make(
   cool_down: int = 0,
   robot: str | None = None,
   shared: bool = False,
-  **settings,
+  **settings: Any,
 ) -> Detector:
   """Builds detector `name`, a map over monitor.Residual. Unknown settings are refused.
 
@@ -355,7 +361,9 @@ def make(
   if ":" in name:
     build = _pure(name, build)
   if name == "rolling_sigma":
-    settings = (one_threshold(robot) if shared else CALIBRATED.get(robot, {})) | settings
+    settings = (
+      one_threshold(robot) if shared else CALIBRATED.get(robot, {})  # type: ignore[arg-type]
+    ) | settings
   elif robot is not None and "robot" in inspect.signature(build).parameters:
     settings = {"robot": robot} | settings
   try:

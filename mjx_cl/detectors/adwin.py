@@ -60,7 +60,7 @@ def insert(window: Buckets, x: jax.Array) -> Buckets:
   number = jnp.where(gives, number - 2, number)
   place = gets & (jnp.arange(places)[:, None] == number)
 
-  def settle(old, first, up):
+  def settle(old: jax.Array, first: jax.Array, up: jax.Array) -> jax.Array:
     left = jnp.where(gives, jnp.concatenate([old[2:], jnp.zeros((2, rows))]), old)
     return jnp.where(place, jnp.concatenate([first[None], up[:-1]]), left)
 
@@ -172,15 +172,17 @@ def adwin(
     warmup=(warmup, warmup == 0 or warmup >= 2, "0, or at least 2"),
   )
 
-  def init():
+  def init() -> AdwinState:
     return AdwinState(cold(), empty(max_buckets, rows), jnp.int32(0), jnp.float32(jnp.nan))
 
-  def check(window, due, last):
+  def check(window: Buckets, due: jax.Array, last: jax.Array) -> tuple[Buckets, jax.Array]:
     """(window after the cuts, score): a loop of no turn where nothing is due, so that under vmap
     the test costs only where some stream is due.
     """
 
-    def turn(carry):
+    def turn(
+      carry: tuple[Buckets, jax.Array, jax.Array, jax.Array],
+    ) -> tuple[Buckets, jax.Array, jax.Array, jax.Array]:
       window, _, score, first = carry
       now = strongest_cut(window, min_window_length)
       cut = now > threshold
@@ -192,7 +194,7 @@ def adwin(
     )
     return window, jnp.where(jnp.isneginf(score), jnp.nan, score)
 
-  def update(state, x):
+  def update(state: AdwinState, x: jax.Array) -> tuple[AdwinState, Alarm]:
     warm, z, ready = standardise(state.warm, jnp.asarray(x, jnp.float32), warmup)
     tick = state.tick + 1
     window = insert(state.window, z)

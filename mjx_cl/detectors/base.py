@@ -42,7 +42,7 @@ def scalar(factory: Callable[..., Detector]) -> Callable[..., Detector]:
   """Marks a factory whose detectors take one number per step; `make` puts them on channels of
   monitor.Residual. Works for plug-ins too.
   """
-  factory.takes = "scalar"
+  factory.takes = "scalar"  # type: ignore[attr-defined]
   return factory
 
 
@@ -56,7 +56,7 @@ def demand(name: str, **rules: tuple[Any, bool, str]) -> None:
       raise UserError(f"detector {name!r}: {setting} must be {rule}; got {value}")
 
 
-def above(value, low) -> bool:
+def above(value: float | jax.Array, low: float) -> bool:
   """Value > low; a traced value, which has no number yet, passes."""
   return isinstance(value, jax.core.Tracer) or bool(value > low)
 
@@ -68,7 +68,7 @@ class Warm(NamedTuple):
     count: int32 (). mean: float32 (). squares: float32 (), sum of squared deviations.
   """
 
-  count: jax.Array
+  count: jax.Array  # type: ignore[assignment]
   mean: jax.Array
   squares: jax.Array
 

@@ -4,24 +4,27 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from mjx_cl.detectors.base import Alarm, Detector, above, demand
 
+if TYPE_CHECKING:
+  from mjx_cl.rollout.monitor import Residual
+
 
 def reference(factory: Callable[..., Detector]) -> Callable[..., Detector]:
   """Marks a factory as a reference: no contract that asks for a detection holds for it."""
-  factory.takes, factory.reference = "residual", True
+  factory.takes, factory.reference = "residual", True  # type: ignore[attr-defined]
   return factory
 
 
 def _constant(fires: bool) -> Detector:
   """Fires at every known row or at none; score 1 or 0."""
 
-  def update(state, residual):
+  def update(state: jax.Array, residual: Residual) -> tuple[jax.Array, Alarm]:
     return state, Alarm(
       residual.valid & fires, jnp.where(residual.valid, float(fires), jnp.nan).astype(jnp.float32)
     )
@@ -58,7 +61,7 @@ class PeriodicState(NamedTuple):
   began. begun: bool (), it has been drawn.
   """
 
-  count: jax.Array
+  count: jax.Array  # type: ignore[assignment]
   phase: jax.Array
   begun: jax.Array
 
@@ -99,7 +102,7 @@ def periodic(threshold: float = math.log(10_000)) -> Detector:
     ),
   )
 
-  def update(state, residual):
+  def update(state: PeriodicState, residual: Residual) -> tuple[PeriodicState, Alarm]:
     known = residual.valid
     drawn = jax.random.bits(_told_apart(jnp.zeros(2, jnp.uint32), residual))
     phase = jnp.where(known & ~state.begun, drawn, state.phase)
@@ -113,7 +116,7 @@ def periodic(threshold: float = math.log(10_000)) -> Detector:
   return Detector(lambda: PeriodicState(jnp.uint32(0), jnp.uint32(0), jnp.bool_(False)), update)
 
 
-def _told_apart(seed: jax.Array, residual) -> jax.Array:
+def _told_apart(seed: jax.Array, residual: Residual) -> jax.Array:
   """A key of seed, uint32 (2,), and the bits of a row: streams start from one state, and would
   otherwise all draw the same.
   """
@@ -126,7 +129,7 @@ def _told_apart(seed: jax.Array, residual) -> jax.Array:
 class RandomState(NamedTuple):
   """Attributes: count: int32 (), known rows. seed: uint32 (2,), data of a key."""
 
-  count: jax.Array
+  count: jax.Array  # type: ignore[assignment]
   seed: jax.Array
 
 
@@ -160,10 +163,10 @@ def random(threshold: float = math.log(10_000), seed: int = 0) -> Detector:
     ),
   )
 
-  def init():
+  def init() -> RandomState:
     return RandomState(jnp.int32(0), jax.random.key_data(jax.random.key(seed, impl="threefry2x32")))
 
-  def update(state, residual):
+  def update(state: RandomState, residual: Residual) -> tuple[RandomState, Alarm]:
     u = jax.random.uniform(
       jax.random.fold_in(_told_apart(state.seed, residual), state.count),
       minval=jnp.finfo(jnp.float32).tiny,
@@ -178,7 +181,7 @@ def random(threshold: float = math.log(10_000), seed: int = 0) -> Detector:
 
 
 @reference
-def oracle(onset=0) -> Detector:
+def oracle(onset: int | jax.Array = 0) -> Detector:
   """Fires once, at the true onset: latency 0, no miss, no false alarm.
 
     t = rows before this one, known or not;  score = 1 if t >= onset, else 0;  fired = (t == onset)
@@ -195,7 +198,7 @@ def oracle(onset=0) -> Detector:
   """
   demand("oracle", onset=(onset, above(onset, -1), "at least 0"))
 
-  def update(state, residual):
+  def update(state: jax.Array, residual: Residual) -> tuple[jax.Array, Alarm]:
     return state + 1, Alarm(state == onset, jnp.where(state >= onset, 1.0, 0.0).astype(jnp.float32))
 
   return Detector(lambda: jnp.int32(0), update)

@@ -4,7 +4,7 @@ blocks.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +12,9 @@ import numpy as np
 
 from mjx_cl.detectors import multivariate
 from mjx_cl.detectors.base import Alarm, Detector, above, demand
+
+if TYPE_CHECKING:
+  from mjx_cl.rollout.monitor import Residual
 
 
 class Healthy(NamedTuple):
@@ -35,7 +38,7 @@ class BfarState(NamedTuple):
   newest first. blocks: int32 (), blocks since the warm-up or the last alarm.
   """
 
-  count: jax.Array
+  count: jax.Array  # type: ignore[assignment]
   step: jax.Array
   bins: jax.Array
   references: jax.Array
@@ -136,7 +139,7 @@ def bfar(
   chosen = rng.integers(0, m, (repetitions, m + blocks)).astype(np.int32)
   noise = rng.standard_normal((repetitions, m + blocks)).astype(np.float32)
 
-  def init():
+  def init() -> BfarState:
     healthy = Healthy(jnp.full(bins, 1.0 / bins), jnp.float32(0), jnp.float32(1), jnp.float32(1))
     return BfarState(
       jnp.int32(0),
@@ -148,7 +151,7 @@ def bfar(
       jnp.int32(0),
     )
 
-  def settle(references):
+  def settle(references: jax.Array) -> Healthy:
     centred = references - references.mean(0)
     covariance = centred.T @ centred / (m - 1)
     variance = jnp.maximum(jnp.trace(covariance) / bins, 1e-12)
@@ -178,7 +181,7 @@ def bfar(
       weights, mean, std, jnp.maximum(level, 1.0)
     )  # constant rewards have no quantile; a run of healthy blocks goes beyond 1
 
-  def update(state, residual):
+  def update(state: BfarState, residual: Residual) -> tuple[BfarState, Alarm]:
     known = jnp.isfinite(residual.reward)
     reward = jnp.where(known, residual.reward, 0.0)
     learning = state.count < m * block
@@ -218,4 +221,4 @@ def bfar(
   return Detector(init, update)
 
 
-bfar.takes = "residual"
+bfar.takes = "residual"  # type: ignore[attr-defined]

@@ -108,14 +108,19 @@ def bocpd(
     warmup=(warmup, warmup == 0 or warmup >= 2, "0, or at least 2"),
   )
   run, last = np.arange(max_run), max_run - 1
-  k_fixed, a_fixed = np.float32(kappa + run), np.float32(alpha + run / 2)
+  k_fixed: np.ndarray
+  a_fixed: np.ndarray
+  k_fixed, a_fixed = (
+    np.float32(kappa + run),  # type: ignore[assignment]
+    np.float32(alpha + run / 2),  # type: ignore[assignment]
+  )
   g_fixed = np.array(
     [math.exp(math.lgamma(alpha + r / 2 + 0.5) - math.lgamma(alpha + r / 2)) for r in run],
     np.float32,
   )
   tail = run == last
 
-  def start(warm):
+  def start(warm: Warm) -> BocpdState:
     return BocpdState(
       warm,
       jnp.where(run == 0, 0.0, -jnp.inf).astype(jnp.float32),
@@ -126,7 +131,7 @@ def bocpd(
       jnp.int32(0),
     )
 
-  def update(state, x):
+  def update(state: BocpdState, x: jax.Array) -> tuple[BocpdState, Alarm]:
     warm, z, ready = standardise(state.warm, jnp.asarray(x, jnp.float32), warmup)
     z = jnp.clip(z, -FAR, FAR)
     k = jnp.where(tail, state.tail_kappa, k_fixed)

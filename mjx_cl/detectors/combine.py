@@ -52,7 +52,7 @@ def on(channel: str, detector: Detector, log: bool = False) -> Detector:
   if not is_channel(channel):
     raise UserError(f"unknown channel {channel!r}; choose from: {NAMES}")
 
-  def update(state, residual):
+  def update(state: Any, residual: Residual) -> tuple[Any, Alarm]:
     x = read(channel, residual)
     valid = jnp.isfinite(x) & (residual.valid | (channel in ("reward", "surprise")))
     skips = getattr(detector.update, "skips", False)
@@ -68,7 +68,7 @@ def on(channel: str, detector: Detector, log: bool = False) -> Detector:
 def any_of(*detectors: Detector) -> Detector:
   """Fires when any member fires; score = the largest of the members' scores that are known."""
 
-  def update(states, x):
+  def update(states: tuple[Any, ...], x: Any) -> tuple[tuple[Any, ...], Alarm]:
     out = [d.update(s, x) for d, s in zip(detectors, states)]
     fired = jnp.any(jnp.stack([alarm.fired for _, alarm in out]))
     scores = jnp.stack([alarm.score for _, alarm in out])
@@ -77,7 +77,7 @@ def any_of(*detectors: Detector) -> Detector:
       fired, jnp.where(jnp.all(jnp.isnan(scores)), jnp.nan, known)
     )
 
-  update.members = (
+  update.members = (  # type: ignore[attr-defined]
     detectors  # for passes.updates: the largest score hides what the other members do
   )
   return Detector(lambda: tuple(d.init() for d in detectors), update)
@@ -92,7 +92,7 @@ class RunState(NamedTuple):
   run: jax.Array
 
 
-def patience(factory: Callable[..., Detector], k: int, **settings) -> Detector:
+def patience(factory: Callable[..., Detector], k: int, **settings: Any) -> Detector:
   """`factory(**settings)`, but firing only at the k-th score above its threshold in a row; k = 1
   changes nothing.
 
@@ -109,7 +109,7 @@ def patience(factory: Callable[..., Detector], k: int, **settings) -> Detector:
   first = factory(**settings)
   threshold = settings.pop("threshold", known["threshold"].default)
 
-  def update(state, x):
+  def update(state: RunState, x: Any) -> tuple[RunState, Alarm]:
     detector = factory(threshold=jnp.where(state.run >= k - 1, threshold, jnp.inf), **settings)
     inner, alarm = detector.update(state.inner, x)
     run = jnp.where(alarm.score > threshold, jnp.minimum(state.run + 1, k), 0)
@@ -134,7 +134,7 @@ def cool_down(detector: Detector, steps: int) -> Detector:
   """
   demand("cool_down", steps=(steps, steps >= 0, "at least 0"))
 
-  def update(state, x):
+  def update(state: CoolState, x: Any) -> tuple[CoolState, Alarm]:
     inner, alarm = detector.update(state.inner, x)
     fired = alarm.fired & (state.left == 0)
     left = jnp.where(jnp.isnan(alarm.score), state.left, jnp.maximum(state.left - 1, 0))
@@ -143,7 +143,7 @@ def cool_down(detector: Detector, steps: int) -> Detector:
   return Detector(lambda: CoolState(detector.init(), jnp.int32(0)), update)
 
 
-def _handed_on(ready: jax.Array, detector: Detector, inner, x: jax.Array):
+def _handed_on(ready: jax.Array, detector: Detector, inner: Any, x: jax.Array) -> tuple[Any, Alarm]:
   """The detector's update where `ready`; elsewhere its state stays and nothing is known."""
   new, alarm = detector.update(inner, jnp.where(ready, x, 0.0))
   return jax.tree.map(lambda a, b: jnp.where(ready, a, b), new, inner), Alarm(
@@ -166,7 +166,7 @@ class WhitenedState(NamedTuple):
     inner: state of the detector.
   """
 
-  count: jax.Array
+  count: jax.Array  # type: ignore[assignment]
   origin: jax.Array
   recent: jax.Array
   products: jax.Array
@@ -213,7 +213,7 @@ def whitened(detector: Detector, order: int = 8, warmup: int = 1000) -> Detector
   lag = jnp.arange(order + 1)
   unit = (lag == 0).astype(jnp.float32)
 
-  def fit(state: WhitenedState):
+  def fit(state: WhitenedState) -> tuple[jax.Array, jax.Array, jax.Array]:
     """One order more of the recursion, from the sums."""
     mean = state.total / warmup
     c = (
@@ -232,14 +232,14 @@ def whitened(detector: Detector, order: int = 8, warmup: int = 1000) -> Detector
       error * (1 - jnp.square(reflection)),
     )
 
-  def update(state, x):
+  def update(state: WhitenedState, x: jax.Array) -> tuple[WhitenedState, Alarm]:
     x = jnp.asarray(x, jnp.float32)
     n = state.count
     origin = jnp.where(n == 0, x, state.origin)
     d = x - origin
     window = jnp.concatenate([d[None], state.recent])
     fitting, solving, ready = n < warmup, (n >= warmup) & (n < warmup + order), n >= warmup + order
-    add = lambda old, new: jnp.where(fitting, new, old)
+    add: Callable[[jax.Array, jax.Array], jax.Array] = lambda old, new: jnp.where(fitting, new, old)
     last = jnp.concatenate([jnp.zeros(1), state.last[:-1] + d])
     filters = [
       jnp.where(solving, new, old)
@@ -247,19 +247,22 @@ def whitened(detector: Detector, order: int = 8, warmup: int = 1000) -> Detector
     ]
     innovation = jnp.sum(filters[0] * (window - state.total / warmup))
     inner, alarm = _handed_on(ready, detector, state.inner, innovation)
-    return WhitenedState(
-      jnp.where(ready, n, n + 1),
-      origin,
-      window[:-1],
-      add(state.products, state.products + d * window),
-      add(state.first, state.first + jnp.where(n < lag, d, 0.0)),
-      add(state.last, last),
-      add(state.total, state.total + d),
-      *filters,
-      inner,
-    ), alarm
+    return (
+      WhitenedState(  # type: ignore[call-arg]
+        jnp.where(ready, n, n + 1),
+        origin,
+        window[:-1],
+        add(state.products, state.products + d * window),
+        add(state.first, state.first + jnp.where(n < lag, d, 0.0)),
+        add(state.last, last),
+        add(state.total, state.total + d),
+        *filters,
+        inner,
+      ),
+      alarm,
+    )
 
-  def init():
+  def init() -> WhitenedState:
     zeros = lambda: jnp.zeros(order + 1)
     return WhitenedState(
       jnp.int32(0),

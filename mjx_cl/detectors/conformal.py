@@ -100,7 +100,7 @@ def conformal(
   )
   power, place = np.array(bets, np.float32), np.arange(bins)
 
-  def start(warm):
+  def start(warm: Warm) -> ConformalState:
     return ConformalState(
       warm,
       jnp.zeros(bins, jnp.int32),
@@ -109,7 +109,7 @@ def conformal(
       jnp.array([seed, 0], jnp.uint32),
     )
 
-  def update(state, x):
+  def update(state: ConformalState, x: jax.Array) -> tuple[ConformalState, Alarm]:
     warm, z, ready = standardise(state.warm, jnp.asarray(x, jnp.float32), warmup)
     a = jnp.abs(z) if two_sided else z - LOW
     mine = jnp.floor(jnp.clip(a / WIDTH, 0, bins - 1)).astype(jnp.int32)
@@ -122,7 +122,11 @@ def conformal(
     equal = upwards[mine] - more + 1
     p = (more + u * equal) / (state.seen + 1)
 
-    evidence, score = accumulate(state.evidence, np.log(power) + (power - 1) * jnp.log(p), form)
+    evidence, score = accumulate(
+      state.evidence,
+      np.log(power) + (power - 1) * jnp.log(p),  # type: ignore[arg-type]
+      form,
+    )
     fired = ready & (score > threshold)
     counted = ready & ((state.seen < freeze) | (freeze == 0))
     new = ConformalState(

@@ -53,10 +53,10 @@ def cusum(
     warmup=(warmup, warmup == 0 or warmup >= 2, "0 or at least 2"),
   )
 
-  def init():
+  def init() -> CusumState:
     return CusumState(cold(), jnp.float32(0), jnp.float32(0))
 
-  def update(state, x):
+  def update(state: CusumState, x: jax.Array) -> tuple[CusumState, Alarm]:
     warm, z, ready = standardise(state.warm, jnp.asarray(x, jnp.float32), warmup)
     up = jnp.maximum(0.0, state.up + z - slack)
     down = jnp.maximum(0.0, state.down - z - slack) if two_sided else state.down

@@ -106,14 +106,17 @@ def e_detector(
     warmup=(warmup, warmup == 0 or warmup >= 2, "0, or at least 2"),
   )
   size = np.array(shifts, np.float32) / np.float32(deviation) ** 2
-  sign = np.repeat(np.float32([1, -1]) if two_sided else np.float32([1]), len(size))
+  sign = np.repeat(
+    np.float32([1, -1]) if two_sided else np.float32([1]),  # type: ignore[arg-type]
+    len(size),
+  )
   size = np.tile(size, len(sign) // len(size))
   price = size * np.float32(bound) + np.square(size * np.float32(deviation)) / 2
 
-  def start(warm):
+  def start(warm: Warm) -> EDetectorState:
     return EDetectorState(warm, jnp.zeros(len(size)))
 
-  def update(state, x):
+  def update(state: EDetectorState, x: jax.Array) -> tuple[EDetectorState, Alarm]:
     warm, z, ready = standardise(state.warm, jnp.asarray(x, jnp.float32), warmup)
     evidence, score = accumulate(state.evidence, sign * size * z - price, form)
     fired = ready & (score > threshold)

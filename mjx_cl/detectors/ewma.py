@@ -54,10 +54,10 @@ def ewma(rate: float = 0.1, threshold: float = 3.0, warmup: int = 1000) -> Detec
     warmup=(warmup, warmup == 0 or warmup >= 2, "0 or at least 2"),
   )
 
-  def init():
+  def init() -> EwmaState:
     return EwmaState(cold(), jnp.float32(0), jnp.float32(1))
 
-  def update(state, x):
+  def update(state: EwmaState, x: jax.Array) -> tuple[EwmaState, Alarm]:
     warm, z, ready = standardise(state.warm, jnp.asarray(x, jnp.float32), warmup)
     average = state.average + rate * (z - state.average)
     forgotten = state.forgotten * (1 - rate) ** 2

@@ -70,12 +70,12 @@ def glr(threshold: float = 12.0, capacity: int = 32, warmup: int = 1000) -> Dete
   )
   slot = jnp.arange(capacity)
 
-  def init():
+  def init() -> GlrState:
     return GlrState(
       cold(), jnp.ones((2, capacity)), jnp.full((2, capacity), -jnp.inf), jnp.bool_(False)
     )
 
-  def update(state, x):
+  def update(state: GlrState, x: jax.Array) -> tuple[GlrState, Alarm]:
     warm, z, ready = standardise(state.warm, jnp.asarray(x, jnp.float32), warmup)
     mean = state.total / state.length
     # the means rise up to the tangent from the present and fall behind it: the last that rises is

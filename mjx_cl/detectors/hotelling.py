@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax.numpy as jnp
 
 from mjx_cl.detectors import multivariate
 from mjx_cl.detectors.base import Alarm, Detector, above, demand
+
+if TYPE_CHECKING:
+  from mjx_cl.rollout.monitor import Residual
 
 
 class HotellingState(NamedTuple):
@@ -75,10 +78,10 @@ def hotelling(
     shrinkage=(shrinkage, 0 <= shrinkage <= 1, "in [0, 1]"),
   )
 
-  def init():
+  def init() -> HotellingState:
     return HotellingState(multivariate.whitener(p), multivariate.trail(smooth, p))
 
-  def update(state, residual):
+  def update(state: HotellingState, residual: Residual) -> tuple[HotellingState, Alarm]:
     x, known = multivariate.pick(residual, names, log)
     reference, y, ready = multivariate.whiten(state.whitener, x, known, warmup, shrinkage)
     held = multivariate.push(state.trail, y, ready)
@@ -91,4 +94,4 @@ def hotelling(
   return Detector(init, update)
 
 
-hotelling.takes = "residual"
+hotelling.takes = "residual"  # type: ignore[attr-defined]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +10,9 @@ import jax.numpy as jnp
 from mjx_cl.detectors import multivariate
 from mjx_cl.detectors.base import Alarm, Detector, Warm, above, demand, standardise
 from mjx_cl.rollout.monitor import LATENT
+
+if TYPE_CHECKING:
+  from mjx_cl.rollout.monitor import Residual
 
 
 class Healthy(NamedTuple):
@@ -90,7 +93,7 @@ def knn(
   )
   stride = warmup // references
 
-  def init():
+  def init() -> KnnState:
     healthy = Healthy(jnp.ones(LATENT), jnp.float32(0), jnp.float32(1))
     return KnnState(
       Warm(jnp.int32(0), jnp.zeros(LATENT), jnp.zeros(LATENT)),
@@ -99,14 +102,14 @@ def knn(
       multivariate.trail(smooth, 1),
     )
 
-  def settle(learnt):
+  def settle(learnt: tuple[Warm, jax.Array]) -> Healthy:
     warm, stored = learnt
     weight = 1 / jnp.square(jnp.maximum(jnp.sqrt(warm.squares / warmup), 1e-6))
     squares = jnp.square(stored[:, None] - stored) @ weight
     own = jnp.sqrt(kth(jnp.where(jnp.eye(references, dtype=bool), jnp.inf, squares), k))
     return Healthy(weight, jnp.mean(own), jnp.maximum(jnp.std(own), 1e-6))
 
-  def update(state, residual):
+  def update(state: KnnState, residual: Residual) -> tuple[KnnState, Alarm]:
     known = jnp.all(jnp.isfinite(residual.latent))
     x = jnp.where(known, residual.latent, 0.0)
     warm, _, ready = standardise(state.warm, x, warmup)
@@ -129,4 +132,4 @@ def knn(
   return Detector(init, update)
 
 
-knn.takes = "residual"
+knn.takes = "residual"  # type: ignore[attr-defined]

@@ -22,7 +22,7 @@ class KswinState(NamedTuple):
   """
 
   buffer: jax.Array
-  count: jax.Array
+  count: jax.Array  # type: ignore[assignment]
   held: jax.Array
   key: jax.Array
   tests: jax.Array
@@ -53,7 +53,7 @@ def draw(key: jax.Array, tests: jax.Array, older: int, number: int) -> jax.Array
     jax.random.fold_in(jax.random.wrap_key_data(key, impl="threefry2x32"), tests), (number,)
   )
 
-  def turn(chosen, i):
+  def turn(chosen: jax.Array, i: jax.Array) -> tuple[jax.Array, None]:
     last = older - number + i
     pick = jnp.floor(u[i] * (last + 1)).astype(jnp.int32)
     return jnp.where(
@@ -68,11 +68,11 @@ def distance(a: jax.Array, b: jax.Array) -> jax.Array:
   both = jnp.concatenate([a, b])
 
   def turn(
-    ahead,
-    pair,
+    ahead: jax.Array,
+    pair: tuple[jax.Array, jax.Array],
     # one sample of each at a time: the detector is 1.4 times as fast as with a table of all pairs,
     # which the compiler sums along its rows
-  ):
+  ) -> tuple[jax.Array, None]:
     return ahead + jnp.where(pair[0] <= both, 1, 0) - jnp.where(pair[1] <= both, 1, 0), None
 
   return jnp.max(jnp.abs(jax.lax.scan(turn, jnp.zeros(both.shape, jnp.int32), (a, b), unroll=4)[0]))
@@ -136,18 +136,20 @@ def kswin(
   older = window - stat_size
   table = surprisals(stat_size)
 
-  def init():
+  def init() -> KswinState:
     key = jax.random.key_data(jax.random.key(seed, impl="threefry2x32"))
     return KswinState(
       jnp.zeros(window), jnp.int32(0), jnp.int32(0), key, jnp.int32(0), jnp.float32(jnp.nan)
     )
 
-  def update(state, x):
+  def update(state: KswinState, x: jax.Array) -> tuple[KswinState, Alarm]:
     buffer = state.buffer.at[state.count % window].set(jnp.asarray(x, jnp.float32))
     count, held = state.count + 1, jnp.minimum(state.held + 1, window)
     due = (held == window) & (count % every == 0)
 
-    def test(carry):
+    def test(
+      carry: tuple[jax.Array, jax.Array, jax.Array],
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
       _, tests, _ = carry
       at = lambda place: buffer[(count + place) % window]  # place 0 is the oldest sample
       new, old = at(older + jnp.arange(stat_size)), at(draw(state.key, tests, older, stat_size))

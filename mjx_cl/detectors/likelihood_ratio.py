@@ -4,7 +4,7 @@ the very fault.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +12,9 @@ import jax.numpy as jnp
 from mjx_cl.detectors.base import Alarm, Detector, above, demand
 from mjx_cl.detectors.combine import CHANNELS, read
 from mjx_cl.errors import UserError
+
+if TYPE_CHECKING:
+  from mjx_cl.rollout.monitor import Residual
 
 
 class LikelihoodRatioState(NamedTuple):
@@ -21,12 +24,15 @@ class LikelihoodRatioState(NamedTuple):
   """
 
   recent: jax.Array
-  count: jax.Array
+  count: jax.Array  # type: ignore[assignment]
   evidence: jax.Array
 
 
 def likelihood_ratio(
-  parameters, threshold: float = 6.0, channels: tuple[str, ...] = ("opr",), log: bool = True
+  parameters: Any,
+  threshold: float = 6.0,
+  channels: tuple[str, ...] = ("opr",),
+  log: bool = True,
 ) -> Detector:
   """CUSUM of the log-likelihood ratio of two Gaussian autoregressions, fitted before and after the
   change.
@@ -76,15 +82,15 @@ def likelihood_ratio(
   orders = before.lags.shape[0], after.lags.shape[0]
   order = max(orders)
 
-  def misfit(model, recent, x):
+  def misfit(model: Any, recent: jax.Array, x: jax.Array) -> jax.Array:
     """-2 ln p, without the constant that both have."""
     mean = model.intercept + jnp.einsum("kij,kj->i", model.lags, recent[: model.lags.shape[0]])
     return jnp.sum(jnp.square(model.whitener @ (x - mean))) + model.log_det
 
-  def init():
+  def init() -> LikelihoodRatioState:
     return LikelihoodRatioState(jnp.zeros((order, len(channels))), jnp.int32(0), jnp.float32(0))
 
-  def update(state, residual):
+  def update(state: LikelihoodRatioState, residual: Residual) -> tuple[LikelihoodRatioState, Alarm]:
     x = jnp.stack([read(c, residual) for c in channels])
     timed = all(c in ("reward", "surprise") for c in channels)  # known without a prediction window
     valid = jnp.all(jnp.isfinite(x)) & (residual.valid | timed)
@@ -104,4 +110,5 @@ def likelihood_ratio(
   return Detector(init, update)
 
 
-likelihood_ratio.takes = "residual"  # and a fit first: it has no line in the table
+# and a fit first: it has no line in the table
+likelihood_ratio.takes = "residual"  # type: ignore[attr-defined]

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import jax
 import jax.numpy as jnp
 
 from mjx_cl.detectors import multivariate
 from mjx_cl.detectors.base import Alarm, Detector, above, demand
+
+if TYPE_CHECKING:
+  from mjx_cl.rollout.monitor import Residual
 
 
 def corrected(z: jax.Array, charts: int, two_sided: bool) -> jax.Array:
@@ -78,10 +83,12 @@ def max_variables(
   )
   sign = jnp.array([-1.0 if c == "reward" else 1.0 for c in names])
 
-  def init():
+  def init() -> multivariate.Standing:
     return multivariate.standing(smooth, len(names))
 
-  def update(state, residual):
+  def update(
+    state: multivariate.Standing, residual: Residual
+  ) -> tuple[multivariate.Standing, Alarm]:
     x, known = multivariate.pick(residual, names, log)
     state, z, ready = multivariate.trailing_z(state, x, known, smooth, warmup)
     largest = jnp.max(jnp.abs(z) if two_sided else sign * z)
@@ -94,4 +101,4 @@ def max_variables(
   return Detector(init, update)
 
 
-max_variables.takes = "residual"
+max_variables.takes = "residual"  # type: ignore[attr-defined]

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from mjx_cl.detectors import multivariate
 from mjx_cl.detectors.base import Alarm, Detector, above, demand
+
+if TYPE_CHECKING:
+  from mjx_cl.rollout.monitor import Residual
 
 
 class MewmaState(NamedTuple):
@@ -75,10 +78,10 @@ def mewma(
     shrinkage=(shrinkage, 0 <= shrinkage <= 1, "in [0, 1]"),
   )
 
-  def init():
+  def init() -> MewmaState:
     return MewmaState(multivariate.whitener(p), jnp.zeros(p), jnp.float32(1))
 
-  def update(state, residual):
+  def update(state: MewmaState, residual: Residual) -> tuple[MewmaState, Alarm]:
     x, known = multivariate.pick(residual, names, log)
     reference, y, ready = multivariate.whiten(state.whitener, x, known, warmup, shrinkage)
     mean = jnp.where(ready, rate * y + (1 - rate) * state.mean, state.mean)
@@ -93,4 +96,4 @@ def mewma(
   return Detector(init, update)
 
 
-mewma.takes = "residual"
+mewma.takes = "residual"  # type: ignore[attr-defined]

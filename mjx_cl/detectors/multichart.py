@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax.numpy as jnp
 
 from mjx_cl.detectors.base import Alarm, Detector, above, demand
@@ -65,7 +67,7 @@ def multichart(threshold: float = 1.0, charts: str = CHARTS, robot: str | None =
   return any_of(*map(chart, names))
 
 
-multichart.takes = "residual"
+multichart.takes = "residual"  # type: ignore[attr-defined]
 
 
 def in_units(detector: Detector, unit: float, threshold: float) -> Detector:
@@ -73,7 +75,7 @@ def in_units(detector: Detector, unit: float, threshold: float) -> Detector:
   fired if and only if score > threshold, rounding or not.
   """
 
-  def update(state, x):
+  def update(state: Any, x: Any) -> tuple[Any, Alarm]:
     new, alarm = detector.update(state, x)
     score, level = alarm.score / unit, jnp.asarray(threshold, jnp.float32)
     score = jnp.where(

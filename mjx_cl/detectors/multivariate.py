@@ -5,7 +5,7 @@ whitened reference, work that is done once.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from mjx_cl.detectors.base import Warm, standardise
 from mjx_cl.detectors.combine import NAMES, is_channel, read
 from mjx_cl.errors import UserError
-from mjx_cl.rollout.monitor import CHANNELS
+from mjx_cl.rollout.monitor import CHANNELS, Residual
 
 ALONE = ("reward", "surprise")  # known where the residuals are not
 
@@ -36,7 +36,7 @@ def split(name: str, channels: str | tuple[str, ...]) -> tuple[str, ...]:
   return channels
 
 
-def pick(residual, channels: tuple[str, ...], log: bool) -> tuple[jax.Array, jax.Array]:
+def pick(residual: Residual, channels: tuple[str, ...], log: bool) -> tuple[jax.Array, jax.Array]:
   """(x, known): the channels of a monitor.Residual, float32 (len(channels),), and whether all of
   them are known; x is 0 where they are not.
 
@@ -53,7 +53,7 @@ def pick(residual, channels: tuple[str, ...], log: bool) -> tuple[jax.Array, jax
   return jnp.where(known, x, 0.0), known
 
 
-def keep(known: jax.Array, new, old):
+def keep(known: jax.Array, new: Any, old: Any) -> Any:
   """`new` where known, else `old`; for leaves small enough to be copied at each step."""
   return jax.tree.map(lambda a, b: jnp.where(known, a, b), new, old)
 
@@ -68,7 +68,7 @@ class Trail(NamedTuple):
 
   buffer: jax.Array
   total: jax.Array
-  count: jax.Array
+  count: jax.Array  # type: ignore[assignment]
 
 
 def trail(smooth: int, p: int) -> Trail:
@@ -133,7 +133,7 @@ def trailing_z(
   return Standing(held, keep(known & full, warm, state.warm)), z, ready & full & known
 
 
-def once(due: jax.Array, compute: Callable, operands, old):
+def once(due: jax.Array, compute: Callable[[Any], Any], operands: Any, old: Any) -> Any:
   """`compute(operands)` where due, else `old`; computed only in the steps and streams in which it
   is due, also under vmap.
 
@@ -145,12 +145,12 @@ def once(due: jax.Array, compute: Callable, operands, old):
   return _once(compute, 0)(due, operands, old)
 
 
-def _once(compute: Callable, rank: int) -> Callable:
+def _once(compute: Callable[[Any], Any], rank: int) -> Callable[[Any, Any, Any], Any]:
   """`once` for `rank` leading axes of streams."""
   alone = lambda lane: jax.lax.cond(lane[0], lambda: compute(lane[1]), lambda: lane[2])
 
   @jax.custom_batching.custom_vmap
-  def run(due, operands, old):
+  def run(due: jax.Array, operands: Any, old: Any) -> Any:
     if rank == 0:
       return alone((due, operands, old))
     flat = lambda x: x.reshape((-1,) + x.shape[rank:])
@@ -162,7 +162,7 @@ def _once(compute: Callable, rank: int) -> Callable:
     return jax.lax.cond(jnp.any(due), lanes, lambda: old)
 
   @run.def_vmap
-  def batched(size, is_batched, *args):
+  def batched(size: int, is_batched: Any, *args: Any) -> tuple[Any, Any]:
     args = jax.tree.map(
       lambda x, b: x if b else jnp.broadcast_to(x, (size,) + x.shape), args, tuple(is_batched)
     )
@@ -179,7 +179,7 @@ class Whitener(NamedTuple):
   uncorrelated units; set once, at the end of the warm-up.
   """
 
-  count: jax.Array
+  count: jax.Array  # type: ignore[assignment]
   mean: jax.Array
   moment: jax.Array
   matrix: jax.Array
@@ -212,7 +212,7 @@ def whiten(
   moment = state.moment + jnp.outer(step, x - mean)
   count, mean, moment = keep(learning & known, (count, mean, moment), state[:3])
 
-  def factor(moment):
+  def factor(moment: jax.Array) -> jax.Array:
     p = moment.shape[0]
     std = jnp.maximum(jnp.sqrt(jnp.diag(moment) / (warmup - 1)), 1e-6)
     r = moment / (warmup - 1) / std[:, None] / std

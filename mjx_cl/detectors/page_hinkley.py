@@ -23,7 +23,7 @@ class PageHinkleyState(NamedTuple):
   """
 
   warm: Warm
-  count: jax.Array
+  count: jax.Array  # type: ignore[assignment]
   origin: jax.Array
   mean: jax.Array
   rise: jax.Array
@@ -86,10 +86,10 @@ def page_hinkley(
     warmup=(warmup, warmup == 0 or warmup >= 2, "0 or at least 2"),
   )
 
-  def init():
+  def init() -> PageHinkleyState:
     return PageHinkleyState(cold(), *[jnp.float32(0)] * 7)
 
-  def update(state, x):
+  def update(state: PageHinkleyState, x: jax.Array) -> tuple[PageHinkleyState, Alarm]:
     warm, z, ready = standardise(state.warm, jnp.asarray(x, jnp.float32), warmup)
     origin = jnp.where(state.count == 0, z, state.origin)
     z = z - origin

@@ -5,7 +5,7 @@ one object per stream.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +15,9 @@ from mjx_cl.detectors.base import Alarm, Detector
 from mjx_cl.detectors.combine import NAMES, is_channel, on
 from mjx_cl.errors import UserError
 from mjx_cl.io.plugins import find, line
+
+if TYPE_CHECKING:
+  from mjx_cl.rollout.monitor import Residual
 
 
 class HostDetector(NamedTuple):
@@ -115,9 +118,12 @@ def run_host(
   if xs.ndim != 2:
     raise UserError(f"run_host takes streams of shape (T, S); got {xs.shape}")
   fired, scores = np.zeros(xs.shape, bool), np.full(xs.shape, np.nan)
-  objects = []
+  objects: list[Any] = []
   for s in range(xs.shape[1]):
-    detector = _fresh(factory, host_name or getattr(factory, "__name__", "of your own"))
+    detector = _fresh(
+      factory,
+      host_name or getattr(factory, "__name__", "of your own"),  # type: ignore[arg-type]
+    )
     if any(detector is other for other in objects):
       raise UserError(
         f"host detector {type(detector).__name__}: the factory gave the same object twice; "
@@ -174,7 +180,7 @@ def check_causal(
         )
 
 
-def samples(host: HostDetector, residual) -> np.ndarray:
+def samples(host: HostDetector, residual: Residual) -> np.ndarray:
   """float32 (T, S): what `host` is given of a recorded monitor.Residual with leading (T, S); nan
   where `on` would mask the sample.
   """

@@ -39,7 +39,7 @@ class RollingSigmaState(NamedTuple):
 
   recent: jax.Array
   buffer: jax.Array
-  count: jax.Array
+  count: jax.Array  # type: ignore[assignment]
   run: jax.Array
   blocks: Moments
   number: jax.Array
@@ -127,7 +127,7 @@ def rolling_sigma(
   shift = max(0, (window // 12).bit_length() - 1)
   size, number = 1 << shift, (window >> shift) + 1
 
-  def init():
+  def init() -> RollingSigmaState:
     zero = Moments(jnp.float32(0), jnp.float32(0))
     return RollingSigmaState(
       jnp.zeros(smooth),
@@ -141,7 +141,7 @@ def rolling_sigma(
       zero,
     )
 
-  def update(state, x):
+  def update(state: RollingSigmaState, x: jax.Array) -> tuple[RollingSigmaState, Alarm]:
     x = jnp.asarray(x, jnp.float32)
     known = ~jnp.isnan(x)
     put = lambda array, at, value, where: array.at[
@@ -200,5 +200,5 @@ def rolling_sigma(
     )
     return new, Alarm(known & (run == patience), jnp.where(ready, score, jnp.nan))
 
-  update.skips = True
+  update.skips = True  # type: ignore[attr-defined]
   return Detector(init, update)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import concurrent.futures
 import functools
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +15,7 @@ from mjx_cl.errors import UserError
 from mjx_cl.io import runtime
 
 
-def scan(detector: Detector, cores: int | None = None):
+def scan(detector: Detector, cores: int | None = None) -> Callable[[Any], Alarm]:
   """A call that runs a detector over streams side by side, from its first state on: one jitted
   program, a scan over time of the vmapped update.
 
@@ -36,21 +38,21 @@ def scan(detector: Detector, cores: int | None = None):
   if cores is not None and cores < 1:
     raise UserError(f"scan needs one core or more; got {cores}")
 
-  def run(xs, at, share: int):
+  def run(xs: Any, at: int | jax.Array, share: int) -> Alarm:
     own = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, at, share, 1), xs)
     start = jax.tree.map(lambda x: jnp.broadcast_to(x, (share,) + jnp.shape(x)), detector.init())
     return jax.lax.scan(jax.vmap(detector.update), start, own)[1]
 
-  programs = {}
+  programs: dict[tuple, Callable[[Any, int], Alarm]] = {}
 
-  def program(xs, share: int):
+  def program(xs: Any, share: int) -> Callable[[Any, int], Alarm]:
     """Compiled for these shapes, before the threads start: each would compile it for itself."""
     key = (jax.tree.structure(xs), *((x.shape, x.dtype) for x in jax.tree.leaves(xs)), share)
     if key not in programs:
       programs[key] = jax.jit(functools.partial(run, share=share)).lower(xs, 0).compile()
     return programs[key]
 
-  def call(xs) -> Alarm:
+  def call(xs: Any) -> Alarm:
     xs = jax.tree.map(jnp.asarray, xs)
     shapes = {x.shape[:2] for x in jax.tree.leaves(xs)}
     if len(shapes) != 1 or len(*shapes) != 2 or 0 in min(shapes):

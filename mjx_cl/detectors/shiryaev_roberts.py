@@ -68,10 +68,10 @@ def shiryaev_roberts(
     warmup=(warmup, warmup == 0 or warmup >= 2, "0 or at least 2"),
   )
 
-  def init():
+  def init() -> ShiryaevRobertsState:
     return ShiryaevRobertsState(cold(), jnp.float32(-jnp.inf), jnp.float32(-jnp.inf))
 
-  def update(state, x):
+  def update(state: ShiryaevRobertsState, x: jax.Array) -> tuple[ShiryaevRobertsState, Alarm]:
     warm, z, ready = standardise(state.warm, jnp.asarray(x, jnp.float32), warmup)
     up = softplus(state.up) + (shift * z - 0.5 * shift**2)
     down = softplus(state.down) + (-shift * z - 0.5 * shift**2) if two_sided else state.down

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import jax.numpy as jnp
 
 from mjx_cl.detectors import multivariate
 from mjx_cl.detectors.base import Alarm, Detector, above, demand
+
+if TYPE_CHECKING:
+  from mjx_cl.rollout.monitor import Residual
 
 
 def surprise(
@@ -50,10 +55,12 @@ def surprise(
     ),
   )
 
-  def init():
+  def init() -> multivariate.Standing:
     return multivariate.standing(smooth, 1)
 
-  def update(state, residual):
+  def update(
+    state: multivariate.Standing, residual: Residual
+  ) -> tuple[multivariate.Standing, Alarm]:
     x, known = multivariate.pick(residual, ("surprise",), warmup > 0)
     state, z, ready = multivariate.trailing_z(state, x, known, smooth, warmup)
     score = jnp.abs(z[0]) if two_sided else z[0]
@@ -65,4 +72,4 @@ def surprise(
   return Detector(init, update)
 
 
-surprise.takes = "residual"
+surprise.takes = "residual"  # type: ignore[attr-defined]

@@ -18,7 +18,7 @@ class ZScoreState(NamedTuple):
 
   warm: Warm
   recent: jax.Array
-  count: jax.Array
+  count: jax.Array  # type: ignore[assignment]
   beyond: jax.Array
 
 
@@ -59,10 +59,10 @@ def z_score(
     warmup=(warmup, warmup == 0 or warmup >= 2, "0 or at least 2"),
   )
 
-  def init():
+  def init() -> ZScoreState:
     return ZScoreState(cold(), jnp.zeros(smooth), jnp.int32(0), jnp.bool_(False))
 
-  def update(state, x):
+  def update(state: ZScoreState, x: jax.Array) -> tuple[ZScoreState, Alarm]:
     x = jnp.asarray(x, jnp.float32)
     recent, y = state.recent, x
     if smooth > 1:

@@ -6,14 +6,18 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy import special, stats
 
+if TYPE_CHECKING:
+  from numpy.typing import ArrayLike
+
 REPS = 20_000
 
 
-def iqm(x: np.ndarray, axis: int = -1) -> np.ndarray:
+def iqm(x: ArrayLike, axis: int = -1) -> np.ndarray:
   """Mean of the middle half: floor(n / 4) values are cut at each end (scipy.stats.trim_mean with
   0.25, rliable's IQM).
   """
@@ -24,7 +28,7 @@ def iqm(x: np.ndarray, axis: int = -1) -> np.ndarray:
 
 
 def interval(
-  x: np.ndarray, statistic: Callable = iqm, seed: int = 0, level: float = 0.95
+  x: ArrayLike, statistic: Callable[..., Any] = iqm, seed: int = 0, level: float = 0.95
 ) -> list[float] | None:
   """Percentile bootstrap interval of `statistic` over runs.
 
@@ -47,7 +51,7 @@ def interval(
     draws = np.take_along_axis(np.broadcast_to(x, (REPS,) + x.shape), rows, 1).reshape(REPS, -1)
   found = statistic(draws, axis=-1)
   low, high = np.quantile(found, [(1 - level) / 2, (1 + level) / 2], method="nearest")
-  return [finite(low), finite(high)]
+  return [finite(low), finite(high)]  # type: ignore[list-item]
 
 
 @functools.lru_cache(maxsize=64)
@@ -94,7 +98,7 @@ def ends(statistics: np.ndarray, level: float = 0.95) -> list[list[float | None]
   return out
 
 
-def censored_median(x: np.ndarray, axis: int = -1) -> np.ndarray:
+def censored_median(x: ArrayLike, axis: int = -1) -> np.ndarray:
   """Median of times in which a censored run counts as infinite (Kaplan-Meier's median where all are
   censored at the end).
   """
@@ -102,7 +106,7 @@ def censored_median(x: np.ndarray, axis: int = -1) -> np.ndarray:
   return np.take(x, (x.shape[axis] - 1) // 2, axis)
 
 
-def share(x: np.ndarray, axis: int = -1) -> np.ndarray:
+def share(x: ArrayLike, axis: int = -1) -> np.ndarray:
   """Mean of zeros and ones."""
   return np.mean(np.asarray(x, float), axis)
 
@@ -132,6 +136,6 @@ def poisson(count: int, level: float = 0.95) -> tuple[float, float]:
   return low, float(special.gammaincinv(count + 1, 1 - tail))
 
 
-def finite(x: float | None) -> float | None:
+def finite(x: float | np.ndarray | None) -> float | None:
   """float, None where undefined or infinite."""
   return float(x) if x is not None and np.isfinite(x) else None

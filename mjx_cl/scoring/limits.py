@@ -18,13 +18,18 @@ from __future__ import annotations
 
 import functools
 import math
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from scipy import special
 
 from mjx_cl.errors import UserError
 from mjx_cl.scoring import intervals as bootstrap
+
+if TYPE_CHECKING:
+  from collections.abc import Iterable
+
+  from numpy.typing import ArrayLike
 
 # 2 x 0.583: mean overshoot at both ends of a Gaussian random walk, Siegmund 1985, Sequential
 # Analysis
@@ -100,7 +105,7 @@ class Parameters(NamedTuple):
   after: Conditional
 
 
-def _streams(x, name: str) -> np.ndarray:
+def _streams(x: ArrayLike, name: str) -> np.ndarray:
   """(T, S, C) from (T,), (T, S) or (T, S, C)."""
   x = np.asarray(x, float)
   if not 1 <= x.ndim <= 3:
@@ -119,7 +124,7 @@ class Lagged(NamedTuple):
   known: np.ndarray
 
 
-def lagged(x, order: int) -> Lagged:
+def lagged(x: ArrayLike | Lagged, order: int) -> Lagged:
   """Streams (T,), (T, S) or (T, S, C), or what this gave, beside their past."""
   if isinstance(x, Lagged):
     return x
@@ -167,7 +172,7 @@ class Healthy:
     streams: float (T,), (T, S) or (T, S, C). order: of the autoregression.
   """
 
-  def __init__(self, streams, order: int = 8):
+  def __init__(self, streams: ArrayLike, order: int = 8) -> None:
     self.streams, self.order = _streams(streams, "nominal"), order
 
   @functools.cached_property
@@ -191,11 +196,11 @@ class Healthy:
     return innovations(self.streams, self.model)[..., 0]
 
 
-def _healthy(nominal, order: int) -> Healthy:
+def _healthy(nominal: ArrayLike | Healthy, order: int) -> Healthy:
   return nominal if isinstance(nominal, Healthy) else Healthy(nominal, order)
 
 
-def fit(nominal, faulty, order: int = 8) -> Parameters:
+def fit(nominal: ArrayLike | Healthy, faulty: ArrayLike, order: int = 8) -> Parameters:
   """Conditional densities before and after the change, by least squares over all streams.
 
   Args:
@@ -216,7 +221,7 @@ def fit(nominal, faulty, order: int = 8) -> Parameters:
   return Parameters(healthy.model, _conditional(faulty, healthy.order, healthy.floor))
 
 
-def innovations(x, model: Conditional) -> np.ndarray:
+def innovations(x: ArrayLike | Lagged, model: Conditional) -> np.ndarray:
   """Whitened one-step errors (T - order, S, C) of streams x, or of `lagged` ones: independent
   standard normal where the model holds; nan where a lag is unknown.
   """
@@ -227,14 +232,14 @@ def innovations(x, model: Conditional) -> np.ndarray:
   )
 
 
-def log_density(x, model: Conditional) -> np.ndarray:
+def log_density(x: ArrayLike | Lagged, model: Conditional) -> np.ndarray:
   """Ln p(x_t | past) of each step, but for a constant, (T - order, S); nan where a lag
   is unknown.
   """
   return -0.5 * (np.sum(innovations(x, model) ** 2, -1) + model.log_det)
 
 
-def log_ratio(x, parameters: Parameters) -> np.ndarray:
+def log_ratio(x: ArrayLike | Lagged, parameters: Parameters) -> np.ndarray:
   """Ln p_after(x_t | past) - ln p_before(x_t | past) of each step, (T - order, S); nan where a lag
   is unknown.
   """
@@ -242,7 +247,9 @@ def log_ratio(x, parameters: Parameters) -> np.ndarray:
   return log_density(x, parameters.after) - log_density(x, parameters.before)
 
 
-def information(nominal, faulty, order: int = 8, reps: int = REPS) -> dict:
+def information(
+  nominal: ArrayLike | Healthy, faulty: ArrayLike, order: int = 8, reps: int = REPS
+) -> dict:
   """Estimated KL rate of the faulty from the healthy channel, with Gaussian autoregressions fitted
   on other seeds than it is measured on.
 
@@ -288,7 +295,7 @@ def information(nominal, faulty, order: int = 8, reps: int = REPS) -> dict:
   }
 
 
-def whiten(x, order: int = 8) -> tuple[np.ndarray, Conditional]:
+def whiten(x: ArrayLike, order: int = 8) -> tuple[np.ndarray, Conditional]:
   """Innovations (T - order, S) of one channel x (T,) or (T, S) under its own autoregression, in
   deviations, and the autoregression.
   """
@@ -299,7 +306,7 @@ def whiten(x, order: int = 8) -> tuple[np.ndarray, Conditional]:
   return innovations(x, model)[..., 0], model
 
 
-def ljung_box(e, lags: int = 20, fitted: int = 0) -> tuple[float, float]:
+def ljung_box(e: ArrayLike, lags: int = 20, fitted: int = 0) -> tuple[float, float]:
   """Test that streams are white.
 
     Q = sum over streams and k = 1 .. lags of n (n + 2) r_k^2 / (n - k),   chi-square with (streams
@@ -329,7 +336,9 @@ def ljung_box(e, lags: int = 20, fitted: int = 0) -> tuple[float, float]:
   return q, float(special.chdtrc(e.shape[1] * lags - fitted, q))
 
 
-def closed_form(nominal, faulty, arl0: float, order: int = 8, lags: int = 20) -> dict:
+def closed_form(
+  nominal: ArrayLike | Healthy, faulty: ArrayLike, arl0: float, order: int = 8, lags: int = 20
+) -> dict:
   """The closed form of `brownian` for one channel, where it applies: after whitening a mean shift
   in independent values.
 
@@ -391,13 +400,20 @@ def _delays(arl0: float, e: np.ndarray) -> list[float | None]:
   e = e.reshape(len(e), -1)
   count, total = np.isfinite(e).sum(0), np.nansum(e, 0)
   w = bootstrap.weights(len(total), REPS)
-  ((low, high),) = bootstrap.ends(((w @ total) / (w @ count))[None])
+  low: Any
+  high: Any
+  ((low, high),) = bootstrap.ends(((w @ total) / (w @ count))[None])  # type: ignore[misc]
   if low > 0 or high < 0:
     return [brownian(arl0, x).delay for x in sorted((low, high), key=abs, reverse=True)]
   return [brownian(arl0, max(-low, high)).delay, None]
 
 
-def efficiency(oracle_latencies, detector_latencies, horizon: int, reps: int = REPS) -> dict:
+def efficiency(
+  oracle_latencies: Iterable[float | None],
+  detector_latencies: Iterable[float | None],
+  horizon: int,
+  reps: int = REPS,
+) -> dict:
   """Delay of the oracle over that of a detector, both at one ARL0 and on the same streams.
 
     restricted mean delay = mean of min(latency_steps + 1, horizon), a miss counts the horizon;
@@ -422,6 +438,7 @@ def efficiency(oracle_latencies, detector_latencies, horizon: int, reps: int = R
       f"{len(sides[1])}"
     )
   oracle, mine = (np.minimum(np.where(np.isnan(x), np.inf, x) + 1, horizon) for x in sides)
+  intervals: list[list[float | None] | None]
   value, intervals = float(oracle.mean() / mine.mean()), [None, None, None]
   if len(mine) > 1:
     w = bootstrap.weights(len(mine), reps)

@@ -25,7 +25,7 @@ and sigmoid it does not share.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from scipy import special, stats
@@ -33,6 +33,9 @@ from scipy import special, stats
 from mjx_cl.errors import UserError
 from mjx_cl.scoring import alarms
 from mjx_cl.scoring import intervals as bootstrap
+
+if TYPE_CHECKING:
+  from numpy.typing import ArrayLike
 
 HORIZON_S = 20.0  # a later alarm is no detection, unless a suite says otherwise [s after onset]
 HALF_S = 5.0  # delay after which half of what an immediate alarm saves is lost [s]
@@ -113,7 +116,7 @@ def per_stream(
 
 def auroc(
   faulty: list[np.ndarray], healthy: list[np.ndarray], reps: int = REPS
-) -> tuple[float | None, list[float] | None]:
+) -> tuple[float | None, list[float | None] | None]:
   """P(score of a faulty step > score of a healthy step) + P(equal) / 2, pooled over streams, and
   its bootstrap interval over seeds.
 
@@ -155,11 +158,11 @@ def auroc(
 
 
 def row(
-  alarm,
-  score,
-  onset,
-  nominal_alarm,
-  nominal_score,
+  alarm: ArrayLike,
+  score: ArrayLike,
+  onset: ArrayLike,
+  nominal_alarm: ArrayLike,
+  nominal_score: ArrayLike,
   control_s: float,
   count_from: int = 0,
   reps: int = REPS,
@@ -255,7 +258,13 @@ def _scaled(x: float | None, by: float) -> float | None:
 
 
 def _demand(
-  alarm, score, onset, nominal_alarm, nominal_score, horizon: int, count_from: int
+  alarm: np.ndarray,
+  score: np.ndarray,
+  onset: np.ndarray,
+  nominal_alarm: np.ndarray,
+  nominal_score: np.ndarray,
+  horizon: int,
+  count_from: int,
 ) -> None:
   """Refuses recordings that would be scored on less than was promised."""
   if (
@@ -280,7 +289,7 @@ def _demand(
     )
 
 
-def arl0(alarm, count_from: int = 0) -> dict:
+def arl0(alarm: ArrayLike, count_from: int = 0) -> dict:
   """Average run length to a false alarm on healthy streams, with restarts: steps / alarms.
 
   Args:
@@ -302,7 +311,7 @@ def arl0(alarm, count_from: int = 0) -> dict:
   }
 
 
-def episode_alarm_probability(alarm, episode, count_from: int = 0) -> dict:
+def episode_alarm_probability(alarm: ArrayLike, episode: ArrayLike, count_from: int = 0) -> dict:
   """Share of healthy episodes with an alarm.
 
   Only whole episodes count: those that begin at `count_from` or later and are followed by another
@@ -407,7 +416,7 @@ def overall(rows: list[dict], reps: int = REPS) -> Overall:
 
 def difference(
   rows: list[dict], first: str, second: str, measure: str = "cost_standard", reps: int = REPS
-) -> tuple[float, list[float]]:
+) -> tuple[float, list[float | None] | None]:
   """How far detector `first` lies above `second` in the mean over all robots x faults x severities,
   and its 95 % interval.
 
@@ -450,6 +459,8 @@ def _drawn(rows: list[dict], reps: int) -> np.ndarray | None:
   """Means over one detector's rows on seeds drawn anew, float (measures of per_stream, reps), the
   same draw for every detector; None without streams.
   """
+  drawn: Any  # a number until the first robot is added
+  strata: dict[str, list[dict]]
   drawn, strata = 0.0, {}
   for r in rows:
     strata.setdefault(r["robot"], []).append(r)
@@ -461,7 +472,7 @@ def _drawn(rows: list[dict], reps: int) -> np.ndarray | None:
         f"the faults of robot {robot!r} must have the same seeds; got "
         f"{sorted({r['streams'] for r in mine})} streams"
       )
-    sums = 0.0
+    sums: Any = 0.0
     for r in mine:
       latency = np.array([np.inf if x is None else x for x in r["stream_latency_steps"]], float)
       sums = sums + np.stack(
@@ -480,9 +491,10 @@ def _means(rows: list[dict], reps: int) -> dict:
   names, drawn = list(per_stream(np.zeros(1), np.zeros(1), 1, 1.0)), _drawn(rows, reps)
   enough = drawn is not None
   strata = {r["robot"]: r for r in rows}
-  ends = bootstrap.ends(drawn) if enough else [None] * len(names)
+  ends = bootstrap.ends(drawn) if enough else [None] * len(names)  # type: ignore[arg-type]
   seeds = sum(r["streams"] for r in strata.values())
-  out = {}
+  out: dict[str, Any] = {}
+  interval: list[float | None] | list[float] | None
   for name, interval in zip(names, ends):
     value = (
       float(np.mean([r[name] for r in rows])) if all(r[name] is not None for r in rows) else None

@@ -28,12 +28,16 @@ def normalise(
     least: None is returned unless reference - none is at least this share of pre; neither is
       anything made of a pre of 0 or less.
   """
-  if None in (final, none, reference, pre) or pre <= 0 or reference - none < least * pre:
+  if (
+    None in (final, none, reference, pre)
+    or pre <= 0  # type: ignore[operator]
+    or reference - none < least * pre  # type: ignore[operator]
+  ):
     return None
-  return (final - none) / (reference - none)
+  return (final - none) / (reference - none)  # type: ignore[operator]
 
 
-def rows(runs, expert=None, least: float = LEAST) -> list[dict]:
+def rows(runs: list[dict], expert: list[dict] | None = None, least: float = LEAST) -> list[dict]:
   """Normalised recovery of every stream whose seed also lived in arm `none`.
 
   Args:
@@ -79,7 +83,7 @@ def rows(runs, expert=None, least: float = LEAST) -> list[dict]:
   return out
 
 
-def summarise(scored) -> dict:
+def summarise(scored: list[dict]) -> dict:
   """Per arm: seeds with a defined value, seeds without, IQM of normalised recovery with its
   bootstrap interval.
   """
@@ -96,7 +100,7 @@ def summarise(scored) -> dict:
   return out
 
 
-def difference(scored, method: str, other: str) -> dict:
+def difference(scored: list[dict], method: str, other: str) -> dict:
   """Paired difference of two arms, method - other: IQM over the seeds in which both are defined,
   with its 95 % bootstrap interval over seeds.
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import pathlib
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -24,6 +25,14 @@ from mjx_cl.config import AdaptConfig
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.io import folders, tables
 from mjx_cl.scoring import events, intervals, normalised_recovery
+
+if TYPE_CHECKING:
+  import os
+  from collections.abc import Callable, Sequence
+
+  from numpy.typing import ArrayLike
+
+  from mjx_cl.config import RunConfig
 
 SHARE = 0.95  # of the best snapshot's reward, from which a stop is good enough
 HORIZON = 10_000  # control steps that the robot lives on with the weights of its stop
@@ -60,7 +69,7 @@ COLUMNS = (
 )
 
 
-def oracle(age, reward, share: float = SHARE) -> int:
+def oracle(age: Sequence[int] | np.ndarray, reward: ArrayLike, share: float = SHARE) -> int:
   """Index of the earliest snapshot whose reward reaches `share` of the best one's: reward >= best -
   (1 - share) |best|.
 
@@ -75,7 +84,7 @@ def oracle(age, reward, share: float = SHARE) -> int:
   return int(np.flatnonzero(reward >= best - (1 - share) * abs(best))[0])
 
 
-def at(age, reward, stop: int) -> float:
+def at(age: ArrayLike, reward: np.ndarray, stop: int) -> float:
   """Reward of the weights with which adaptation ended after `stop` control steps: of the last
   snapshot up to then.
   """
@@ -110,7 +119,7 @@ def spans(happened: list[dict]) -> list[dict]:
   return out
 
 
-def unrecoverable(runs) -> dict[int, bool | None]:
+def unrecoverable(runs: list[dict]) -> dict[int, bool | None]:
   """Seed -> no arm of the run reached half of normalised recovery; None where it is undefined, as
   of a robot that lost little.
   """
@@ -122,7 +131,9 @@ def unrecoverable(runs) -> dict[int, bool | None]:
   }
 
 
-def rows(snapshots, happened, runs, updates) -> list[dict]:
+def rows(
+  snapshots: list[dict], happened: list[dict], runs: list[dict], updates: np.ndarray
+) -> list[dict]:
   """Every adaptation that the stop rule may end, against the snapshots of the same seed.
 
     oracle_stop_steps, own_stop_steps: control steps from the start of its adaptation to the oracle
@@ -146,7 +157,7 @@ def rows(snapshots, happened, runs, updates) -> list[dict]:
   curves: dict[tuple, list] = {}
   for s in snapshots:
     curves.setdefault((s["stream"], s["step"] + 1 - s["since_start"]), []).append(s)
-  total = {}
+  total: dict[int, int] = {}
   for r in runs:
     total[r["stream"]] = total.get(r["stream"], 0) + r["updates"]
   streams = sorted({(r["stream"], r["arm"], r["seed"]) for r in runs if stops(ARMS[r["arm"]])})
@@ -177,7 +188,7 @@ def rows(snapshots, happened, runs, updates) -> list[dict]:
   return sorted(out, key=lambda r: (r["stream"], -1 if r["since"] is None else r["since"]))
 
 
-def _against(curve, since, stop, done) -> dict:
+def _against(curve: list[dict], since: int, stop: int | None, done: Callable[[int], int]) -> dict:
   """The stop of one adaptation against the snapshots `curve`; done: control step -> updates taken
   by then.
   """
@@ -207,7 +218,7 @@ def _against(curve, since, stop, done) -> dict:
   }
 
 
-def summarise(judged) -> dict:
+def summarise(judged: list[dict]) -> dict:
   """Aggregates of `rows`, as summary.json's `stop_rule`: per arm counts with Wilson's interval, IQM
   and means with bootstrap intervals.
 
@@ -229,11 +240,11 @@ def summarise(judged) -> dict:
       "ended": len(ended),
     }
 
-    def count(name, hits, n):
+    def count(name: str, hits: int, n: int) -> None:
       p = intervals.wilson(hits, n)
       out[name], out[name + "_ci"] = hits, None if p is None else [x * n for x in p]
 
-    def put(name, values, statistic):
+    def put(name: str, values: list[float], statistic: Callable[..., Any]) -> None:
       out[name] = intervals.finite(statistic(values)) if values else None
       out[name + "_ci"] = intervals.interval(values, statistic) if values else None
 
@@ -256,7 +267,7 @@ def summarise(judged) -> dict:
   return {"share": SHARE, "horizon_steps": HORIZON, "arms": arms}
 
 
-def of_folder(folder) -> list[dict]:
+def of_folder(folder: str | os.PathLike) -> list[dict]:
   """`rows` of a finished run with snapshots."""
   snapshots, runs = _read(folder, "snapshots"), _read(folder, "runs")
   columns = _table(folder, "trace", ["stream", "updates"])
@@ -268,7 +279,7 @@ def of_folder(folder) -> list[dict]:
 # ---- the rule with a signal left out -------------------------------------------------------------
 
 
-def ablation(folder, **rule) -> list[dict]:
+def ablation(folder: str | os.PathLike, **rule: Any) -> list[dict]:
   """When the stop rule would have ended the first adaptation of each stream that never stops, had
   it not asked a signal to settle.
 
@@ -302,6 +313,7 @@ def ablation(folder, **rule) -> list[dict]:
     )
   except (OSError, ValueError, KeyError, TypeError) as e:
     raise FileError(f"{folder} holds no run: {e}") from None
+  curves: dict[tuple[int, int], list[dict]]
   chunks, curves = _read(folder, "signals"), {}
   if (pathlib.Path(folder) / "snapshots.parquet").exists():
     for s in _read(folder, "snapshots"):
@@ -351,7 +363,7 @@ def ablation(folder, **rule) -> list[dict]:
   return out
 
 
-def ablated(rows) -> dict:
+def ablated(rows: list[dict]) -> dict:
   """Aggregates of `ablation`: signal left out ("" none) -> {adaptations, converged, aborted,
   own_stop_steps_median, early, lost_share}.
 
@@ -379,7 +391,9 @@ def ablated(rows) -> dict:
   return out
 
 
-def _relive(own, since, names, config):
+def _relive(
+  own: dict[int, list[dict]], since: dict[int, int], names: tuple[str, ...], config: AdaptConfig
+) -> dict[int, np.ndarray]:
   """Stream -> decisions (1 + 6, chunks) of the phase machine: with all signals, then with each left
   out.
   """
@@ -399,8 +413,16 @@ def _relive(own, since, names, config):
   now = (np.arange(len(rows), dtype=np.int32) + 1) * length
   counts = np.vstack([np.ones(len(names), bool), ~np.eye(len(names), dtype=bool)])
 
-  def live(signals, posture, acceptance, since, counts):
-    def step(state, x):
+  def live(
+    signals: jax.Array,
+    posture: jax.Array,
+    acceptance: jax.Array,
+    since: jax.Array,
+    counts: jax.Array,
+  ) -> jax.Array:
+    def step(
+      state: decide.PhaseState, x: tuple[jax.Array, jax.Array, jax.Array, jax.Array]
+    ) -> tuple[decide.PhaseState, jax.Array]:
       signals, posture, acceptance, now = x
       falls = (since >= now - length) & (since < now)
       state, decision, _ = decide.update(
@@ -456,7 +478,7 @@ LEARNS = (
 )  # of AdaptConfig: what its weights depend on
 
 
-def told(config) -> dict[int, int]:
+def told(config: RunConfig) -> dict[int, int]:
   """Seed -> control steps from the true onset to the oracle stop, for the arms of a run that end
   there; {} where none does.
 
@@ -473,7 +495,7 @@ def told(config) -> dict[int, int]:
   """
   if not any(ARMS[arm].end.told for arm in config.arms):
     return {}
-  folder = pathlib.Path(config.stops)
+  folder = pathlib.Path(config.stops)  # type: ignore[arg-type]
   try:
     theirs = tables.read_json(folder / "config.json")
   except FileError as e:
@@ -512,12 +534,12 @@ def told(config) -> dict[int, int]:
 # ---- files ---------------------------------------------------------------------------------------
 
 
-def _table(folder, name, columns=None):
+def _table(folder: str | os.PathLike, name: str, columns: list[str] | None = None) -> pyarrow.Table:
   try:
     return pyarrow.parquet.read_table(pathlib.Path(folder) / f"{name}.parquet", columns=columns)
   except (OSError, pyarrow.ArrowException) as e:
     raise FileError(f"cannot read {name}.parquet of {folder}: {str(e).splitlines()[0]}") from None
 
 
-def _read(folder, name) -> list[dict]:
+def _read(folder: str | os.PathLike, name: str) -> list[dict]:
   return _table(folder, name).to_pylist()

@@ -36,6 +36,7 @@ def narrow(
   top = float(known.max())
   top += max(abs(top) * 1e-3, 1e-6)
   grid = np.unique(np.append(np.quantile(known, 1 - np.geomspace(0.3, 1e-5, TOGETHER - 1)), top))
+  tried: dict[float, int]
   low, high, tried = float(known.min()), math.inf, {}
   for _ in range(ROUNDS):
     grid = np.append(grid, [grid[-1]] * (TOGETHER - len(grid)))
