@@ -17,9 +17,10 @@ import re
 import signal
 import sys
 from dataclasses import dataclass
-from typing import Annotated, Union
+from typing import TYPE_CHECKING, Annotated, Any, Union
 
 import tyro
+from tyro.conf import Positional
 
 from mjx_cl import __version__
 from mjx_cl.cli import commands
@@ -28,7 +29,9 @@ from mjx_cl.config import FaultConfig, RunConfig
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.io.interrupt import Interruptible, Lasting, later
 
-Positional = tyro.conf.Positional
+if TYPE_CHECKING:
+  import types
+  from collections.abc import Callable
 
 
 @dataclass(frozen=True)
@@ -413,7 +416,7 @@ COMMANDS = (
   List,
   Doctor,
 )  # Run is `mjx-cl run`, done by commands.do_run
-Command = Union[  # noqa: UP007  of a computed tuple
+Command = Union[  # type: ignore[valid-type]  # noqa: UP007  of a computed tuple
   tuple(
     Annotated[
       kind,
@@ -426,7 +429,7 @@ Command = Union[  # noqa: UP007  of a computed tuple
 DO = {kind: getattr(commands, f"do_{kind.__name__.lower()}") for kind in COMMANDS}
 
 
-def parse(argv: list[str] | None):
+def parse(argv: list[str] | None) -> Any:
   """Arguments -> command. tyro's framed report of a mistake becomes one line. `--version` alone
   prints it and ends.
   """
@@ -436,7 +439,7 @@ def parse(argv: list[str] | None):
   report = io.StringIO()
   try:
     with contextlib.redirect_stderr(report):
-      return tyro.cli(
+      return tyro.cli(  # type: ignore[call-overload]
         Command,
         prog="mjx-cl",
         args=argv,
@@ -458,12 +461,12 @@ def parse(argv: list[str] | None):
     ) from None
 
 
-def attempt(do, again=lambda: "") -> int:
+def attempt(do: Callable[[], object], again: Callable[[], str] = lambda: "") -> int:
   """Exit status of `do()`; what goes wrong becomes one line on standard error, an interrupt one
   that ends in `again()`.
   """
 
-  def stop(number, frame):
+  def stop(number: int, frame: types.FrameType | None) -> None:
     if not later(number, frame):
       raise KeyboardInterrupt
 
@@ -481,7 +484,7 @@ def attempt(do, again=lambda: "") -> int:
       signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-def _attempt(do, again) -> int:
+def _attempt(do: Callable[[], object], again: Callable[[], str]) -> int:
   try:
     do()
     return 0
@@ -513,9 +516,9 @@ def _attempt(do, again) -> int:
 
 def main(argv: list[str] | None = None) -> int:
   """Entry point of `mjx-cl`."""
-  command = None
+  command: Any = None
 
-  def do():
+  def do() -> None:
     nonlocal command
     command = parse(argv)
     if not isinstance(command, (Plot, Query, Report)):
@@ -527,7 +530,7 @@ def main(argv: list[str] | None = None) -> int:
     with apart(command):
       DO[type(command)](command)
 
-  def again():
+  def again() -> str:
     kind = type(command) if command else None
     return (
       "; what was saved can be resumed with --resume"
