@@ -6,7 +6,13 @@ alone starts no JAX. Call `setup` first. Other modules are private unless the do
 them.
 """
 
+from __future__ import annotations
+
 import importlib
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+  from typing import Any
 
 __version__ = "0.1.0"
 __all__ = [
@@ -20,7 +26,7 @@ __all__ = [
 ]
 
 
-def __getattr__(name: str):
+def __getattr__(name: str) -> Any:
   if name not in __all__:
     raise AttributeError(f"module 'mjx_cl' has no attribute {name!r}; it has: {', '.join(__all__)}")
   # `setup` comes before the first use of JAX, all else brings JAX with it

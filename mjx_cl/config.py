@@ -10,12 +10,19 @@ import math
 import numbers
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
 from mjx_cl.errors import UserError, choose
 from mjx_cl.sizes import SIZES
+
+if TYPE_CHECKING:
+  from typing import TypeVar
+
+  from _typeshed import DataclassInstance
+
+  Settled = TypeVar("Settled", bound=DataclassInstance)
 
 # decisions between two rounds of updates, of a training as of a run, where the stop rule looks as
 # often
@@ -23,7 +30,7 @@ CHUNK = 64
 FOREVER = 2**31 - 1  # control steps that no run outlasts
 
 
-def positive(config, *names: str) -> None:
+def positive(config: object, *names: str) -> None:
   """Raises unless every named field is a finite number above 0."""
   for name in names:
     value = getattr(config, name)
@@ -31,7 +38,7 @@ def positive(config, *names: str) -> None:
       raise UserError(f"{name} must be above 0; got {value}")
 
 
-def not_below_0(config, *names: str) -> None:
+def not_below_0(config: object, *names: str) -> None:
   """Raises unless every named field is a finite number of at least 0."""
   for name in names:
     value = getattr(config, name)
@@ -64,7 +71,7 @@ def kinds(where: str, annotations: dict[str, str], values: dict, before: str = "
       )
 
 
-def whole(config, *names: str, most: int = FOREVER - 1) -> None:
+def whole(config: object, *names: str, most: int = FOREVER - 1) -> None:
   """Raises unless every named field is a whole number of at least 0 and at most `most`."""
   for name in names:
     value = getattr(config, name)
@@ -123,7 +130,7 @@ Settings = Annotated[
 ]
 
 
-def fraction(config, *names: str) -> None:
+def fraction(config: object, *names: str) -> None:
   """Raises unless every named field lies in [0, 1]."""
   for name in names:
     value = getattr(config, name)
@@ -188,7 +195,7 @@ class DreamerConfig:
   slow_rate: float = 0.02
   obs_scale: tuple[float, ...] | str | None = None
 
-  def __post_init__(self):
+  def __post_init__(self) -> None:
     choose("size", self.size, SIZES)
     if isinstance(self.obs_scale, (list, tuple)):
       object.__setattr__(self, "obs_scale", tuple(self.obs_scale))  # a card holds a list
@@ -280,7 +287,7 @@ class TrainConfig:
   fault: str | None = None
   severity: float = 1.0
 
-  def __post_init__(self):
+  def __post_init__(self) -> None:
     whole(
       self,
       "envs",
@@ -384,7 +391,7 @@ class AdaptConfig:
   period_steps: int = 3520
   random_steps: int = 6000
 
-  def __post_init__(self):
+  def __post_init__(self) -> None:
     whole(
       self,
       "start_windows",
@@ -461,7 +468,7 @@ class FaultConfig:
   period: int = 1000
   share: float = 0.5
 
-  def __post_init__(self):
+  def __post_init__(self) -> None:
     if self.target == "random":
       object.__setattr__(self, "target", None)
 
@@ -515,7 +522,7 @@ class RunConfig(FaultConfig):
   parts: bool = False
   residuals: bool = False
 
-  def __post_init__(self):
+  def __post_init__(self) -> None:
     super().__post_init__()
     positive(self, "steps", "seeds")
     if self.steps >= FOREVER:
@@ -581,7 +588,7 @@ def recorded(kind: type, record: Mapping[str, Any]) -> dict[str, Any]:
   return {name: value for name, value in record.items() if name in names}
 
 
-def replace(config, **changes):
+def replace(config: Settled, **changes: Any) -> Settled:
   """dataclasses.replace that names the valid fields when it is given an unknown one."""
   known = {f.name for f in dataclasses.fields(config)}
   for name in changes:

@@ -1,5 +1,15 @@
 """Errors that reach a user as one line. The CLI prints the message and leaves with `exit_code`."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+  from collections.abc import Mapping
+  from typing import TypeVar
+
+  Member = TypeVar("Member")
+
 
 class UserError(Exception):
   """Wrong arguments, names or ranges: exit code 2."""
@@ -17,7 +27,7 @@ class FileError(UserError):
   exit_code = 1
 
 
-def choose(kind: str, name: str, table) -> object:
+def choose(kind: str, name: str, table: Mapping[str, Member]) -> Member:
   """table[name], or a UserError that names every valid choice."""
   try:
     return table[name]

@@ -16,7 +16,7 @@ import os
 import re
 import signal
 import sys
-from typing import Annotated, Union
+from typing import TYPE_CHECKING, Annotated, Any, Union
 
 import tyro
 
@@ -43,6 +43,10 @@ from mjx_cl.config import FaultConfig
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.io.interrupt import Interruptible, Lasting, later
 
+if TYPE_CHECKING:
+  import types
+  from collections.abc import Callable
+
 COMMANDS = (
   Run,
   Train,
@@ -59,7 +63,7 @@ COMMANDS = (
   List,
   Doctor,
 )  # Run is `mjx-cl run`, done by commands.do_run
-Command = Union[  # noqa: UP007  of a computed tuple
+Command = Union[  # type: ignore[valid-type]  # noqa: UP007  of a computed tuple
   tuple(
     Annotated[
       kind,
@@ -72,7 +76,7 @@ Command = Union[  # noqa: UP007  of a computed tuple
 DO = {kind: getattr(commands, f"do_{kind.__name__.lower()}") for kind in COMMANDS}
 
 
-def parse(argv: list[str] | None):
+def parse(argv: list[str] | None) -> Any:
   """Arguments -> command. tyro's framed report of a mistake becomes one line. `--version` alone
   prints it and ends.
   """
@@ -82,7 +86,7 @@ def parse(argv: list[str] | None):
   report = io.StringIO()
   try:
     with contextlib.redirect_stderr(report):
-      return tyro.cli(
+      return tyro.cli(  # type: ignore[call-overload]
         Command,
         prog="mjx-cl",
         args=argv,
@@ -104,12 +108,12 @@ def parse(argv: list[str] | None):
     ) from None
 
 
-def attempt(do, again=lambda: "") -> int:
+def attempt(do: Callable[[], object], again: Callable[[], str] = lambda: "") -> int:
   """Exit status of `do()`; what goes wrong becomes one line on standard error, an interrupt one
   that ends in `again()`.
   """
 
-  def stop(number, frame):
+  def stop(number: int, frame: types.FrameType | None) -> None:
     if not later(number, frame):
       raise KeyboardInterrupt
 
@@ -127,7 +131,7 @@ def attempt(do, again=lambda: "") -> int:
       signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-def _attempt(do, again) -> int:
+def _attempt(do: Callable[[], object], again: Callable[[], str]) -> int:
   try:
     do()
     return 0
@@ -159,9 +163,9 @@ def _attempt(do, again) -> int:
 
 def main(argv: list[str] | None = None) -> int:
   """Entry point of `mjx-cl`."""
-  command = None
+  command: Any = None
 
-  def do():
+  def do() -> None:
     nonlocal command
     command = parse(argv)
     if not isinstance(command, (Plot, Query, Report)):
@@ -173,7 +177,7 @@ def main(argv: list[str] | None = None) -> int:
     with apart(command):
       DO[type(command)](command)
 
-  def again():
+  def again() -> str:
     kind = type(command) if command else None
     return (
       "; what was saved can be resumed with --resume"

@@ -118,6 +118,7 @@ def do_bench(args: Bench) -> None:
     if part.name not in done and part.name not in found:
       bench.check(part, robots)
   estimates = bench.estimates(parts, robots)
+  others: dict[str, list[str]]
   chosen, others = {p.name for p in parts}, {}
   for name, text in bench.standing(out, [p for p in suite.parts if p.name not in chosen])[
     1
@@ -334,7 +335,7 @@ def do_certify(args: Certify) -> None:
     for line in certify.summary(rows):
       print(f"{line['name']}: {line['value']}")
     print(f"files in {args.out}")
-  for line in faulty:
+  for line in faulty:  # type: ignore[assignment]
     say(f"mjx-cl: {line}")
 
 
@@ -352,7 +353,7 @@ def do_record(args: Record) -> None:
   folders.probe(out)
   told = [0.0]
 
-  def progress(part, done, steps, lanes):
+  def progress(part: str, done: int, steps: int, lanes: int) -> None:
     now = time.monotonic()
     if now - told[0] > 10 or done >= steps:
       told[0] = now
@@ -437,7 +438,7 @@ def do_leaderboard(args: Leaderboard) -> None:
     taken.add(name)
   told = [0.0]
 
-  def progress(robot, name, done, total, seconds):
+  def progress(robot: str, name: str, done: int, total: int, seconds: float) -> None:
     if time.monotonic() - told[0] > 2 or done == total:
       told[0] = time.monotonic()
       say(

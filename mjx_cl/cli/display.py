@@ -9,6 +9,16 @@ import json
 import math
 import sys
 import time
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+  from collections.abc import Collection, Iterator, Mapping, Sequence
+  from typing import Any, Self, TextIO
+
+  from rich.table import Table
+
+  from mjx_cl.runs.run import Progress
+  from mjx_cl.runs.suite import Estimate, Part, Suite
 
 
 def say(text: str) -> None:
@@ -26,7 +36,7 @@ def clock(seconds: float) -> str:
   )
 
 
-def show(table) -> None:
+def show(table: Table) -> None:
   """Prints a rich table; as wide as it likes where no terminal says how wide that is, so that no
   cell is cut.
   """
@@ -36,10 +46,10 @@ def show(table) -> None:
 
 
 # standard output of a command with --json, while whatever else is printed goes to standard error
-RESULT = []
+RESULT: list[TextIO] = []
 
 
-def emit(value) -> None:
+def emit(value: Any) -> None:
   """The one JSON value of a command."""
   from mjx_cl.io.tables import plain
 
@@ -47,7 +57,7 @@ def emit(value) -> None:
 
 
 @contextlib.contextmanager
-def apart(command):
+def apart(command: object) -> Iterator[None]:
   """With --json nothing but `emit` reaches standard output, also not what a user's detector or
   robot prints.
   """
@@ -133,7 +143,9 @@ def show_summary(s: dict, out: str) -> None:
   )
 
 
-def plan_lines(suite, parts, done, estimates) -> list[str]:
+def plan_lines(
+  suite: Suite, parts: Sequence[Part], done: Collection[str], estimates: Mapping[str, Estimate]
+) -> list[str]:
   """The plan of a suite for a reader."""
   lines = [f"{suite.name}: {suite.about}"]
   width = max([4, *(len(p.name) for p in parts)])
@@ -156,7 +168,7 @@ def plan_lines(suite, parts, done, estimates) -> list[str]:
   return lines + [f"  note, {which}: {text}" for text, which in bench.notes(todo)]
 
 
-def detect_table(rows: list[dict], columns: bool):
+def detect_table(rows: list[dict], columns: bool) -> Table:
   """Rows of a detection's summary as a table in which cells wrap and nothing is cut, with or
   without the columns that alarms are in.
   """
@@ -184,7 +196,7 @@ def detect_table(rows: list[dict], columns: bool):
   return table
 
 
-def json_value(x):
+def json_value(x: Any) -> Any:
   """A database's value as JSON has it: decimals are numbers, what is not finite is null, keys of a
   map and whatever else there is are text.
   """
@@ -204,7 +216,7 @@ def json_value(x):
 class RunDisplay:
   """Live table of a run on a terminal; a plain line now and then elsewhere."""
 
-  def __init__(self):
+  def __init__(self) -> None:
     from rich.console import Console
     from rich.live import Live
 
@@ -214,18 +226,19 @@ class RunDisplay:
       if self.console.is_terminal
       else None
     )
+    self.first: tuple[float, int] | None
     self.begin, self.first, self.told = time.monotonic(), None, 0.0
 
-  def __enter__(self):
+  def __enter__(self) -> Self:
     if self.live:
       self.live.start()
     return self
 
-  def __exit__(self, *_):
+  def __exit__(self, *_: object) -> None:
     if self.live:
       self.live.stop()
 
-  def __call__(self, p) -> None:
+  def __call__(self, p: Progress) -> None:
     """Shows how far a run is, every few seconds."""
     from mjx_cl.adapt.decide import PHASES
 
@@ -269,11 +282,13 @@ class TrainDisplay:
   terminal.
   """
 
-  def __init__(self, total: int):
+  def __init__(self, total: int) -> None:
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
     self.console = Console(stderr=True)
+    self.recent: list[float]
+    self.marks: list[tuple[float, int]]
     self.total, self.recent, self.marks, self.told = total, [], [], 0.0
     self.bar = (
       Progress(
@@ -288,12 +303,12 @@ class TrainDisplay:
     )
     self.task = self.bar.add_task("", total=total) if self.bar else None
 
-  def __enter__(self):
+  def __enter__(self) -> Self:
     if self.bar:
       self.bar.start()
     return self
 
-  def __exit__(self, *_):
+  def __exit__(self, *_: object) -> None:
     if self.bar:
       self.bar.stop()
 
@@ -308,7 +323,7 @@ class TrainDisplay:
     step = "" if row["reward"] is None else f" ({row['reward']:.2f} a step)"
     text = f"{row['phase']}: return {mean}{step}, {rate:.1f} updates/s"
     if self.bar:
-      self.bar.update(self.task, completed=row["updates"], description=text)
+      self.bar.update(self.task, completed=row["updates"], description=text)  # type: ignore[arg-type]
     elif now - self.told > 30 or row["updates"] >= self.total:
       self.told = now
       left = clock((self.total - row["updates"]) / rate) if rate else "?"

@@ -8,10 +8,9 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import tyro
+from tyro.conf import Positional
 
 from mjx_cl.config import FaultConfig, RunConfig
-
-Positional = tyro.conf.Positional
 
 
 @dataclass(frozen=True)
@@ -48,8 +47,8 @@ class Train:
   preset: str = "cpu"
   """Learner and schedule, see `mjx-cl list presets`."""
   demonstrator: str | None = None
-  """A policy's .npz, `reference`: the robot's own driver (car), or `ppo`: train one first with brax
-  (needs mjx-cl[brax]); default: none.
+  """A policy's .npz, `reference`: the robot's own driver (car), or `ppo`: train one first with brax;
+  default: none.
   """
   agent: str | None = None
   """Start from this agent's weights, moments and counters; the replay is filled by acting."""

@@ -6,6 +6,7 @@ import os
 import zipfile
 import zlib
 from collections.abc import Mapping
+from typing import Any
 
 import jax
 import numpy as np
@@ -14,7 +15,7 @@ from mjx_cl.errors import FileError
 from mjx_cl.io import folders
 
 
-def named(tree) -> dict[str, object]:
+def named(tree: Any) -> dict[str, Any]:
   """Path -> leaf of a tree, in the order of its leaves."""
   return {
     jax.tree_util.keystr(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(tree)
@@ -33,7 +34,7 @@ def write(path: str | os.PathLike, arrays: Mapping[str, object], small: bool = F
     FileError where the disk is full or the folder refuses; what was at `path` stays.
   """
   save = np.savez_compressed if small else np.savez
-  folders.atomic(path, lambda file: save(file, **{k: np.asarray(v) for k, v in arrays.items()}))
+  folders.atomic(path, lambda file: save(file, **{k: np.asarray(v) for k, v in arrays.items()}))  # type: ignore[arg-type]
 
 
 def read(path: str | os.PathLike) -> dict[str, np.ndarray]:

@@ -7,6 +7,7 @@ import logging
 import pathlib
 import re
 import sys
+from typing import Any
 
 import jax
 import numpy as np
@@ -17,15 +18,15 @@ from mjx_cl.errors import FileError
 logging.getLogger("absl").setLevel(logging.ERROR)
 
 
-def _is_key(x) -> bool:
+def _is_key(x: Any) -> bool:
   return isinstance(x, jax.Array) and jax.numpy.issubdtype(x.dtype, jax.dtypes.prng_key)
 
 
-def _is_empty(x) -> bool:
+def _is_empty(x: Any) -> bool:
   return 0 in getattr(x, "shape", ())
 
 
-def pack(tree):
+def pack(tree: Any) -> Any:
   """What orbax can write: typed random keys -> their uint32 data; arrays without an element (MJX
   has some) -> one zero; everything else unchanged.
   """
@@ -35,7 +36,7 @@ def pack(tree):
   )
 
 
-def unpack(tree, like):
+def unpack(tree: Any, like: Any) -> Any:
   """Inverse of `pack`, for a tree of the same structure as `like`."""
   return jax.tree.map(
     lambda x, y: jax.random.wrap_key_data(x) if _is_key(y) else y if _is_empty(y) else x, tree, like
@@ -80,7 +81,7 @@ def _first_line(error: BaseException) -> str:
   )  # orbax fails to print how two trees differ
 
 
-def _dtypes(tree) -> dict[tuple[str, ...], np.dtype]:
+def _dtypes(tree: Any) -> dict[tuple[str, ...], np.dtype]:
   """Path -> dtype of every leaf of a tree of arrays or of their metadata, which has dicts and lists
   where the arrays have named tuples.
   """
@@ -94,7 +95,7 @@ def _dtypes(tree) -> dict[tuple[str, ...], np.dtype]:
 class Checkpoints:
   """Numbered checkpoints of one run in FOLDER, each an array tree and a JSON dict."""
 
-  def __init__(self, folder):
+  def __init__(self, folder: pathlib.Path | str) -> None:
     self.folder = pathlib.Path(folder).absolute()
     options = ocp.CheckpointManagerOptions(
       max_to_keep=2, enable_async_checkpointing=False, create=True
@@ -105,7 +106,7 @@ class Checkpoints:
     """Number of the newest complete checkpoint."""
     return self._manager.latest_step()
 
-  def save(self, number: int, tree, meta: dict) -> None:
+  def save(self, number: int, tree: Any, meta: dict) -> None:
     """Writes one; a kill at any moment leaves the earlier ones whole."""
     try:
       self._manager.save(
@@ -121,7 +122,7 @@ class Checkpoints:
         f"cannot write checkpoint {number} in {self.folder}: {e}; the earlier ones are intact"
       ) from e
 
-  def load(self, like):
+  def load(self, like: Any) -> tuple[Any, dict[str, Any]]:
     """Newest checkpoint that can be read, (tree, meta), for a tree like `like`; it is the `latest`
     from then on.
 

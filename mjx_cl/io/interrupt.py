@@ -12,7 +12,7 @@ import signal
 import sys
 import threading
 import types
-from typing import TextIO
+from typing import Any, TextIO
 
 
 class Lasting:
@@ -20,7 +20,7 @@ class Lasting:
   (`2>&1 | tee log` dies of the same Ctrl-C) the work goes on and is saved.
   """
 
-  def __init__(self, stream: TextIO):
+  def __init__(self, stream: TextIO) -> None:
     self._stream = stream
 
   def write(self, text: str) -> int:
@@ -69,9 +69,9 @@ class Interruptible:
 
   again = False
 
-  def __init__(self):
+  def __init__(self) -> None:
     self._set = False
-    self._old: dict[int, object] = {}
+    self._old: dict[int, Any] = {}
 
   def __enter__(self) -> Interruptible:
     if threading.current_thread() is threading.main_thread():

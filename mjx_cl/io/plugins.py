@@ -13,7 +13,9 @@ import importlib.util
 import os
 import pathlib
 import sys
+import types
 from collections.abc import Callable
+from typing import Any
 
 from mjx_cl.errors import FileError, PluginError, UserError
 
@@ -33,7 +35,7 @@ class Registry(collections.UserDict):
     with a colon where nothing of that name is.
   """
 
-  def __init__(self, group: str, kind: str, own: dict):
+  def __init__(self, group: str, kind: str, own: dict[str, Any]) -> None:
     self.group, self.kind, self.own, self.filled, self.members = (
       group,
       kind,
@@ -43,7 +45,7 @@ class Registry(collections.UserDict):
     )
 
   @property
-  def data(self) -> dict:
+  def data(self) -> dict[str, Any]:  # type: ignore[override]
     """What UserDict reads and writes."""
     self.fill()
     return self.members
@@ -78,10 +80,10 @@ class Registry(collections.UserDict):
       raise
     self.members |= found
 
-  def __contains__(self, name) -> bool:
+  def __contains__(self, name: object) -> bool:
     return name in self.data or (isinstance(name, str) and ":" in name)
 
-  def __missing__(self, name):
+  def __missing__(self, name: object) -> Any:
     if isinstance(name, str) and ":" in name:
       return find(name, self.kind)
     raise KeyError(name)
@@ -134,15 +136,15 @@ def find(source: str, kind: str) -> Callable:
 
 
 @functools.cache
-def _file(path: pathlib.Path, changed: int):
+def _file(path: pathlib.Path, changed: int) -> types.ModuleType:
   """The module in a file, loaded once for each time that it was written (`changed` [ns])."""
   # under a name of its own: two files of one name must not be taken for each other
   inner = f"mjx_cl_file_{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:12]}"
   spec = importlib.util.spec_from_file_location(inner, path)
-  module = importlib.util.module_from_spec(spec)
+  module = importlib.util.module_from_spec(spec)  # type: ignore[arg-type]
   sys.modules[inner] = module  # dataclasses look their module up there
   try:
-    spec.loader.exec_module(module)
+    spec.loader.exec_module(module)  # type: ignore[union-attr]
   except BaseException:
     del sys.modules[inner]
     raise

@@ -14,6 +14,7 @@ import pathlib
 import platform
 import subprocess
 import sys
+from typing import Any
 
 # jaxlib 0.10.x can lose a completion event in MJX programs and hang for ever (256 robots under
 # vmap: most runs); this flag cures it.
@@ -194,9 +195,9 @@ PACKAGES = (
 )
 
 
-def provenance() -> dict:
+def provenance() -> dict[str, Any]:
   """Versions, machine and commit of this process, for config.json; cores: those that it may use."""
-  versions = {}
+  versions: dict[str, str | None] = {}
   for name in PACKAGES:
     try:
       versions[name] = importlib.metadata.version(name)

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import json
+import os
 import pathlib
 import re
 import tomllib
+from collections.abc import Mapping
+from typing import Any, NoReturn
 
 import duckdb
 import numpy as np
@@ -16,20 +19,20 @@ from mjx_cl.errors import FileError, UserError
 from mjx_cl.io import folders
 
 
-def plain(x):
+def plain(x: Any) -> Any:
   """NumPy scalars and arrays as Python values, for json."""
   if hasattr(x, "tolist"):
     return x.tolist()
   raise TypeError(f"{type(x).__name__} is no JSON value")
 
 
-def write_json(path, value) -> None:
+def write_json(path: os.PathLike | str, value: Any) -> None:
   """Writes JSON (nan and infinity refused)."""
   text = json.dumps(value, indent=1, allow_nan=False, default=plain) + "\n"
   folders.atomic(path, lambda file: file.write(text.encode()))
 
 
-def read_json(path) -> dict:
+def read_json(path: os.PathLike | str) -> dict[str, Any]:
   """The JSON object in a file.
 
   Raises:
@@ -49,8 +52,8 @@ def read_json(path) -> dict:
 
 
 def write_table(
-  path,
-  columns: dict,
+  path: os.PathLike | str,
+  columns: Mapping[str, Any],
   nan_is_null: bool = True,
   codec: str = "zstd",
   level: int | None = None,
@@ -85,7 +88,7 @@ def write_table(
   )
 
 
-def write_arrow(path, table) -> None:
+def write_arrow(path: os.PathLike | str, table: pyarrow.Table) -> None:
   """Writes a pyarrow Table as Parquet, compressed as `write_table` does."""
   folders.atomic(
     path,
@@ -115,7 +118,7 @@ def read_suite(name: str, folder: pathlib.Path) -> tuple[pathlib.Path, dict]:
     raise FileError(f"{path} is no TOML: {e}") from None
 
 
-def read_arrow(path):
+def read_arrow(path: os.PathLike | str) -> pyarrow.Table:
   """A Parquet file as a pyarrow Table.
 
   Raises:
@@ -129,18 +132,18 @@ def read_arrow(path):
     raise FileError(f"cannot read {path}: {str(e).splitlines()[0]}") from None
 
 
-def read_table(path) -> dict:
+def read_table(path: os.PathLike | str) -> dict[str, np.ndarray]:
   """Columns of a Parquet file as NumPy arrays, null as nan."""
   table = read_arrow(path)
   return {name: table[name].to_numpy() for name in table.column_names}
 
 
-def read_plain(path) -> dict[str, list]:
+def read_plain(path: os.PathLike | str) -> dict[str, list]:
   """Columns of a Parquet file as Python values, null as None."""
   return read_arrow(path).to_pydict()
 
 
-def read_rows(path) -> list[dict]:
+def read_rows(path: os.PathLike | str) -> list[dict[str, Any]]:
   """Rows of a Parquet file as Python values by column, null as None."""
   columns = read_plain(path)
   return [dict(zip(columns, cells)) for cells in zip(*columns.values())]
@@ -158,6 +161,8 @@ def views(folders: tuple[str, ...] = (), results: str = "results") -> dict[str, 
   Raises:
     UserError where a folder is missing, nothing is found, or two tables would have one name.
   """
+  found: dict[str, pathlib.Path]
+  at: Any
   found, seen = {}, set()
   for folder in (results, *folders):
     name, sign, at = folder.partition("=")
@@ -191,7 +196,9 @@ def views(folders: tuple[str, ...] = (), results: str = "results") -> dict[str, 
   return found
 
 
-def query(tables, sql: str | None = None) -> tuple[list[str], list[tuple]]:
+def query(
+  tables: os.PathLike | str | dict[str, pathlib.Path], sql: str | None = None
+) -> tuple[list[str], list[tuple]]:
   """Runs SQL over result files, which it can read and not change: SELECT statements alone (FROM,
   DESCRIBE, SHOW and SUMMARIZE are such), no file outside the views, no settings, no extensions.
 
@@ -250,13 +257,13 @@ def query(tables, sql: str | None = None) -> tuple[list[str], list[tuple]]:
       raise UserError(f"query: {str(e).splitlines()[0]}; views: {names}") from None
 
 
-def _none(folder):
+def _none(folder: os.PathLike | str) -> NoReturn:
   raise UserError(f"no .parquet file in {folder}")
 
 
-def _describe(db, name: str) -> tuple[str, int, str]:
+def _describe(db: duckdb.DuckDBPyConnection, name: str) -> tuple[str, int, str]:
   quoted = '"' + name.replace('"', '""') + '"'
-  rows = db.execute(f"select count(*) from {quoted}").fetchone()[0]
+  rows = db.execute(f"select count(*) from {quoted}").fetchone()[0]  # type: ignore[index]
   return (
     name,
     rows,

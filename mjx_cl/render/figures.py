@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import os
 import pathlib
 import warnings
 
@@ -31,7 +32,7 @@ def smooth(values: np.ndarray, width: int) -> np.ndarray:
   return np.where(counts > 0, sums / np.maximum(1, counts), np.nan)
 
 
-def figure(folder, width: int = 500) -> pathlib.Path:
+def figure(folder: os.PathLike | str, width: int = 500) -> pathlib.Path:
   """Draws FOLDER/figure.png from its trace, events and config.
 
   Args:
@@ -49,7 +50,7 @@ def figure(folder, width: int = 500) -> pathlib.Path:
     ) from None
 
 
-def _figure(folder, width: int) -> pathlib.Path:
+def _figure(folder: os.PathLike | str, width: int) -> pathlib.Path:
   import matplotlib
 
   matplotlib.use("Agg")
@@ -178,7 +179,7 @@ def _figure(folder, width: int) -> pathlib.Path:
 FEW = 3  # seeds that give no interval, see report.few
 
 
-def survival(out, parts: list[str], columns: int = 3) -> pathlib.Path | None:
+def survival(out: os.PathLike | str, parts: list[str], columns: int = 3) -> pathlib.Path | None:
   """Draws OUT/recovery.png: of each part with affected streams and several arms, the share not yet
   recovered (Kaplan-Meier) since the onset, shaded its pointwise 95 % interval, which ends where the
   last stream recovers or is watched no longer.
@@ -256,7 +257,7 @@ def survival(out, parts: list[str], columns: int = 3) -> pathlib.Path | None:
   return out / "recovery.png"
 
 
-def ratios(out, points: list[dict]) -> pathlib.Path | None:
+def ratios(out: os.PathLike | str, points: list[dict]) -> pathlib.Path | None:
   """Draws OUT/ratio.png: restricted mean time to recovery against train ratio, a line with 95 %
   intervals for each env, fault and severity. Points of FEW seeds or fewer are hollow, without an
   interval, and no line joins them to others, which are of other seeds too.

@@ -97,9 +97,9 @@ def write_mp4(path: pathlib.Path, images: Iterable[np.ndarray], fps: float) -> N
   ]
   with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
     with contextlib.suppress(BrokenPipeError):
-      process.stdin.write(first.tobytes())
+      process.stdin.write(first.tobytes())  # type: ignore[union-attr]
       for image in images:
-        process.stdin.write(image.tobytes())
+        process.stdin.write(image.tobytes())  # type: ignore[union-attr]
     _, words = process.communicate()
   if process.returncode:
     raise FileError(

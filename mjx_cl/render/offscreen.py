@@ -57,7 +57,7 @@ class Offscreen:
     env: environment with `mj_model`. width, height: pixels. library: as `gl_library` names it.
   """
 
-  def __init__(self, env: Any, width: int, height: int, library: str):
+  def __init__(self, env: Any, width: int, height: int, library: str) -> None:
     model = env.mj_model
     self.env, self.model, self.data = env, copy.copy(model), mujoco.MjData(model)
     self.model.vis.global_.offwidth, self.model.vis.global_.offheight = width, height

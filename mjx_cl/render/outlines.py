@@ -57,7 +57,7 @@ class Canvas:
   no frame.
   """
 
-  def __init__(self, width: int, height: int):
+  def __init__(self, width: int, height: int) -> None:
     self.width, self.height = width, height
     self.figure = Figure(figsize=(width / 100, height / 100), dpi=100)
     self._agg = FigureCanvasAgg(self.figure)
@@ -80,7 +80,7 @@ class Canvas:
 class Sketch:
   """Outlines of the geoms in parallel projection, far ones first; the camera follows the robot."""
 
-  def __init__(self, env: Any, width: int, height: int):
+  def __init__(self, env: Any, width: int, height: int) -> None:
     self.env, self.model = env, env.mj_model
     model, self.data, self.canvas = env.mj_model, mujoco.MjData(env.mj_model), Canvas(width, height)
     self.reach, self.planar = reach(model), planar(model)
@@ -136,7 +136,7 @@ class Sketch:
     mujoco.mj_kinematics(self.model, self.data)
     floor, root = floor_of(self.model, self.data), self.data.xpos[1]
     look = np.array([root[0], root[1], floor + (0.6 if self.planar else 0.3) * self.reach])
-    self.canvas.figure.set_facecolor(SKY[1])
+    self.canvas.figure.set_facecolor(SKY[1])  # type: ignore[arg-type]
     self.canvas.ax.clear()
     self._floor(root, floor)
     shapes = []
@@ -171,7 +171,7 @@ class Plan:
   drawn by `draw_car`.
   """
 
-  def __init__(self, draw: Callable[..., Any], width: int, height: int):
+  def __init__(self, draw: Callable[..., Any], width: int, height: int) -> None:
     self.draw, self.canvas = draw, Canvas(width, height)
     self.canvas.figure.set_facecolor("0.93")
 

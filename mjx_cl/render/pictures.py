@@ -12,7 +12,8 @@ from __future__ import annotations
 import functools
 import os
 import pathlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -32,14 +33,14 @@ MOST_STEPS = 100_000  # control steps of an episode
 
 
 def act(
-  env,
+  env: Any,
   steps: int,
   seed: int = 0,
-  agent=None,
-  params=None,
+  agent: Any = None,
+  params: Any = None,
   repeat: int = 1,
   deterministic: bool = False,
-  **fault,
+  **fault: Any,
 ) -> Iterator[Frame]:
   """Frames of `steps` control steps, one per decision, of the robot that seed `seed` has in `run`;
   faults as in `adapters.join`.
@@ -49,7 +50,7 @@ def act(
   )  # refuses before it acts
   params = jax.tree.map(lambda x: x[None], jnp.zeros(()) if params is None else params)
 
-  def live():
+  def live() -> Iterator[Frame]:
     streams = jax.jit(nest(begin, 0, 0))(jax.random.key(seed)[None, None])
     for step in range(0, steps, repeat):
       state = jax.tree.map(bare, streams.env)
@@ -66,7 +67,7 @@ def act(
   return live()
 
 
-def bare(x) -> np.ndarray:
+def bare(x: jax.Array) -> np.ndarray:
   """The one robot of a leaf (1, 1, ...), in NumPy; a key as its bits."""
   return np.asarray(
     (jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x)[0, 0]
@@ -76,7 +77,13 @@ def bare(x) -> np.ndarray:
 VIEWS = ("auto", "robot", "top")
 
 
-def painter(env, width: int, height: int, view: str = "auto", say=lambda text: None):
+def painter(
+  env: Any,
+  width: int,
+  height: int,
+  view: str = "auto",
+  say: Callable[[str], object] = lambda text: None,
+) -> tuple[Plan | Offscreen | Sketch, str]:
   """(what draws this robot here, its name). `auto`: from above a car and what MuJoCo does not know,
   else as MuJoCo has it.
   """
@@ -105,7 +112,9 @@ def painter(env, width: int, height: int, view: str = "auto", say=lambda text: N
   return Sketch(env, width, height), "matplotlib"
 
 
-def check(out, steps: int, width: int, height: int, fps: float, seed: int = 0) -> pathlib.Path:
+def check(
+  out: os.PathLike | str, steps: int, width: int, height: int, fps: float, seed: int = 0
+) -> pathlib.Path:
   """The output path, or the one thing that is wrong with the arguments."""
   out = pathlib.Path(out)
   if out.suffix.lower() not in SUFFIXES:
@@ -128,8 +137,8 @@ def check(out, steps: int, width: int, height: int, fps: float, seed: int = 0) -
 
 
 def render(
-  env,
-  out,
+  env: Any,
+  out: os.PathLike | str,
   steps: int = 400,
   width: int = 480,
   height: int = 360,
@@ -138,9 +147,9 @@ def render(
   target: str | None = None,
   repeat: int = 1,
   view: str = "auto",
-  say=lambda text: None,
-  **acting,
-) -> dict:
+  say: Callable[[str], object] = lambda text: None,
+  **acting: Any,
+) -> dict[str, Any]:
   """Acts and writes the picture, at the robot's own pace; every n-th decision is drawn so that
   `fps` is met.
 
@@ -168,7 +177,7 @@ def render(
   try:
     scene, drawn_by = painter(env, width, height, view, say)
 
-    def images():
+    def images() -> Iterator[np.ndarray]:
       nonlocal count
       for i, frame in enumerate(frames):
         if i % every == 0:

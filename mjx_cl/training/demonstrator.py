@@ -13,7 +13,8 @@ import os
 import pathlib
 import sys
 import time
-from typing import NamedTuple
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +24,9 @@ from mjx_cl import envs
 from mjx_cl.envs.adapters import brax_env, brax_module
 from mjx_cl.errors import FileError
 from mjx_cl.io import arrays, folders, runtime
+
+if TYPE_CHECKING:
+  from mjx_cl.types import EnvState, Model, Step
 
 
 class Policy(NamedTuple):
@@ -68,7 +72,7 @@ def load(path: str | os.PathLike) -> Policy:
     raise FileError(f"cannot read demonstrator {path}: {e}") from None
 
 
-def _to_policy(params) -> Policy:
+def _to_policy(params: Any) -> Policy:
   normalizer, network = params[0], params[1]
   layers = network["params"]
   names = sorted(layers, key=lambda n: int(n.rsplit("_", 1)[1]))
@@ -89,17 +93,17 @@ class Shaped:
       step's reward.
   """
 
-  def __init__(self, env, weights: dict[str, float], bonus: float):
+  def __init__(self, env: Any, weights: dict[str, float], bonus: float) -> None:
     self.env, self.bonus = env, bonus
     factors = jnp.asarray([weights.get(name, 1.0) for name in env.reward_terms], jnp.float32)
     self.model = env.model._replace(
       task=env.model.task | {"reward_weights": env.model.task["reward_weights"] * factors}
     )
 
-  def __getattr__(self, name):
+  def __getattr__(self, name: str) -> Any:
     return getattr(self.env, name)
 
-  def step(self, model, state, action):
+  def step(self, model: Model, state: EnvState, action: jax.Array) -> tuple[EnvState, Step]:
     """A step of the robot with the shaped reward."""
     state, out = self.env.step(model, state, action)
     return state, out._replace(reward=out.reward + self.bonus)
@@ -120,7 +124,7 @@ SIZES = {
 HIDDEN = (128,) * 3  # policy and value
 
 
-def networks_of(env):
+def networks_of(env: Any) -> Any:
   """Brax's networks, of the shapes that `train` trains for `env`."""
   running_statistics, networks = (
     brax_module("training.acme.running_statistics"),
@@ -135,7 +139,7 @@ def networks_of(env):
   )
 
 
-def _template(env):
+def _template(env: Any) -> tuple[Any, Any, Any]:
   """(normaliser, policy, value) of those networks: what `latest.msgpack` is read into."""
   running_statistics, specs = (
     brax_module("training.acme.running_statistics"),
@@ -149,7 +153,7 @@ def _template(env):
   )
 
 
-def latest(out: pathlib.Path, env) -> tuple[list[dict], tuple]:
+def latest(out: pathlib.Path, env: Any) -> tuple[list[dict], tuple]:
   """The curve and the networks that a run in `out` left behind."""
   from flax import serialization
 
@@ -165,14 +169,14 @@ def latest(out: pathlib.Path, env) -> tuple[list[dict], tuple]:
 
 
 def train(
-  env,
+  env: Any,
   out: str | os.PathLike,
   steps: int,
   seed: int = 0,
   evals: int = 12,
-  progress=lambda row: None,
+  progress: Callable[[dict[str, Any]], object] = lambda row: None,
   resume: bool = False,
-  **settings,
+  **settings: Any,
 ) -> list[dict]:
   """Trains PPO and keeps one policy per evaluation as OUT/policy_NN.npz, with OUT/curve.json.
 
@@ -203,7 +207,7 @@ def train(
     return rows
   start = time.monotonic() - before
 
-  def on_progress(step, metrics):
+  def on_progress(step: int, metrics: Mapping[str, Any]) -> None:
     if done and not int(step):
       return  # the evaluation that the earlier run ended with
     rows.append(
@@ -217,7 +221,7 @@ def train(
     folders.atomic(out / "curve.json", lambda file: file.write(text.encode()))
     progress(rows[-1])
 
-  def on_params(step, _, params):
+  def on_params(step: int, _: object, params: Any) -> None:
     from flax import serialization
 
     save(out / f"policy_{done + int(step):09d}.npz", _to_policy(params))

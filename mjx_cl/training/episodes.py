@@ -17,7 +17,7 @@ class Episodes:
     alive: bool, not over yet.
   """
 
-  def __init__(self, shape: tuple[int, ...]):
+  def __init__(self, shape: tuple[int, ...]) -> None:
     self.total, self.steps = np.zeros(shape), np.zeros(shape, int)
     self.ended, self.alive = np.zeros(shape, bool), np.ones(shape, bool)
 
@@ -38,7 +38,7 @@ class Episodes:
 class Returns:
   """Returns of all episodes that end, per robot."""
 
-  def __init__(self, shape: tuple[int, ...]):
+  def __init__(self, shape: tuple[int, ...]) -> None:
     self.sums = np.zeros(shape)
 
   def add(self, rows: Row) -> list[tuple[tuple[int, int], float]]:
@@ -50,4 +50,4 @@ class Returns:
       for at in zip(*np.nonzero(d)):
         ended.append((tuple(int(i) for i in at), float(self.sums[at])))
         self.sums[at] = 0.0
-    return ended
+    return ended  # type: ignore[return-value]

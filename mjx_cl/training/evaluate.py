@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,8 +15,14 @@ from mjx_cl.training.episodes import Episodes
 
 
 def evaluate(
-  env, agent, params, episodes: int, seed: int = 0, repeat: int = 1, deterministic: bool = False
-) -> dict:
+  env: Any,
+  agent: Any,
+  params: Any,
+  episodes: int,
+  seed: int = 0,
+  repeat: int = 1,
+  deterministic: bool = False,
+) -> dict[str, Any]:
   """Runs `episodes` episodes side by side, seeds seed, seed + 1, ...
 
   Returns:
@@ -33,7 +41,7 @@ def evaluate(
     name + "_ci": (p := intervals.wilson(int(hits.sum()), episodes)) and [x * episodes for x in p],
   }
 
-  def per_step(name, value, steps):
+  def per_step(name: str, value: np.ndarray, steps: np.ndarray) -> dict[str, Any]:
     """A mean over steps, so that a short episode counts for little; drawn anew by episodes."""
     over = lambda drawn, axis: (
       value[drawn.astype(int)].sum(axis) / np.maximum(1, steps[drawn.astype(int)].sum(axis))
@@ -68,7 +76,15 @@ def evaluate(
   return out
 
 
-def live(env, rollout, agent, params, episodes: int, seed: int, drive: bool = False):
+def live(
+  env: Any,
+  rollout: Rollout,
+  agent: Any,
+  params: Any,
+  episodes: int,
+  seed: int,
+  drive: bool = False,
+) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray], np.ndarray]:
   """One episode each: (return, measured steps, {figure: sum over the steps}, terminated), arrays
   (episodes,).
 

@@ -12,7 +12,8 @@ import os
 import pathlib
 import sys
 import time
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -30,6 +31,10 @@ from mjx_cl.keys import OfStream
 from mjx_cl.rollout.scan import Rollout, Stream, nest, records, start
 from mjx_cl.training import agents, demonstrator, episodes, evaluate, needs
 
+if TYPE_CHECKING:
+  Metrics = dict[str, jax.Array]
+  Learnt = tuple[TrainState, replay_lib.Replay, Metrics, jax.Array]
+
 DEMONSTRATOR_STEPS = 8_000_000
 
 
@@ -42,7 +47,14 @@ class Learner(NamedTuple):
   key: jax.Array
 
 
-def make_learn(agent: Agent, batch: int, length: int, mesh=None, *, how: str | None = None):
+def make_learn(
+  agent: Agent,
+  batch: int,
+  length: int,
+  mesh: jax.sharding.Mesh | None = None,
+  *,
+  how: str | None = None,
+) -> Callable[..., Learnt]:
   """(train, replay, key, weights, active (seeds,), updates) -> (train, replay, metrics (seeds,),
   means over the updates, culprit (seeds,)), seeds leading, jitted.
 
@@ -58,20 +70,26 @@ def make_learn(agent: Agent, batch: int, length: int, mesh=None, *, how: str | N
       is the same, so results agree but for float32 rounding.
   """
 
-  def step(train, replay, key, weights):
+  def step(
+    train: TrainState, replay: replay_lib.Replay, key: jax.Array, weights: Weights
+  ) -> tuple[TrainState, replay_lib.Replay, Metrics, tuple[jax.Array, jax.Array], Any]:
     key_sample, key_update = jax.random.split(key)
     replay, data, address = replay_lib.sample(replay, key_sample, batch, length + 1)
     train, metrics, latents = agent.update(train, data, key_update, weights)
     return train, replay, metrics, address, latents
 
-  def one_seed(train, replay, key, weights, updates):
+  def one_seed(
+    train: TrainState, replay: replay_lib.Replay, key: jax.Array, weights: Weights, updates: int
+  ) -> Learnt:
     keys = jax.random.split(key, updates)
 
-    def one_update(train, replay, key):
+    def one_update(
+      train: TrainState, replay: replay_lib.Replay, key: jax.Array
+    ) -> tuple[TrainState, replay_lib.Replay, Metrics]:
       train, replay, metrics, address, latents = step(train, replay, key, weights)
       return train, replay_lib.refresh(replay, address, latents), metrics
 
-    def body(state):
+    def body(state: tuple[Any, ...]) -> tuple[Any, ...]:
       i, train, replay, sums, _ = state
       train, replay, metrics = one_update(train, replay, keys[i])
       return i + 1, train, replay, jax.tree.map(jnp.add, sums, metrics), culprit(metrics)
@@ -85,7 +103,14 @@ def make_learn(agent: Agent, batch: int, length: int, mesh=None, *, how: str | N
     )
     return train, replay, jax.tree.map(lambda x: x / i, sums), bad
 
-  def by_map(train, replay, keys, weights, active, updates):
+  def by_map(
+    train: TrainState,
+    replay: replay_lib.Replay,
+    keys: jax.Array,
+    weights: Weights,
+    active: jax.Array,
+    updates: int,
+  ) -> Learnt:
     run = lambda train, replay, key: one_seed(train, replay, key, weights, updates)
     shapes = jax.eval_shape(run, *jax.tree.map(lambda x: x[0], (train, replay, keys)))[2]
     rest = lambda train, replay, key: (
@@ -98,17 +123,24 @@ def make_learn(agent: Agent, batch: int, length: int, mesh=None, *, how: str | N
       lambda x: jax.lax.cond(x[3], run, rest, *x[:3]), (train, replay, keys, active)
     )
 
-  def by_vmap(train, replay, keys, weights, active, updates):
+  def by_vmap(
+    train: TrainState,
+    replay: replay_lib.Replay,
+    keys: jax.Array,
+    weights: Weights,
+    active: jax.Array,
+    updates: int,
+  ) -> Learnt:
     keys = jax.vmap(lambda key: jax.random.split(key, updates), out_axes=1)(keys)
 
     def one_update(
-      train,
-      replay,
-      key,
-      live,
+      train: TrainState,
+      replay: replay_lib.Replay,
+      key: jax.Array,
+      live: jax.Array,
       # vmap of `one_seed` would hold a second replay: what a loop carries is kept or replaced as a
       # whole
-    ):
+    ) -> tuple[TrainState, replay_lib.Replay, Metrics, jax.Array]:
       new, sampled, metrics, (stream, begin), latents = step(train, replay, key, weights)
       kept = lambda a, b: jax.tree.map(lambda a, b: jnp.where(live, a, b), a, b)
       sampled = sampled._replace(queue=kept(sampled.queue, replay.queue))
@@ -122,7 +154,7 @@ def make_learn(agent: Agent, batch: int, length: int, mesh=None, *, how: str | N
         jnp.where(live, culprit(metrics), -1),
       )
 
-    def body(state):
+    def body(state: tuple[Any, ...]) -> tuple[Any, ...]:
       i, count, train, replay, sums, bad = state
       live = active & (bad < 0)
       train, replay, metrics, found = jax.vmap(one_update)(train, replay, keys[i], live)
@@ -147,10 +179,19 @@ def make_learn(agent: Agent, batch: int, length: int, mesh=None, *, how: str | N
   over_seeds = choose("how", how or runtime.seeds_by(), {"map": by_map, "vmap": by_vmap})
 
   @functools.partial(jax.jit, static_argnames=("updates",), donate_argnums=(0, 1))
-  def learn(train, replay, key, weights, active, updates):
+  def learn(
+    train: TrainState,
+    replay: replay_lib.Replay,
+    key: jax.Array,
+    weights: Weights,
+    active: jax.Array,
+    updates: int,
+  ) -> Learnt:
     seeds = train.updates.shape[0]
     if seeds == 1:  # no copy of the replay
-      out = one_seed(*jax.tree.map(lambda x: x[0], (train, replay)), key, weights, updates)
+      out = one_seed(  # type: ignore[call-arg]
+        *jax.tree.map(lambda x: x[0], (train, replay)), key, weights, updates
+      )
       return jax.tree.map(lambda x: x[None], out)
     body = functools.partial(over_seeds, updates=updates)
     if mesh is not None:
@@ -163,14 +204,14 @@ def make_learn(agent: Agent, batch: int, length: int, mesh=None, *, how: str | N
   return learn
 
 
-def seeds_mesh(seeds: int):
+def seeds_mesh(seeds: int) -> jax.sharding.Mesh | None:
   """A mesh of the most devices that share `seeds` seeds evenly, or None where that is one."""
   devices = jax.devices()
   count = max(n for n in range(1, len(devices) + 1) if seeds % n == 0)
   return jax.sharding.Mesh(np.asarray(devices[:count]), ("seeds",)) if count > 1 else None
 
 
-def expert(env, name: str):
+def expert(env: Any, name: str) -> Callable[[Stream], jax.Array]:
   """A demonstrator, Stream -> action: `reference`, the environment's own driver that knows its
   state, or a policy's .npz.
 
@@ -189,7 +230,7 @@ def expert(env, name: str):
   return lambda stream: policy(stream.obs)
 
 
-def cut(env, steps: int | None):
+def cut(env: Any, steps: int | None) -> Any:
   """The environment with episodes of `steps` control steps; itself for None."""
   if steps is None:
     return env
@@ -198,7 +239,7 @@ def cut(env, steps: int | None):
   return env
 
 
-def eased(env, factor: float):
+def eased(env: Any, factor: float) -> Any:
   """The environment with its reward's negative weights times `factor`; itself for 1."""
   if factor == 1.0:
     return env
@@ -212,7 +253,9 @@ def eased(env, factor: float):
   return env
 
 
-def faults_of(env, config: TrainConfig):
+def faults_of(
+  env: Any, config: TrainConfig
+) -> tuple[faults.Fault | tuple[faults.Fault, ...], faults.Plan | None, jax.Array | int]:
   """(Fault or tuple of them, their Plan, targets) of a training: of a preset its own; of a fault no
   Plan and -1, since both are drawn.
 
@@ -232,7 +275,9 @@ def faults_of(env, config: TrainConfig):
   return faults.build(changes, env)
 
 
-def check(env, dreamer: DreamerConfig, config: TrainConfig, agent_name: str | None = None) -> None:
+def check(
+  env: Any, dreamer: DreamerConfig, config: TrainConfig, agent_name: str | None = None
+) -> None:
   """Refuses actions whose bounds are not -1 and 1, a replay that can never hold one update's
   windows, and an agent that sees or acts otherwise than this training would have it.
 
@@ -279,7 +324,7 @@ def check(env, dreamer: DreamerConfig, config: TrainConfig, agent_name: str | No
       )
 
 
-def scaled(env, dreamer: DreamerConfig) -> DreamerConfig:
+def scaled(env: Any, dreamer: DreamerConfig) -> DreamerConfig:
   """`dreamer` with the robot's own deviations in the place of obs_scale `spec`."""
   return (
     dataclasses.replace(dreamer, obs_scale=tuple(float(v.scale) for v in env.spec.obs))
@@ -297,9 +342,17 @@ class Trainer:
   there is only `pure`.
   """
 
+  about: dict[str, Any]
+
   def __init__(
-    self, env, dreamer: DreamerConfig, config: TrainConfig, out, seed: int = 0, seeds: int = 1
-  ):
+    self,
+    env: Any,
+    dreamer: DreamerConfig,
+    config: TrainConfig,
+    out: os.PathLike | str,
+    seed: int = 0,
+    seeds: int = 1,
+  ) -> None:
     check(env, dreamer, config)
     self.env, self.dreamer, self.config, self.out = env, dreamer, config, pathlib.Path(out)
     env = eased(cut(env, config.episode), config.penalties)
@@ -383,13 +436,13 @@ class Trainer:
     """Updates taken, by the seeds that have not failed."""
     return int(np.max(np.asarray(self.state.train.updates)))
 
-  def _drive(self):
+  def _drive(self) -> np.ndarray:
     drive = np.zeros((self.seeds, self.config.envs), bool)
     if self.phase != "pure":
       drive[:, : round(self.config.demo_share * self.config.envs)] = True
     return drive
 
-  def _shake(self):
+  def _shake(self) -> np.ndarray | None:
     """Probability of a random stretch for each robot, or None; the last robots are shaken, the
     first are driven by a demonstrator.
     """
@@ -432,7 +485,7 @@ class Trainer:
   def _enter(self, phase: str) -> None:
     self.phase, self.phase_start = phase, self.updates
 
-  def _drawn(self, key) -> faults.Plan:
+  def _drawn(self, key: jax.Array) -> faults.Plan:
     """A severity from the stream's key, from the first step on; a preset's own, and none without
     `config.fault`.
     """
@@ -444,7 +497,7 @@ class Trainer:
       else 0.0
     )
 
-  def _new_fault(self, stream: Stream, ended) -> Stream:
+  def _new_fault(self, stream: Stream, ended: jax.Array) -> Stream:
     """`stream` with another target and severity where its episode `ended`, so far as these are
     drawn: that follows from its key and its clock.
     """
@@ -458,10 +511,11 @@ class Trainer:
 
   # ---- one chunk ---------------------------------------------------------------------------------
 
-  def step(self) -> dict:
+  def step(self) -> dict[str, Any]:
     """Collects one chunk, takes the updates that it pays for, returns a row of metrics."""
     begin = time.monotonic()
     drive, shake = self._drive(), self._shake()
+    kept: Any
     params, kept = self.state.train.params, records
     if self.mesh is not None:
       params = jax.device_put(params, jax.devices()[0])
@@ -475,6 +529,7 @@ class Trainer:
     learnt = rows._replace(reward=rows.reward - cost * rows.terminated) if cost else rows
     replay = self._add(self.state.replay, *kept(learnt))
     self.state = self.state._replace(streams=streams, replay=replay)
+    each: dict[int, list[float]]
     expert_returns, own, each = [], [], {g: [] for g in range(self.seeds)}
     counts = ~drive  # robots that act as the agent would
     counts &= shake is None or shake == 0
@@ -529,7 +584,7 @@ class Trainer:
           self.state.train, self.state.replay, key_learn, self._weights(), active, count
         )
         self.state = self.state._replace(train=train, replay=replay, key=key)
-        metrics = {k: np.asarray(v) for k, v in metrics.items()}
+        metrics = {k: np.asarray(v) for k, v in metrics.items()}  # type: ignore[misc]
         self._notice_failures(np.asarray(bad))
         alive = [g for g in range(self.seeds) if g not in self.failed]
         row |= {k: float(np.mean(v[alive])) for k, v in metrics.items()} | {
@@ -609,7 +664,7 @@ class Trainer:
     path = self.out / "metrics.parquet"
     rows = tables.read_arrow(path).to_pylist() if path.exists() else []
     state, meta = self.checkpoints.load(self.state)
-    chunks = self.checkpoints.latest()
+    chunks: Any = self.checkpoints.latest()
     try:
       failed = {int(g): str(why) for g, why in meta.get("failed", {}).items()}
       phase, phase_start, owed, own = (
@@ -642,10 +697,10 @@ class Trainer:
 
 
 def build(
-  env,
+  env: Any,
   dreamer: DreamerConfig,
   config: TrainConfig,
-  out,
+  out: os.PathLike | str,
   seed: int,
   seeds: int,
   demonstrator_name: str | None,
@@ -660,7 +715,7 @@ def build(
   out = pathlib.Path(out)
   config = shown(config, out, demonstrator_name)
   if demonstrator_name == "ppo":
-    path = pathlib.Path(config.demonstrator)
+    path = pathlib.Path(config.demonstrator)  # type: ignore[arg-type]
     if not path.exists():
       demonstrator.train(
         env,
@@ -702,7 +757,9 @@ def build(
   return trainer
 
 
-def shown(config: TrainConfig, out, demonstrator_name: str | None) -> TrainConfig:
+def shown(
+  config: TrainConfig, out: os.PathLike | str, demonstrator_name: str | None
+) -> TrainConfig:
   """The settings with their demonstrator: the policy that `ppo` leaves in the folder, or what the
   user named.
   """
@@ -715,8 +772,8 @@ def shown(config: TrainConfig, out, demonstrator_name: str | None) -> TrainConfi
 
 
 def check_same(
-  out,
-  env,
+  out: os.PathLike | str,
+  env: Any,
   dreamer: DreamerConfig,
   config: TrainConfig,
   seed: int,
@@ -789,7 +846,7 @@ def clear(out: pathlib.Path) -> None:
     path.unlink()
 
 
-def export(trainer: Trainer, count: int = 20) -> dict:
+def export(trainer: Trainer, count: int = 20) -> dict[str, Any]:
   """Writes OUT/agent of the first seed that has not failed: weights, moments, counters, and the
   card with its returns. Returns the card.
   """
@@ -826,7 +883,11 @@ def export(trainer: Trainer, count: int = 20) -> dict:
   return card
 
 
-def run(trainer: Trainer, progress=lambda row: None, save_every_s: float = 240.0) -> None:
+def run(
+  trainer: Trainer,
+  progress: Callable[[dict[str, Any]], object] = lambda row: None,
+  save_every_s: float = 240.0,
+) -> None:
   """Trains to the end, saving every `save_every_s` seconds, at the end, and when interrupted."""
   saved = time.monotonic()
   with Interruptible() as interrupt:

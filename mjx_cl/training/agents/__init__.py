@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 import pathlib
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -42,7 +43,7 @@ def shipped() -> list[str]:
   return sorted(p.parent.name for p in HERE.glob("*/card.json"))
 
 
-def save(folder, train: TrainState, card: dict) -> None:
+def save(folder: os.PathLike | str, train: TrainState, card: dict) -> None:
   """Writes an agent of one seed: parameters and counters in full, optimiser moments as bfloat16
   (they only steer step sizes).
   """
@@ -60,7 +61,7 @@ def save(folder, train: TrainState, card: dict) -> None:
   folders.atomic(folder / "card.json", lambda file: file.write(text.encode()))
 
 
-def of(env, path: str | None = None, **departures) -> Trained:
+def of(env: Any, path: str | None = None, **departures: Any) -> Trained:
   """`load` for the robot `env`, which is known by the name in its spec; its `agents_of` names
   another whose agents it takes.
   """
@@ -74,7 +75,7 @@ def of(env, path: str | None = None, **departures) -> Trained:
   )
 
 
-def is_shipped(env) -> bool:
+def is_shipped(env: Any) -> bool:
   """Whether there is an agent for this robot without a path."""
   return not {env.spec.name, getattr(env, "agents_of", None)}.isdisjoint(shipped())
 
@@ -85,7 +86,7 @@ def load(
   obs_size: int,
   act_size: int,
   agents_of: str | None = None,
-  **departures,
+  **departures: Any,
 ) -> Trained:
   """Loads an agent by shipped name or folder.
 
