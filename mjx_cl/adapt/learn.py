@@ -63,14 +63,14 @@ def fresh_moments(agent: Agent, train: TrainState, begins: jax.Array) -> TrainSt
 
 
 def renew(
-  agent: Agent, train: TrainState, acting, keys: jax.Array, fresh: jax.Array
+  agent: Agent, train: TrainState, acting: Any, keys: jax.Array, fresh: jax.Array
 ) -> tuple[TrainState, Any]:
   """New parameters, moments and counters where `fresh` (groups,). Loops for the reason given in
   `learn`.
   """
 
-  def stream(g, state):
-    def anew(_, state):
+  def stream(g: jax.Array, state: tuple[TrainState, Any]) -> tuple[TrainState, Any]:
+    def anew(_: jax.Array, state: tuple[TrainState, Any]) -> tuple[TrainState, Any]:
       train, acting = state
       new = agent.init(jax.random.fold_in(keys[g], OfAdaptation.FRESH))
       return put(train, g, new), put(acting, g, new.params)
@@ -100,8 +100,12 @@ def learn(
     lambda x: x.reshape((-1,) + x.shape[2:]), replay
   )  # (groups, 1, ..) -> (groups, ..)
 
-  def stream(g, state):
-    def update(state):
+  def stream(
+    g: jax.Array, state: tuple[TrainState, Replay, jax.Array]
+  ) -> tuple[TrainState, Replay, jax.Array]:
+    def update(
+      state: tuple[jax.Array, TrainState, Replay, jax.Array],
+    ) -> tuple[jax.Array, TrainState, Replay, jax.Array]:
       i, train, replay, _ = state
       key_sample, key_update = jax.random.split(jax.random.fold_in(keys[g], i))
       replay, data, address = replay_lib.sample(replay, key_sample, c.batch, c.length + 1, only=g)
@@ -154,7 +158,7 @@ def keep_behaviour(keep: jax.Array, before: TrainState, after: TrainState) -> Tr
   shapes the features, as in every arm.
   """
 
-  def one(path, old, new):
+  def one(path: tuple[Any, ...], old: jax.Array, new: jax.Array) -> jax.Array:
     names = {getattr(part, "key", getattr(part, "name", None)) for part in path}
     return jnp.where(keep, old, new) if names & BEHAVIOUR else new
 

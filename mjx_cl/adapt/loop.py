@@ -173,11 +173,11 @@ class Programs:
     most: as many are kept, the newest: a compiled program takes memory.
   """
 
-  def __init__(self, most: int = 8):
+  def __init__(self, most: int = 8) -> None:
     self.most = most
     self.kept: dict[Hashable, Any] = {}  # the newest last
 
-  def share(self, key: Hashable, program):
+  def share(self, key: Hashable, program: Any) -> Any:
     """The program that is kept under `key`, else `program`, which is kept from now on."""
     try:
       program = self.kept.pop(key, program)
@@ -219,7 +219,7 @@ class Loop:
     capacity: int = 20_480,
     same: Hashable | None = None,
     programs: Programs | None = None,
-  ):
+  ) -> None:
     self.agent, self.monitor, self.detector, self.spec = agent, monitor, detector, spec
     self.config, self.repeat, self.capacity = config, repeat, capacity
     self._program = jax.jit(self._digest, donate_argnums=0)
@@ -288,7 +288,14 @@ class Loop:
     return self._program(state, rows, now, choices, keys, acceptance, self.config)
 
   def _digest(
-    self, state: LoopState, rows: Row, now, choices: Choices, keys, acceptance, config: AdaptConfig
+    self,
+    state: LoopState,
+    rows: Row,
+    now: jax.Array,
+    choices: Choices,
+    keys: jax.Array,
+    acceptance: jax.Array | None,
+    config: AdaptConfig,
   ) -> tuple[LoopState, Digest]:
     agent, was, length = self.agent, state.phase.phase, rows.reward.shape[0]
     split = jax.vmap(lambda key: jax.random.split(jax.random.fold_in(key, now), 3))(keys)

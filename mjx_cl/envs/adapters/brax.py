@@ -22,7 +22,7 @@ class BraxEnv(base.Env):
     **settings: FaultSettings.
   """
 
-  def __init__(self, env: Any, fault: str | None = None, **settings: Any):
+  def __init__(self, env: Any, fault: str | None = None, **settings: Any) -> None:
     self.env, self.faulty = env, fault is not None
     self.rollout, self._begin = join(env, fault=fault or "none", **settings)
 

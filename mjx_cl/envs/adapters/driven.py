@@ -32,7 +32,7 @@ class Puppet:
   x U(-1, 1): 0 is no command at all.
   """
 
-  def __init__(self, act_size: int, spread: float = 0.0):
+  def __init__(self, act_size: int, spread: float = 0.0) -> None:
     self.act_size, self.spread = act_size, spread
     self.size = types.SimpleNamespace(stoch=1, classes=1)
 
@@ -154,7 +154,7 @@ class Robots:
     untouched: bool (num,), no control step since the last reset.
   """
 
-  def __init__(self, env: Any, physics: str, num: int, **fault: Any):
+  def __init__(self, env: Any, physics: str, num: int, **fault: Any) -> None:
     self._made = (env, physics, num), fault
     self.env, self.num = envs.make(env, physics) if isinstance(env, str) else env, num
     self.rollout, begin = join(self.env, **fault)

@@ -27,7 +27,7 @@ class GymnasiumEnv(gymnasium.Env):
     **fault: FaultSettings.
   """
 
-  def __init__(self, env: Any, seed: int = 0, physics: str = "auto", **fault: Any):
+  def __init__(self, env: Any, seed: int = 0, physics: str = "auto", **fault: Any) -> None:
     self.robots, self._seed = Robots(env, physics, 1, **fault), seed
     spec = self.robots.env.spec
     self.metadata = {"render_modes": [], "render_fps": 1.0 / spec.control_s}
@@ -64,7 +64,7 @@ class GymnasiumVector(gymnasium.vector.VectorEnv):
 
   def __init__(
     self, env: Any, num_envs: int = 1, seed: int = 0, physics: str = "auto", **fault: Any
-  ):
+  ) -> None:
     if num_envs < 1:
       raise UserError(f"num_envs must be above 0; got {num_envs}")
     self.robots, self.num_envs, self._seed = Robots(env, physics, num_envs, **fault), num_envs, seed
