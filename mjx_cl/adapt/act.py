@@ -51,7 +51,7 @@ class Weighed(NamedTuple):
   earns: jax.Array
 
 
-def follow(acting: Any, params: Any, number: jax.Array, average: jax.Array) -> Any:
+def follow(acting: Any, params: Any, number: jax.Array, average: jax.Array | float) -> Any:
   """`acting` drawn towards the parameters that learn, where `number` (groups,) of updates is above
   0: acting + average (params - acting).
   """

@@ -71,10 +71,10 @@ class Crew:
     self,
     states: list[LoopState],
     rows: Row,
-    now: jax.Array | int,
+    now: jax.Array,
     choices: Choices,
     keys: jax.Array,
-    acceptance: jax.Array | np.ndarray | None = None,
+    acceptance: jax.Array | None = None,
   ) -> tuple[list[LoopState], Digest]:
     """One chunk of all streams; arguments as of Loop._digest, `states` is used up. The Digest is
     NumPy.

@@ -138,7 +138,7 @@ def choices(
   Raises:
     UserError where an arm's schedule does not fit into the run.
   """
-  arms = [choose("arm", arm, arms_lib.ARMS) for arm, _ in labels]
+  arms: list[Any] = [choose("arm", arm, arms_lib.ARMS) for arm, _ in labels]
   onsets = [()] * len(arms) if onsets is None else onsets
   at = [
     arm.trigger.steps(config, own if arm.breaks else (), steps, seed)
@@ -294,7 +294,7 @@ class Loop:
     now: jax.Array,
     choices: Choices,
     keys: jax.Array,
-    acceptance: jax.Array | None,
+    acceptance: jax.Array | float | None,
     config: AdaptConfig,
   ) -> tuple[LoopState, Digest]:
     agent, was, length = self.agent, state.phase.phase, rows.reward.shape[0]

@@ -160,7 +160,7 @@ class Agent:
       clone_std,
     )
     self.size = s = SIZES[config.size]
-    self.deviations = config.min_std, config.max_std
+    self.deviations: tuple[float, ...] = config.min_std, config.max_std
     self.bins = jnp.asarray(nets.two_hot_bins(config.bins))
     if isinstance(config.obs_scale, str):
       raise UserError(

@@ -57,7 +57,7 @@ def parameter(module: nn.Module, name: str, init: Callable, shape: tuple[int, ..
   """
   if not module.has_variable("params", name):
     return module.param(name, init, shape)
-  value = module.get_variable("params", name)
+  value: jax.Array = module.get_variable("params", name)
   if value.shape != shape:
     raise flax.errors.ScopeParamShapeError(name, module.scope.path_text, shape, value.shape)
   return value

@@ -41,7 +41,7 @@ def make(name: str, physics: str = "auto") -> Any:
     UserError for an unknown name, a backend that the robot has not, and whatever goes wrong in a
     robot of another package.
   """
-  build = choose("environment", name, ENVS)
+  build: Any = choose("environment", name, ENVS)
   if name in ENVS.own:
     return build(physics=physics)
   try:

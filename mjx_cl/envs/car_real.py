@@ -145,7 +145,7 @@ def widen(model: Model, name: str, share: jax.Array | float, wheels: tuple[int, 
   Args:
     wheels: geoms of the four wheels.
   """
-  item = choose("gap item", name, GAP)
+  item: Any = choose("gap item", name, GAP)
   where, leaf = item.leaf.split(".")
   table = getattr(model, where)
   value, more = table[leaf], share * (item.real - item.simulator)
@@ -299,7 +299,9 @@ class CarReal:
     self.wheels = tuple(self.mj_model.geom(f"wheel_{n}").id for n in WHEELS)
     leaves = ("body_mass", "body_inertia", "body_ipos", "geom_friction", "dof_damping")
     mj = {name: jnp.asarray(getattr(self.mj_model, name), jnp.float32) for name in leaves}
-    task = {name: car.nominal()[name] for name in ("strength", "velocity_limit", "reward_weights")}
+    task: dict[str, Any] = {
+      name: car.nominal()[name] for name in ("strength", "velocity_limit", "reward_weights")
+    }
     task |= {i.leaf[5:]: i.simulator for i in GAP.values() if i.leaf.startswith("task.")}
     model = Model(
       mj | {"gravity": jnp.asarray(self.mj_model.opt.gravity, jnp.float32)},

@@ -116,7 +116,7 @@ def make(name: str, env: Any) -> Fault:
     UserError for an unknown name, a fault that has nothing to act on in this robot, and whatever
     goes wrong in one of another package.
   """
-  build = choose("fault", name, FAULTS)
+  build: Any = choose("fault", name, FAULTS)
   try:
     made = build(env)
     if not isinstance(made, Fault):

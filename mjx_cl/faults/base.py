@@ -37,8 +37,8 @@ class Ports(NamedTuple):
   """
 
   model: Model
-  ctrl: jax.Array | None = None
-  obs: jax.Array | None = None
+  ctrl: jax.Array | Any = None
+  obs: jax.Array | Any = None
   first: jax.Array | bool = False
   since: jax.Array | int = 0
 

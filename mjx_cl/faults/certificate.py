@@ -267,7 +267,7 @@ def certify(
   nominal = Lane(next(iter(faults)), next(iter(faults.values())).targets[0], 0.0)
   run = program(env, tuple(faults.values()))
   model = faults_lib.owned_model(tuple(faults.values()), env.model)
-  under = []
+  under: list[list[Certificate]] = []
   for k, size in enumerate(sizes):
     signal, out = jnp.asarray(actions(env, steps, seed + k, size)), []
     for part in parts(chosen):

@@ -52,7 +52,7 @@ _Metadata = type(
   (ctypes.Structure,),
   {"_fields_": [("struct_size", _N), ("version", _Version), ("traits", ctypes.c_uint32)]},
 )
-_Extension = type(
+_Extension: Any = type(
   "Extension",
   (ctypes.Structure,),
   {
@@ -100,7 +100,7 @@ _lock = threading.Lock()
 _BETWEEN = "|"  # in an attribute: between name and word
 
 
-def _array(buffer: _Buffer) -> np.ndarray:
+def _array(buffer: Any) -> np.ndarray:
   """The buffer's numbers, uint32, without a copy."""
   shape = buffer.dims[: buffer.rank]
   size = 4 * int(np.prod(shape, dtype=np.int64))

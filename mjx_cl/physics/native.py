@@ -219,7 +219,7 @@ class Host:
     self.shapes = {o: np.shape(getattr(data, o)) for o in outputs}
     if law is not None:
       self.shapes |= {"ctrl": (mj_model.nu,), "qvel_before": (mj_model.nv,)}
-    self._batches: dict[int, object] = {}
+    self._batches: dict[tuple[int, tuple[str, ...], bool], tuple[Any, dict[str, np.ndarray]]] = {}
     self._lock = threading.Lock()
     self.seconds = 0.0
 

@@ -231,7 +231,7 @@ class Rollout:
     """
     if drive is None:
       drive = jnp.zeros(streams.t.shape, bool)
-    shaken = None if shake is None else 0
+    shaken: int | None = None if shake is None else 0
     decide = nest(self._decide, (0, 0, 0, shaken), (None, 0, 0, shaken))
     control = nest(self._control, (0, 0), (0, 0))
     params = jax.vmap(self.agent.prepare)(params)

@@ -154,6 +154,8 @@ class Robots:
     untouched: bool (num,), no control step since the last reset.
   """
 
+  streams: Stream | Any
+
   def __init__(self, env: Any, physics: str, num: int, **fault: Any) -> None:
     self._made = (env, physics, num), fault
     self.env, self.num = envs.make(env, physics) if isinstance(env, str) else env, num
@@ -193,7 +195,9 @@ class Robots:
     self.untouched = np.ones(self.num, bool)
     return np.array(self.streams.obs[0])
 
-  def step(self, actions: np.ndarray, pending: Sequence[bool]) -> tuple[np.ndarray, ...]:
+  def step(
+    self, actions: np.ndarray, pending: Sequence[bool] | np.ndarray
+  ) -> tuple[np.ndarray, ...]:
     """One control step of all robots but those `pending`, which get a new episode in its place
     while their fault clock stands still.
 
