@@ -118,7 +118,7 @@ class Crew:
     """
     plain = lanes is None or lanes.plain
     if len(states) == 1:
-      return states[0].acting if plain else lanes.spread(states[0].acting)
+      return states[0].acting if plain else lanes.spread(states[0].acting)  # type: ignore[union-attr]
     at = [
       (states[i].acting, g - block.start)
       for i, block in enumerate(self.blocks)
@@ -126,7 +126,7 @@ class Crew:
     ]
     streams = [
       jax.tree.map(lambda x: np.asarray(x)[k], acting)
-      for acting, k in (at if plain else (at[g] for g in lanes.order))
+      for acting, k in (at if plain else (at[g] for g in lanes.order))  # type: ignore[union-attr]
     ]
     return jax.tree.map(lambda *x: jnp.asarray(np.stack(x)), *streams)
 

@@ -92,7 +92,7 @@ class PhaseState(NamedTuple):
   phase: jax.Array
   since: jax.Array
   ring: jax.Array
-  count: jax.Array
+  count: jax.Array  # type: ignore[assignment]
   best: jax.Array
   best_at: jax.Array
   mean: jax.Array

@@ -4,7 +4,7 @@ parameters and moments.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +15,9 @@ from mjx_cl.dreamer.agent import Agent, TrainState, culprit
 from mjx_cl.dreamer.replay import Replay
 from mjx_cl.keys import OfAdaptation
 from mjx_cl.rollout.scan import Row, records
+
+if TYPE_CHECKING:
+  from collections.abc import Callable
 
 BEHAVIOUR = {"pol", "val", "slow", "range"}  # of a TrainState: what is no world model
 
@@ -29,7 +32,9 @@ def fill(
     row: int32 (groups,), after which row.
     adapting: bool (groups,), the chunk began within an adaptation.
   """
-  where = lambda a, b: jnp.where(begins.reshape((-1,) + (1,) * (a.ndim - 1)), a, b)
+  where: Callable[..., Any] = lambda a, b: jnp.where(
+    begins.reshape((-1,) + (1,) * (a.ndim - 1)), a, b
+  )
   count = where(jnp.zeros_like(replay.count), replay.count)
   queue = where(jnp.zeros_like(replay.queue), replay.queue)
   length = rows.reward.shape[0]

@@ -44,7 +44,7 @@ class LoopState(NamedTuple):
 
   train: TrainState
   acting: Any
-  replay: replay_lib.Replay
+  replay: replay_lib.Replay | Any
   history: History
   detector: Any
   phase: decide.PhaseState
@@ -152,7 +152,7 @@ def choices(
   ]
   flags = lambda get: jnp.asarray([get(arm) for arm in arms], bool)
   limits = [
-    min(arm.end.limit(config), stops[seed]) if arm.end.told else arm.end.limit(config)
+    min(arm.end.limit(config), stops[seed]) if arm.end.told else arm.end.limit(config)  # type: ignore[index]
     for arm, (_, seed) in zip(arms, labels)
   ]
   return Choices(
@@ -332,8 +332,15 @@ class Loop:
     before, weighed = state.before, ()
     if before is not None:
       reward = seen.signals[:, decide.SIGNALS.index("reward")]
-      acting, before, weighed = act.put_back(
-        acting, before, phase, was, begins, reward, taken, choices.rollback
+      acting, before, weighed = act.put_back(  # type: ignore[assignment]
+        acting,
+        before,
+        phase,
+        was,
+        begins,
+        reward,
+        taken,
+        choices.rollback,  # type: ignore[arg-type]
       )
     train = train._replace(params=act.choose(act.ended(was, phase), acting, train.params))
 

@@ -120,7 +120,7 @@ def culprit(metrics: dict[str, jax.Array]) -> jax.Array:
   finite. The world model's losses come first, then the critic's and the actor's, which are made of
   its dreams: the first one names the origin.
   """
-  bad = [
+  bad: Any = [
     ~(
       jnp.abs(metrics[k])
       <= (EXPLODED if k.startswith("loss") or k == "opt/loss" else jnp.finfo(jnp.float32).max)
@@ -349,7 +349,7 @@ class Agent:
 
   def value(self, value_params: Any, deter: jax.Array, stoch: jax.Array) -> jax.Array:
     """Value logits (..., bins) of a (fast or slow) critic."""
-    return self.val.apply({"params": value_params}, deter, stoch)
+    return self.val.apply({"params": value_params}, deter, stoch)  # type: ignore[return-value]
 
   def loss(
     self,
@@ -447,9 +447,9 @@ class Agent:
       batch.demo[:, 1:].swapaxes(0, 1),
       batch.has_demo[:, 1:].swapaxes(0, 1).astype(jnp.float32),
     )
-    var = self.clone_std**2
+    var = self.clone_std**2  # type: ignore[operator]
     kl = jnp.sum(
-      jnp.log(std / self.clone_std) + (var + jnp.square(mean - demo)) / (2 * jnp.square(std)) - 0.5,
+      jnp.log(std / self.clone_std) + (var + jnp.square(mean - demo)) / (2 * jnp.square(std)) - 0.5,  # type: ignore[operator]
       -1,
     )
     return jnp.sum(kl * has) / jnp.maximum(1.0, jnp.sum(has))

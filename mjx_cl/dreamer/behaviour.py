@@ -91,7 +91,7 @@ def step_losses(
   policy = -omega * (nets.normal_logp(mean, std, action) * adv + agent.config.entropy * entropy)
   logits = agent.val.apply({"params": val}, *features, pre=pre[1])
   value = omega * (
-    nets.two_hot_loss(logits, ret, agent.bins) + nets.two_hot_loss(logits, slow, agent.bins)
+    nets.two_hot_loss(logits, ret, agent.bins) + nets.two_hot_loss(logits, slow, agent.bins)  # type: ignore[arg-type]
   )
   return jnp.sum(policy), jnp.sum(value), jnp.sum(entropy)
 
@@ -123,7 +123,7 @@ def sums_stacked(
   agent: Agent, pol: Any, val: Any, img: Imagined, *targets: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
   """`step_losses` over all states at once."""
-  return step_losses(agent, pol, val, (img.deter, img.stoch), img.action, *targets)
+  return step_losses(agent, pol, val, (img.deter, img.stoch), img.action, *targets)  # type: ignore[arg-type]
 
 
 # ---- state by state ------------------------------------------------------------------------------
@@ -220,7 +220,7 @@ def sums_stepwise(
 
   def losses_at(pol: Any, val: Any, x: tuple[Any, ...]) -> tuple[jax.Array, jax.Array, jax.Array]:
     _, _, pre, action, targets = x
-    return step_losses(agent, pol, val, (), action, *targets, pre=pre)
+    return step_losses(agent, pol, val, (), action, *targets, pre=pre)  # type: ignore[misc]
 
   def gradients_at(
     pol: Any, val: Any, x: tuple[Any, ...]

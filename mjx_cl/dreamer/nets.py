@@ -59,7 +59,7 @@ def parameter(module: nn.Module, name: str, init: Callable, shape: tuple[int, ..
     return module.param(name, init, shape)
   value: jax.Array = module.get_variable("params", name)
   if value.shape != shape:
-    raise flax.errors.ScopeParamShapeError(name, module.scope.path_text, shape, value.shape)
+    raise flax.errors.ScopeParamShapeError(name, module.scope.path_text, shape, value.shape)  # type: ignore[union-attr]
   return value
 
 

@@ -47,7 +47,7 @@ class Replay(NamedTuple):
   """
 
   data: Record
-  count: jax.Array
+  count: jax.Array  # type: ignore[assignment]
   queue: jax.Array
 
 

@@ -399,7 +399,7 @@ def reward_terms(
 
 def make_spec(mj_model: mujoco.MjModel) -> Spec:
   """Names, units and groups, read from the tables above and the MuJoCo model."""
-  obs, groups = [], []
+  obs, groups = [], []  # type: ignore[var-annotated]
   for group, names, unit, noise, scale in OBSERVATION:
     groups.append((group, tuple(range(len(obs), len(obs) + len(names)))))
     bound = {"projected_gravity": 1 + noise, "last_action": 1.0}.get(group, float("inf"))
@@ -536,7 +536,11 @@ class Quadruped:
     action = jnp.clip(action, -1.0, 1.0)
     motor = {name: task[name] for name in ("strength", "velocity_limit")}
     inner, out = self.physics.step(
-      model.mj, before.backend, DEFAULT + ACTION_SCALE * action, motor, model.force
+      model.mj,
+      before.backend,
+      DEFAULT + ACTION_SCALE * action,  # type: ignore[arg-type]
+      motor,
+      model.force,
     )
     qpos, qvel, gravity = (
       out["qpos"],

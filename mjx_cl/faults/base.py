@@ -107,7 +107,7 @@ def read(ports: Ports, name: str) -> jax.Array:
   """Value of the leaf `name`."""
   kind, _, leaf = name.partition(".")
   return (
-    getattr(ports.model, kind)[leaf]
+    getattr(ports.model, kind)[leaf]  # type: ignore[return-value]
     if leaf
     else ports.model.force
     if kind == "force"
@@ -125,7 +125,7 @@ def write(ports: Ports, name: str, value: jax.Array) -> Ports:
   return (
     ports._replace(model=ports.model._replace(force=value))
     if kind == "force"
-    else ports._replace(**{kind: value})
+    else ports._replace(**{kind: value})  # type: ignore[arg-type]
   )
 
 

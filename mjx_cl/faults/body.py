@@ -62,7 +62,7 @@ def payload(env: Any) -> Fault:
   trunk = int(env.spec.bodies[0][1][0])
   share = float(mass.sum() / mass[trunk])
 
-  def act(
+  def act(  # type: ignore[no-redef]
     target: jax.Array, memory: Any, severity: jax.Array, key: jax.Array, ports: Ports
   ) -> tuple[Any, dict[str, jax.Array]]:
     grown = jnp.where(jnp.arange(mass.size) == trunk, 1.0 + 0.4 * severity * share, 1.0)

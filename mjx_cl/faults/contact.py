@@ -127,7 +127,7 @@ def wind(env: Any) -> Fault:
   def act(
     blow: jax.Array, memory: Any, severity: jax.Array, key: jax.Array, ports: Ports
   ) -> tuple[Any, dict[str, jax.Array]]:
-    return memory, {"force": ports.model.force + severity * blow}
+    return memory, {"force": ports.model.force + severity * blow}  # type: ignore[operator]
 
   return fault("wind", env, ("force",), names, act, rows=blows)
 
@@ -155,7 +155,7 @@ def push(env: Any) -> Fault:
     strength = jnp.where(phase < PUSH_FOR, severity, 0.0)
     chosen = (jnp.arange(blows.shape[0]) == which)[:, None]
     return which, {
-      "force": ports.model.force + strength * jnp.sum(jnp.where(chosen, blows, 0.0), 0)
+      "force": ports.model.force + strength * jnp.sum(jnp.where(chosen, blows, 0.0), 0)  # type: ignore[operator]
     }
 
   return fault("push", env, ("force",), ("trunk",), act, jnp.int32(0))

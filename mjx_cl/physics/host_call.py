@@ -105,7 +105,7 @@ def _array(buffer: Any) -> np.ndarray:
   shape = buffer.dims[: buffer.rank]
   size = 4 * int(np.prod(shape, dtype=np.int64))
   return (
-    np.frombuffer((ctypes.c_char * size).from_address(buffer.data), np.uint32).reshape(shape)
+    np.frombuffer((ctypes.c_char * size).from_address(buffer.data), np.uint32).reshape(shape)  # type: ignore[call-overload]
     if size
     else np.zeros(shape, np.uint32)
   )

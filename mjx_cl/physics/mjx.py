@@ -133,7 +133,7 @@ class Mjx:
         carry: tuple[mjx.Data, jax.Array, jax.Array], _: None
       ) -> tuple[tuple[mjx.Data, jax.Array, jax.Array], None]:
         d = carry[0]
-        actuators = jnp.asarray(self.law(jnp, task, ctrl, d.qpos, d.qvel), d.ctrl.dtype)
+        actuators = jnp.asarray(self.law(jnp, task, ctrl, d.qpos, d.qvel), d.ctrl.dtype)  # type: ignore[misc]
         return (mjx.step(model, d.replace(ctrl=actuators)), actuators, d.qvel), None
 
       (state, actuators, before), _ = jax.lax.scan(

@@ -231,12 +231,12 @@ class Rollout:
     """
     if drive is None:
       drive = jnp.zeros(streams.t.shape, bool)
-    shaken: int | None = None if shake is None else 0
+    shaken = None if shake is None else 0
     decide = nest(self._decide, (0, 0, 0, shaken), (None, 0, 0, shaken))
     control = nest(self._control, (0, 0), (0, 0))
     params = jax.vmap(self.agent.prepare)(params)
 
-    def step(streams: Stream, _: None) -> tuple[Stream, Row]:
+    def step(streams: Stream, _: Any) -> tuple[Stream, Row]:
       carry, action, demo, has_demo = decide(params, streams, drive, shake)
       before = streams
       streams, out, severity = control(streams, action)

@@ -69,8 +69,8 @@ class Arriving(Rollout):
   so that the next one begins by the ordinary reset.
   """
 
-  def _control(self, stream: Arrival, action: jax.Array) -> tuple[Any, Step, jax.Array]:
-    later, out, severity = super()._control(stream, action)
+  def _control(self, stream: Arrival, action: jax.Array) -> tuple[Any, Step, jax.Array]:  # type: ignore[override]
+    later, out, severity = super()._control(stream, action)  # type: ignore[arg-type]
     waits = stream.t < stream.enter
     env = jax.tree.map(lambda rest, moved: jnp.where(waits, rest, moved), stream.env, later.env)
     out = out._replace(

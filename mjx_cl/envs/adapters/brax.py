@@ -33,7 +33,7 @@ class BraxEnv(base.Env):
       state, obs = self.env.init(self.env.model, rng)
       return base.State(state, obs, zero, zero, {})
     stream = self._begin(rng)
-    info = {"stream": stream._replace(env=()), "severity": zero}
+    info = {"stream": stream._replace(env=()), "severity": zero}  # type: ignore[arg-type]
     return base.State(stream.env, stream.obs, zero, zero, {}, info)
 
   def step(self, state: base.State, action: jax.Array) -> base.State:

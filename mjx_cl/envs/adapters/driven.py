@@ -178,8 +178,8 @@ class Robots:
 
   def __setstate__(self, state: dict[str, Any]) -> None:
     place, fault = state["made"]
-    self.__init__(*place, **fault)
-    back = lambda x: jax.random.wrap_key_data(x.data) if isinstance(x, _Bits) else jnp.asarray(x)
+    self.__init__(*place, **fault)  # type: ignore[misc]
+    back = lambda x: jax.random.wrap_key_data(x.data) if isinstance(x, _Bits) else jnp.asarray(x)  # type: ignore[arg-type]
     self.streams = jax.tree.map(back, state["streams"], is_leaf=lambda x: isinstance(x, _Bits))
     self.untouched = state["untouched"]
 
