@@ -51,7 +51,7 @@ class Weighed(NamedTuple):
   earns: jax.Array
 
 
-def follow(acting, params, number: jax.Array, average: jax.Array):
+def follow(acting: Any, params: Any, number: jax.Array, average: jax.Array | float) -> Any:
   """`acting` drawn towards the parameters that learn, where `number` (groups,) of updates is above
   0: acting + average (params - acting).
   """
@@ -65,7 +65,7 @@ def ended(was: jax.Array, phase: PhaseState) -> jax.Array:
 
 
 def put_back(
-  acting,
+  acting: Any,
   before: Before,
   phase: PhaseState,
   was: jax.Array,
@@ -99,7 +99,7 @@ def put_back(
   return acting, after, Weighed(back, earned, earns)
 
 
-def choose(where: jax.Array, a, b):
+def choose(where: jax.Array, a: Any, b: Any) -> Any:
   """Of each stream the leaves of `a` where `where` (groups,), else those of `b`."""
   return jax.tree.map(lambda x, y: jnp.where(_wide(where, x), x, y), a, b)
 

@@ -10,9 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from mjx_cl.config import FOREVER
 from mjx_cl.errors import UserError
+
+if TYPE_CHECKING:
+  from mjx_cl.config import AdaptConfig
 
 
 @dataclass(frozen=True)
@@ -70,7 +74,7 @@ class Arm:
   agent: str = ""
 
 
-def _random(adapt, onsets, steps, seed):
+def _random(adapt: AdaptConfig, onsets: tuple[int, ...], steps: int, seed: int) -> tuple[int, ...]:
   """One step, uniform over those from which a whole adaptation fits into the run."""
   import numpy as np
 

@@ -12,7 +12,7 @@ block.
 from __future__ import annotations
 
 import concurrent.futures
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +21,12 @@ import numpy as np
 from mjx_cl.adapt.loop import Choices, Digest, Loop, LoopState
 from mjx_cl.io.runtime import cores
 from mjx_cl.rollout.order import Lanes
+
+if TYPE_CHECKING:
+  from collections.abc import Sequence
+
+  from mjx_cl.dreamer.agent import TrainState
+  from mjx_cl.rollout.scan import Row
 
 LATER = (
   "history",
@@ -37,20 +43,22 @@ class Crew:
     threads: None: as many as cores may be used, and no more than there are blocks.
   """
 
-  def __init__(self, loop: Loop, groups: int, size: int | None = None, threads: int | None = None):
+  def __init__(
+    self, loop: Loop, groups: int, size: int | None = None, threads: int | None = None
+  ) -> None:
     size = size or (1 if jax.default_backend() == "cpu" else groups)
     self.loop, self.groups = loop, groups
     self.blocks = [slice(g, min(g + size, groups)) for g in range(0, groups, size)]
     self.threads = threads or min(len(cores()), len(self.blocks))
     self._warm: set[int] = set()  # sizes of block whose program is there
 
-  def init(self, trains, rollback: bool = False) -> list[LoopState]:
+  def init(self, trains: Sequence[TrainState], rollback: bool = False) -> list[LoopState]:
     """State before the first step, a list of blocks. trains: TrainState that each stream begins
     with; those of a block are put in place one by one. rollback: as of Loop.init.
     """
     return [self._begin(trains[block], rollback) for block in self.blocks]
 
-  def _begin(self, trains, rollback):
+  def _begin(self, trains: Sequence[TrainState], rollback: bool) -> LoopState:
     state = self.loop.init(trains[0], len(trains), rollback)
     if all(train is trains[0] for train in trains):
       return state
@@ -60,7 +68,13 @@ class Crew:
     )  # `before` is written at every start, before it is read
 
   def digest(
-    self, states: list[LoopState], rows, now, choices: Choices, keys, acceptance=None
+    self,
+    states: list[LoopState],
+    rows: Row,
+    now: jax.Array,
+    choices: Choices,
+    keys: jax.Array,
+    acceptance: jax.Array | None = None,
   ) -> tuple[list[LoopState], Digest]:
     """One chunk of all streams; arguments as of Loop._digest, `states` is used up. The Digest is
     NumPy.
@@ -71,7 +85,7 @@ class Crew:
       return [jax.block_until_ready(state)], host(digest)
     rows, choices, acceptance = host(rows), host(choices), host(acceptance)
 
-    def one(i):
+    def one(i: int) -> tuple[LoopState, Digest]:
       block = self.blocks[i]
       state, digest = self.loop.digest(
         states[i],
@@ -104,7 +118,7 @@ class Crew:
     """
     plain = lanes is None or lanes.plain
     if len(states) == 1:
-      return states[0].acting if plain else lanes.spread(states[0].acting)
+      return states[0].acting if plain else lanes.spread(states[0].acting)  # type: ignore[union-attr]
     at = [
       (states[i].acting, g - block.start)
       for i, block in enumerate(self.blocks)
@@ -112,7 +126,7 @@ class Crew:
     ]
     streams = [
       jax.tree.map(lambda x: np.asarray(x)[k], acting)
-      for acting, k in (at if plain else (at[g] for g in lanes.order))
+      for acting, k in (at if plain else (at[g] for g in lanes.order))  # type: ignore[union-attr]
     ]
     return jax.tree.map(lambda *x: jnp.asarray(np.stack(x)), *streams)
 
@@ -155,15 +169,15 @@ class Crew:
     ]
 
 
-def cut(tree, block: slice, axis: int):
+def cut(tree: Any, block: slice, axis: int) -> Any:
   """Entries `block` along an axis of every leaf."""
   return jax.tree.map(lambda x: x[(slice(None),) * axis + (block,)], tree)
 
 
-def glue(parts: list, later: tuple[str, ...]):
+def glue(parts: list, later: tuple[str, ...]) -> Any:
   """Named tuples put together along axis 1 of the fields `later`, axis 0 of the others, NumPy."""
 
-  def field(name):
+  def field(name: str) -> Any:
     values = [getattr(part, name) for part in parts]
     return jax.tree.map(
       lambda *x: np.concatenate([np.asarray(y) for y in x], int(name in later)), *values

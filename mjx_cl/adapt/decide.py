@@ -11,12 +11,17 @@ the structure.
 from __future__ import annotations
 
 import dataclasses
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from mjx_cl.config import AdaptConfig
+
+if TYPE_CHECKING:
+  from collections.abc import Iterable
+
+  from mjx_cl.adapt.loop import Choices
 
 SIGNALS = ("opr", "rpr", "reward", "dyn_loss", "adv_mag", "value_loss")
 
@@ -48,14 +53,14 @@ REASONS = (
 STATIC = ("patience", "refit", "fresh_moments")
 
 
-def _flatten(config: AdaptConfig):
+def _flatten(config: AdaptConfig) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
   names = [f.name for f in dataclasses.fields(config)]
   return tuple(getattr(config, n) for n in names if n not in STATIC), tuple(
     getattr(config, n) for n in STATIC
   )
 
 
-def _unflatten(static, leaves) -> AdaptConfig:
+def _unflatten(static: tuple[Any, ...], leaves: Iterable[Any]) -> AdaptConfig:
   config = object.__new__(
     AdaptConfig
   )  # traced values can't be checked; those of the config that was flattened have been
@@ -87,7 +92,7 @@ class PhaseState(NamedTuple):
   phase: jax.Array
   since: jax.Array
   ring: jax.Array
-  count: jax.Array
+  count: jax.Array  # type: ignore[assignment]
   best: jax.Array
   best_at: jax.Array
   mean: jax.Array
@@ -144,8 +149,8 @@ def decide(
   posture: jax.Array,
   begin: Starts,
   now: jax.Array,
-  choices,
-  acceptance,
+  choices: Choices,
+  acceptance: jax.Array | float,
   least_posture: float,
   config: AdaptConfig,
 ) -> tuple[PhaseState, jax.Array, jax.Array]:
@@ -156,7 +161,14 @@ def decide(
     acceptance: () or (groups,).
   """
 
-  def one(state, signals, posture, begin, choices, acceptance):
+  def one(
+    state: PhaseState,
+    signals: jax.Array,
+    posture: jax.Array,
+    begin: Starts,
+    choices: Choices,
+    acceptance: jax.Array | float,
+  ) -> tuple[PhaseState, jax.Array, jax.Array]:
     return update(
       state,
       signals,
@@ -218,20 +230,20 @@ def nominal_std(state: PhaseState) -> jax.Array:
 
 def update(
   state: PhaseState,
-  signals,
-  posture,
-  alarm,
-  alarm_step,
-  now,
-  acts,
-  acceptance,
-  least_posture,
+  signals: jax.Array,
+  posture: jax.Array,
+  alarm: jax.Array,
+  alarm_step: jax.Array | int,
+  now: jax.Array | int,
+  acts: jax.Array | bool,
+  acceptance: jax.Array | float,
+  least_posture: jax.Array | float,
   config: AdaptConfig,
-  due=False,
-  rule=True,
-  limit=None,
-  counts=None,
-):
+  due: jax.Array | bool = False,
+  rule: jax.Array | bool = True,
+  limit: jax.Array | int | None = None,
+  counts: jax.Array | None = None,
+) -> tuple[PhaseState, jax.Array, jax.Array]:
   """One chunk of one stream.
 
   Args:
@@ -265,7 +277,14 @@ def update(
   )
 
 
-def _remember(state: PhaseState, signals, posture, begins, now, config: AdaptConfig) -> PhaseState:
+def _remember(
+  state: PhaseState,
+  signals: jax.Array,
+  posture: jax.Array,
+  begins: jax.Array,
+  now: jax.Array | int,
+  config: AdaptConfig,
+) -> PhaseState:
   """The nominal levels (Welford) until the first adaptation, the ring while adapting."""
   adapting = state.phase == ADAPTING
   learns = (state.phase == NOMINAL) & ~begins & (now > config.warmup) & ~jnp.isnan(signals)
@@ -284,7 +303,15 @@ def _remember(state: PhaseState, signals, posture, begins, now, config: AdaptCon
 
 
 def _judge(
-  state: PhaseState, begins, calm, now, acceptance, least_posture, rule, limit, config: AdaptConfig
+  state: PhaseState,
+  begins: jax.Array,
+  calm: jax.Array,
+  now: jax.Array | int,
+  acceptance: jax.Array | float,
+  least_posture: jax.Array | float,
+  rule: jax.Array | bool,
+  limit: jax.Array | int,
+  config: AdaptConfig,
 ) -> tuple[PhaseState, jax.Array]:
   """The decision of a chunk that is remembered already, and the phase that follows it.
 

@@ -4,7 +4,7 @@ parameters and moments.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +15,9 @@ from mjx_cl.dreamer.agent import Agent, TrainState, culprit
 from mjx_cl.dreamer.replay import Replay
 from mjx_cl.keys import OfAdaptation
 from mjx_cl.rollout.scan import Row, records
+
+if TYPE_CHECKING:
+  from collections.abc import Callable
 
 BEHAVIOUR = {"pol", "val", "slow", "range"}  # of a TrainState: what is no world model
 
@@ -29,7 +32,9 @@ def fill(
     row: int32 (groups,), after which row.
     adapting: bool (groups,), the chunk began within an adaptation.
   """
-  where = lambda a, b: jnp.where(begins.reshape((-1,) + (1,) * (a.ndim - 1)), a, b)
+  where: Callable[..., Any] = lambda a, b: jnp.where(
+    begins.reshape((-1,) + (1,) * (a.ndim - 1)), a, b
+  )
   count = where(jnp.zeros_like(replay.count), replay.count)
   queue = where(jnp.zeros_like(replay.queue), replay.queue)
   length = rows.reward.shape[0]
@@ -63,14 +68,14 @@ def fresh_moments(agent: Agent, train: TrainState, begins: jax.Array) -> TrainSt
 
 
 def renew(
-  agent: Agent, train: TrainState, acting, keys: jax.Array, fresh: jax.Array
+  agent: Agent, train: TrainState, acting: Any, keys: jax.Array, fresh: jax.Array
 ) -> tuple[TrainState, Any]:
   """New parameters, moments and counters where `fresh` (groups,). Loops for the reason given in
   `learn`.
   """
 
-  def stream(g, state):
-    def anew(_, state):
+  def stream(g: jax.Array, state: tuple[TrainState, Any]) -> tuple[TrainState, Any]:
+    def anew(_: jax.Array, state: tuple[TrainState, Any]) -> tuple[TrainState, Any]:
       train, acting = state
       new = agent.init(jax.random.fold_in(keys[g], OfAdaptation.FRESH))
       return put(train, g, new), put(acting, g, new.params)
@@ -100,8 +105,12 @@ def learn(
     lambda x: x.reshape((-1,) + x.shape[2:]), replay
   )  # (groups, 1, ..) -> (groups, ..)
 
-  def stream(g, state):
-    def update(state):
+  def stream(
+    g: jax.Array, state: tuple[TrainState, Replay, jax.Array]
+  ) -> tuple[TrainState, Replay, jax.Array]:
+    def update(
+      state: tuple[jax.Array, TrainState, Replay, jax.Array],
+    ) -> tuple[jax.Array, TrainState, Replay, jax.Array]:
       i, train, replay, _ = state
       key_sample, key_update = jax.random.split(jax.random.fold_in(keys[g], i))
       replay, data, address = replay_lib.sample(replay, key_sample, c.batch, c.length + 1, only=g)
@@ -154,7 +163,7 @@ def keep_behaviour(keep: jax.Array, before: TrainState, after: TrainState) -> Tr
   shapes the features, as in every arm.
   """
 
-  def one(path, old, new):
+  def one(path: tuple[Any, ...], old: jax.Array, new: jax.Array) -> jax.Array:
     names = {getattr(part, "key", getattr(part, "name", None)) for part in path}
     return jnp.where(keep, old, new) if names & BEHAVIOUR else new
 

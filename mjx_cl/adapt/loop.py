@@ -44,7 +44,7 @@ class LoopState(NamedTuple):
 
   train: TrainState
   acting: Any
-  replay: replay_lib.Replay
+  replay: replay_lib.Replay | Any
   history: History
   detector: Any
   phase: decide.PhaseState
@@ -138,7 +138,7 @@ def choices(
   Raises:
     UserError where an arm's schedule does not fit into the run.
   """
-  arms = [choose("arm", arm, arms_lib.ARMS) for arm, _ in labels]
+  arms: list[Any] = [choose("arm", arm, arms_lib.ARMS) for arm, _ in labels]
   onsets = [()] * len(arms) if onsets is None else onsets
   at = [
     arm.trigger.steps(config, own if arm.breaks else (), steps, seed)
@@ -152,7 +152,7 @@ def choices(
   ]
   flags = lambda get: jnp.asarray([get(arm) for arm in arms], bool)
   limits = [
-    min(arm.end.limit(config), stops[seed]) if arm.end.told else arm.end.limit(config)
+    min(arm.end.limit(config), stops[seed]) if arm.end.told else arm.end.limit(config)  # type: ignore[index]
     for arm, (_, seed) in zip(arms, labels)
   ]
   return Choices(
@@ -173,11 +173,11 @@ class Programs:
     most: as many are kept, the newest: a compiled program takes memory.
   """
 
-  def __init__(self, most: int = 8):
+  def __init__(self, most: int = 8) -> None:
     self.most = most
     self.kept: dict[Hashable, Any] = {}  # the newest last
 
-  def share(self, key: Hashable, program):
+  def share(self, key: Hashable, program: Any) -> Any:
     """The program that is kept under `key`, else `program`, which is kept from now on."""
     try:
       program = self.kept.pop(key, program)
@@ -219,7 +219,7 @@ class Loop:
     capacity: int = 20_480,
     same: Hashable | None = None,
     programs: Programs | None = None,
-  ):
+  ) -> None:
     self.agent, self.monitor, self.detector, self.spec = agent, monitor, detector, spec
     self.config, self.repeat, self.capacity = config, repeat, capacity
     self._program = jax.jit(self._digest, donate_argnums=0)
@@ -288,7 +288,14 @@ class Loop:
     return self._program(state, rows, now, choices, keys, acceptance, self.config)
 
   def _digest(
-    self, state: LoopState, rows: Row, now, choices: Choices, keys, acceptance, config: AdaptConfig
+    self,
+    state: LoopState,
+    rows: Row,
+    now: jax.Array,
+    choices: Choices,
+    keys: jax.Array,
+    acceptance: jax.Array | float | None,
+    config: AdaptConfig,
   ) -> tuple[LoopState, Digest]:
     agent, was, length = self.agent, state.phase.phase, rows.reward.shape[0]
     split = jax.vmap(lambda key: jax.random.split(jax.random.fold_in(key, now), 3))(keys)
@@ -325,8 +332,15 @@ class Loop:
     before, weighed = state.before, ()
     if before is not None:
       reward = seen.signals[:, decide.SIGNALS.index("reward")]
-      acting, before, weighed = act.put_back(
-        acting, before, phase, was, begins, reward, taken, choices.rollback
+      acting, before, weighed = act.put_back(  # type: ignore[assignment]
+        acting,
+        before,
+        phase,
+        was,
+        begins,
+        reward,
+        taken,
+        choices.rollback,  # type: ignore[arg-type]
       )
     train = train._replace(params=act.choose(act.ended(was, phase), acting, train.params))
 

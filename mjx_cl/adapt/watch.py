@@ -4,7 +4,7 @@ that the stop rule reads.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +14,9 @@ from mjx_cl.dreamer.agent import Agent, Batch, TrainState
 from mjx_cl.rollout.monitor import History, Monitor, Residual
 from mjx_cl.rollout.scan import Row
 from mjx_cl.types import Spec
+
+if TYPE_CHECKING:
+  from mjx_cl.adapt.loop import LoopState
 
 
 class Watched(NamedTuple):
@@ -35,7 +38,13 @@ class Watched(NamedTuple):
 
 
 def watch(
-  agent: Agent, monitor: Monitor, detector: Detector, spec: Spec, state, rows: Row, keys: jax.Array
+  agent: Agent,
+  monitor: Monitor,
+  detector: Detector,
+  spec: Spec,
+  state: LoopState,
+  rows: Row,
+  keys: jax.Array,
 ) -> tuple[Watched, History, Any, Residual]:
   """Looks at a chunk.
 
@@ -103,14 +112,16 @@ def evaluate(
     jnp.zeros_like(first),
   )
 
-  def one(train, batch, key):
+  def one(
+    train: TrainState, batch: Batch, key: jax.Array
+  ) -> tuple[jax.Array, jax.Array, jax.Array]:
     metrics = agent.loss(train.params, train.slow, train.range, batch, key)[1][0]
     return metrics["loss/dyn"], metrics["adv_mag"], metrics["loss/value"]
 
   return jax.vmap(one)(train, batch, keys)
 
 
-def refit(detector: Detector, state, past: Residual, over: jax.Array):
+def refit(detector: Detector, state: Any, past: Residual, over: jax.Array) -> Any:
   """`state` of the detector, where `over` (groups,): one that has seen the rows `past` alone."""
   fresh = jax.tree.map(lambda x: jnp.broadcast_to(x, (over.shape[0],) + x.shape), detector.init())
   fresh, _ = jax.lax.scan(jax.vmap(detector.update), fresh, past)

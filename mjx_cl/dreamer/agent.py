@@ -120,7 +120,7 @@ def culprit(metrics: dict[str, jax.Array]) -> jax.Array:
   finite. The world model's losses come first, then the critic's and the actor's, which are made of
   its dreams: the first one names the origin.
   """
-  bad = [
+  bad: Any = [
     ~(
       jnp.abs(metrics[k])
       <= (EXPLODED if k.startswith("loss") or k == "opt/loss" else jnp.finfo(jnp.float32).max)
@@ -151,7 +151,7 @@ class Agent:
     act_size: int,
     clone_std: float | None = None,
     stepwise: bool | None = None,
-  ):
+  ) -> None:
     self.stepwise = jax.default_backend() == "cpu" if stepwise is None else stepwise
     self.config, self.obs_size, self.act_size, self.clone_std = (
       config,
@@ -160,7 +160,7 @@ class Agent:
       clone_std,
     )
     self.size = s = SIZES[config.size]
-    self.deviations = config.min_std, config.max_std
+    self.deviations: tuple[float, ...] = config.min_std, config.max_std
     self.bins = jnp.asarray(nets.two_hot_bins(config.bins))
     if isinstance(config.obs_scale, str):
       raise UserError(
@@ -202,20 +202,20 @@ class Agent:
       jnp.int32(0),
     )
 
-  def _apply(self, params, name, *args, **kwargs):
+  def _apply(self, params: Any, name: str, *args: Any, **kwargs: Any) -> Any:
     own = params[name]
     return getattr(self, name).apply(own if "params" in own else {"params": own}, *args, **kwargs)
 
-  def _encode(self, params, obs):
+  def _encode(self, params: Any, obs: jax.Array) -> jax.Array:
     return self._apply(params, "enc", obs / self.obs_scale)
 
-  def prepare(self, params):
+  def prepare(self, params: Any) -> dict[str, Any]:
     """The same parameters with what a scan over the core would otherwise re-arrange at every step;
     every method takes either form.
     """
     return {**params, "dyn": rssm.hoist(params["dyn"])} if "params" not in params["dyn"] else params
 
-  def _core(self, params, deter, stoch, action):
+  def _core(self, params: Any, deter: jax.Array, stoch: jax.Array, action: jax.Array) -> jax.Array:
     return self._apply(params, "dyn", deter, stoch, action, method="core")
 
   def hot(self, index: jax.Array) -> jax.Array:
@@ -228,7 +228,9 @@ class Agent:
     """The carry at an episode's start."""
     return Carry(jnp.zeros(self.size.deter), jnp.zeros(self.stoch_size), jnp.zeros(self.act_size))
 
-  def act(self, params, carry: Carry, obs: jax.Array, key: jax.Array, deterministic: bool = False):
+  def act(
+    self, params: Any, carry: Carry, obs: jax.Array, key: jax.Array, deterministic: bool = False
+  ) -> tuple[Carry, jax.Array]:
     """One posterior step and an action for one robot.
 
     Args:
@@ -248,7 +250,9 @@ class Agent:
 
   # ---- world model -------------------------------------------------------------------------------
 
-  def observe(self, params, batch: Batch, key: jax.Array):
+  def observe(
+    self, params: Any, batch: Batch, key: jax.Array
+  ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Posterior states of the T trained steps, time-major: deter (T, B, D), stoch (T, B, S),
     posterior logits (T, B, stoch, classes).
     """
@@ -260,7 +264,9 @@ class Agent:
       jnp.repeat(x, 2, axis) if rows == 1 else x
     )  # on a CPU the product of a single row takes twice the time of that of two
 
-    def step(state, x):
+    def step(
+      state: tuple[jax.Array, jax.Array], x: tuple[jax.Array, jax.Array, jax.Array, jax.Array]
+    ) -> tuple[tuple[jax.Array, jax.Array], tuple[jax.Array, jax.Array, jax.Array]]:
       deter, stoch = state
       action, first, tokens, uniform = x
       keep = 1.0 - first[:, None]
@@ -278,7 +284,9 @@ class Agent:
     )
     return jax.lax.scan(step, start, jax.tree.map(lambda x: wide(x, 1), xs))[1]
 
-  def imagine(self, params, deter, stoch, key: jax.Array, steps: int):
+  def imagine(
+    self, params: Any, deter: jax.Array, stoch: jax.Array, key: jax.Array, steps: int
+  ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Policy and prior from rows (N, D), (N, S), no gradient.
 
     Returns:
@@ -288,7 +296,9 @@ class Agent:
     params, rows = sg(self.prepare(params)), deter.shape[0]
     uniform, noise = self.draws(key, steps, rows)
 
-    def step(state, x):
+    def step(
+      state: Latent, x: tuple[jax.Array, jax.Array]
+    ) -> tuple[Latent, tuple[jax.Array, jax.Array, jax.Array]]:
       noise, uniform = x
       action = self.choose(params, state.deter, state.stoch, noise)
       return self.follow(params, state, action, uniform), (state.deter, state.stoch, action)
@@ -299,7 +309,7 @@ class Agent:
     last = (end.deter, end.stoch, self.choose(params, end.deter, end.stoch, noise[-1]))
     return sg(jax.tree.map(lambda x, final: jnp.concatenate([x, final[None]]), states, last))
 
-  def draws(self, key, steps: int, rows: int):
+  def draws(self, key: jax.Array, steps: int, rows: int) -> tuple[jax.Array, jax.Array]:
     """Uniform numbers (steps, rows, stoch) for the prior and normal ones (steps + 1, rows, A) for
     the policy.
     """
@@ -308,16 +318,23 @@ class Agent:
       jax.random.normal, key_a, (steps + 1, rows, self.act_size)
     )
 
-  def choose(self, params, deter, stoch, noise):
+  def choose(self, params: Any, deter: jax.Array, stoch: jax.Array, noise: jax.Array) -> jax.Array:
     """The policy's action (N, A) for standard normal `noise`."""
     mean, std = nets.normal(*self._apply(params, "pol", deter, stoch), *self.deviations)
     return mean + std * noise
 
-  def latent(self, params, deter, stoch) -> Latent:
+  def latent(self, params: Any, deter: jax.Array, stoch: jax.Array) -> Latent:
     """Rows (N, D), (N, S) as a scan over the prior carries them."""
     return Latent(self._apply(params, "dyn", deter, method="cut"), deter, stoch)
 
-  def follow(self, params, state: Latent, action, uniform, pre=(None, None)) -> Latent:
+  def follow(
+    self,
+    params: Any,
+    state: Latent,
+    action: jax.Array,
+    uniform: jax.Array,
+    pre: tuple[jax.Array | None, jax.Array | None] = (None, None),
+  ) -> Latent:
     """One step of the prior, sampled with numbers `uniform` (N, stoch). `pre`: as in
     `RSSM.core_cut`.
     """
@@ -330,11 +347,19 @@ class Agent:
     )
     return Latent(chunks, deter, stoch)
 
-  def value(self, value_params, deter, stoch):
+  def value(self, value_params: Any, deter: jax.Array, stoch: jax.Array) -> jax.Array:
     """Value logits (..., bins) of a (fast or slow) critic."""
-    return self.val.apply({"params": value_params}, deter, stoch)
+    return self.val.apply({"params": value_params}, deter, stoch)  # type: ignore[return-value]
 
-  def loss(self, params, slow, range_, batch: Batch, key: jax.Array, weights: Weights = Weights()):
+  def loss(
+    self,
+    params: Any,
+    slow: Any,
+    range_: jax.Array,
+    batch: Batch,
+    key: jax.Array,
+    weights: Weights = Weights(),
+  ) -> tuple[jax.Array, tuple[dict[str, jax.Array], jax.Array, jax.Array, jax.Array]]:
     """The joint objective.
 
     Returns:
@@ -415,21 +440,23 @@ class Agent:
     stoch = jnp.argmax(stoch.reshape(length, rows, self.size.stoch, self.size.classes), -1)
     return total, (metrics, img.range, sg(deter).swapaxes(0, 1), stoch.swapaxes(0, 1))
 
-  def _clone_loss(self, params, deter, stoch, batch):
+  def _clone_loss(self, params: Any, deter: jax.Array, stoch: jax.Array, batch: Batch) -> jax.Array:
     """Mean over labelled replayed states of KL(N(demo, clone_std^2) || policy) [nats]."""
     mean, std = nets.normal(*self._apply(params, "pol", deter, stoch), *self.deviations)
     demo, has = (
       batch.demo[:, 1:].swapaxes(0, 1),
       batch.has_demo[:, 1:].swapaxes(0, 1).astype(jnp.float32),
     )
-    var = self.clone_std**2
+    var = self.clone_std**2  # type: ignore[operator]
     kl = jnp.sum(
-      jnp.log(std / self.clone_std) + (var + jnp.square(mean - demo)) / (2 * jnp.square(std)) - 0.5,
+      jnp.log(std / self.clone_std) + (var + jnp.square(mean - demo)) / (2 * jnp.square(std)) - 0.5,  # type: ignore[operator]
       -1,
     )
     return jnp.sum(kl * has) / jnp.maximum(1.0, jnp.sum(has))
 
-  def _anchor_loss(self, params, deter, stoch, batch):
+  def _anchor_loss(
+    self, params: Any, deter: jax.Array, stoch: jax.Array, batch: Batch
+  ) -> jax.Array:
     """Mean over replayed states of -log policy(action taken) [nats], for the policy's mean alone;
     at an episode's last state none was taken.
 
@@ -442,7 +469,9 @@ class Agent:
     logp = nets.normal_logp(mean, std, batch.action[:, 1:].swapaxes(0, 1))
     return -jnp.sum(logp * taken) / jnp.maximum(1.0, jnp.sum(taken))
 
-  def update(self, state: TrainState, batch: Batch, key: jax.Array, weights: Weights = Weights()):
+  def update(
+    self, state: TrainState, batch: Batch, key: jax.Array, weights: Weights = Weights()
+  ) -> tuple[TrainState, dict[str, jax.Array], tuple[jax.Array, jax.Array]]:
     """One gradient step. Where a loss or the gradient is at fault (`culprit`) nothing changes, the
     counter included.
 
@@ -470,7 +499,9 @@ class Agent:
 
   # ---- prediction --------------------------------------------------------------------------------
 
-  def open_loop(self, params, deter, stoch, actions, key: jax.Array):
+  def open_loop(
+    self, params: Any, deter: jax.Array, stoch: jax.Array, actions: jax.Array, key: jax.Array
+  ) -> tuple[jax.Array, jax.Array]:
     """Predictions of the next n steps from rows, actions given, one prior sample each; never looks
     at an observation.
 
@@ -487,23 +518,23 @@ class Agent:
     )
 
     def step(
-      state,
-      x,
+      state: Latent,
+      x: tuple[jax.Array, jax.Array],
       # decoded where the state is at hand: the stacked states would be a hundred times the
       # predictions
-    ):
+    ) -> tuple[Latent, tuple[jax.Array, jax.Array]]:
       state = self.follow(params, state, *x)
       return state, self.predict(params, state.deter, state.stoch)
 
     return jax.lax.scan(step, self.latent(params, deter, stoch), (actions, uniform))[1]
 
-  def predict(self, params, deter, stoch):
+  def predict(self, params: Any, deter: jax.Array, stoch: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Observation (..., O) in raw units and reward (...) at states."""
     return self.obs_scale * nets.symexp(
       self._apply(params, "dec", deter, stoch)
     ), nets.two_hot_mean(self._apply(params, "rew", deter, stoch), self.bins)
 
-  def beliefs(self, params, deter, obs):
+  def beliefs(self, params: Any, deter: jax.Array, obs: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Logits (..., stoch, classes) of the posterior at `obs` and of the prior, both at `deter`."""
     flat, tokens = (
       deter.reshape(-1, deter.shape[-1]),
@@ -515,18 +546,20 @@ class Agent:
       self._apply(params, "dyn", flat, method="prior").reshape(shape),
     )
 
-  def dream(self, params, deter, stoch, steps: int, key: jax.Array):
+  def dream(
+    self, params: Any, deter: jax.Array, stoch: jax.Array, steps: int, key: jax.Array
+  ) -> tuple[jax.Array, jax.Array]:
     """As `open_loop`, with the actions that the policy imagines for itself."""
     deters, stochs, _ = self.imagine(params, deter, stoch, key, steps)
     return self.predict(params, deters[1:], stochs[1:])
 
 
-def categorical_entropy(logits):
+def categorical_entropy(logits: jax.Array) -> jax.Array:
   """Mean entropy [nats] summed over the categorical variables."""
   p = rssm.probs(logits)
   return -jnp.mean(jnp.sum(p * jnp.log(p), (-2, -1)))
 
 
-def parameter_count(params) -> int:
+def parameter_count(params: Any) -> int:
   """Trainable parameters, slow critic apart."""
   return int(sum(np.prod(x.shape) for x in jax.tree.leaves(params)))

@@ -16,12 +16,15 @@ bins) is ever written. On 2 CPU cores memory traffic is what costs (benchmarks/R
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from mjx_cl.dreamer import losses, nets
+
+if TYPE_CHECKING:
+  from mjx_cl.dreamer.agent import Agent, Latent
 
 sg = jax.lax.stop_gradient
 
@@ -48,7 +51,13 @@ class Imagined(NamedTuple):
   pre: tuple | None
 
 
-def readings(agent, params, slow, *features, pre=(None,) * 4):
+def readings(
+  agent: Agent,
+  params: Any,
+  slow: Any,
+  *features: jax.Array,
+  pre: tuple[jax.Array | None, ...] = (None,) * 4,
+) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
   """Reward, continue, value and slow value (...) at states (..., D), (..., S), or from the first
   layers' outputs `pre`.
   """
@@ -62,7 +71,18 @@ def readings(agent, params, slow, *features, pre=(None,) * 4):
   )
 
 
-def step_losses(agent, pol, val, features, action, adv, omega, ret, slow, pre=(None, None)):
+def step_losses(
+  agent: Agent,
+  pol: Any,
+  val: Any,
+  features: tuple[jax.Array, ...],
+  action: jax.Array,
+  adv: jax.Array,
+  omega: jax.Array,
+  ret: jax.Array,
+  slow: jax.Array,
+  pre: tuple[jax.Array | None, ...] = (None, None),
+) -> tuple[jax.Array, jax.Array, jax.Array]:
   """Sums over rows of the policy loss, the value loss and the entropy, three float32 ()."""
   mean, std = nets.normal(
     *agent.pol.apply({"params": pol}, *features, pre=pre[0]), *agent.deviations
@@ -71,7 +91,7 @@ def step_losses(agent, pol, val, features, action, adv, omega, ret, slow, pre=(N
   policy = -omega * (nets.normal_logp(mean, std, action) * adv + agent.config.entropy * entropy)
   logits = agent.val.apply({"params": val}, *features, pre=pre[1])
   value = omega * (
-    nets.two_hot_loss(logits, ret, agent.bins) + nets.two_hot_loss(logits, slow, agent.bins)
+    nets.two_hot_loss(logits, ret, agent.bins) + nets.two_hot_loss(logits, slow, agent.bins)  # type: ignore[arg-type]
   )
   return jnp.sum(policy), jnp.sum(value), jnp.sum(entropy)
 
@@ -79,7 +99,9 @@ def step_losses(agent, pol, val, features, action, adv, omega, ret, slow, pre=(N
 # ---- large products ------------------------------------------------------------------------------
 
 
-def imagine_stacked(agent, params, slow, deter, stoch, key) -> Imagined:
+def imagine_stacked(
+  agent: Agent, params: Any, slow: Any, deter: jax.Array, stoch: jax.Array, key: jax.Array
+) -> Imagined:
   """`Imagined` from the stacked states of `agent.imagine`."""
   deter, stoch, action = agent.imagine(params, deter, stoch, key, agent.config.imagine)
   rew, con, val, slow_val = readings(agent, params, slow, deter, stoch)
@@ -97,9 +119,11 @@ def imagine_stacked(agent, params, slow, deter, stoch, key) -> Imagined:
   )
 
 
-def sums_stacked(agent, pol, val, img: Imagined, *targets):
+def sums_stacked(
+  agent: Agent, pol: Any, val: Any, img: Imagined, *targets: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
   """`step_losses` over all states at once."""
-  return step_losses(agent, pol, val, (img.deter, img.stoch), img.action, *targets)
+  return step_losses(agent, pol, val, (img.deter, img.stoch), img.action, *targets)  # type: ignore[arg-type]
 
 
 # ---- state by state ------------------------------------------------------------------------------
@@ -107,14 +131,16 @@ def sums_stacked(agent, pol, val, img: Imagined, *targets):
 FIRST = ("mlp", "hidden0", "linear")  # where a head keeps its first layer
 
 
-def first_layer(head):
+def first_layer(head: Any) -> dict[str, Any]:
   """Parameters of a head's first layer, of its parameters."""
   for name in FIRST:
     head = head[name]
   return head
 
 
-def imagine_stepwise(agent, params, slow, deter, stoch, key) -> Imagined:
+def imagine_stepwise(
+  agent: Agent, params: Any, slow: Any, deter: jax.Array, stoch: jax.Array, key: jax.Array
+) -> Imagined:
   """`Imagined` with the heads read inside the scan; the same draws as `agent.imagine`.
 
   The first layers of all heads and of the core's two projections meet the same state: one product
@@ -136,7 +162,11 @@ def imagine_stepwise(agent, params, slow, deter, stoch, key) -> Imagined:
   )
   bias = jnp.concatenate([layer["bias"] for layer in layers])
 
-  def look(state):
+  def look(
+    state: Latent,
+  ) -> tuple[
+    list[jax.Array], tuple[jax.Array, jax.Array, jax.Array, jax.Array], tuple[jax.Array, jax.Array]
+  ]:
     """(policy and value parts (N, 2 U), what the heads say, the core's parts)."""
     from_deter, from_stoch = state.deter @ with_deter, state.stoch @ with_stoch
     pre = jnp.split(from_deter[:, : bias.size] + from_stoch[:, : bias.size] + bias, len(layers), 1)
@@ -147,7 +177,7 @@ def imagine_stepwise(agent, params, slow, deter, stoch, key) -> Imagined:
       (from_deter[:, bias.size :] + own[0]["bias"], from_stoch[:, bias.size :] + own[1]["bias"]),
     )
 
-  def step(state, x):
+  def step(state: Latent, x: tuple[jax.Array, jax.Array]) -> tuple[Latent, tuple[Any, ...]]:
     noise, uniform = x
     pre, said, parts = look(state)
     mean, std = nets.normal(
@@ -181,21 +211,27 @@ def imagine_stepwise(agent, params, slow, deter, stoch, key) -> Imagined:
   )
 
 
-def sums_stepwise(agent, pol, val, img: Imagined, *targets):
+def sums_stepwise(
+  agent: Agent, pol: Any, val: Any, img: Imagined, *targets: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
   """`step_losses` added up over the states, gradients taken on the way: the backward pass only
   scales them.
   """
 
-  def losses_at(pol, val, x):
+  def losses_at(pol: Any, val: Any, x: tuple[Any, ...]) -> tuple[jax.Array, jax.Array, jax.Array]:
     _, _, pre, action, targets = x
-    return step_losses(agent, pol, val, (), action, *targets, pre=pre)
+    return step_losses(agent, pol, val, (), action, *targets, pre=pre)  # type: ignore[misc]
 
-  def gradients_at(pol, val, x):
+  def gradients_at(
+    pol: Any, val: Any, x: tuple[Any, ...]
+  ) -> tuple[Any, tuple[Any, Any], tuple[jax.Array, ...]]:
     """Losses, and gradients of policy + value: the two share no parameter. Those of the first
     layers follow from that of `pre`.
     """
 
-    def total(pol, val, pre):
+    def total(
+      pol: Any, val: Any, pre: tuple[jax.Array, ...]
+    ) -> tuple[jax.Array, tuple[jax.Array, jax.Array, jax.Array]]:
       policy, value, entropy = losses_at(pol, val, (None, None, pre) + x[3:])
       return policy + value, (policy, value, entropy)
 
@@ -203,7 +239,7 @@ def sums_stepwise(agent, pol, val, img: Imagined, *targets):
     joint = jnp.concatenate(grad_pre, 1)
     return out, (grad_pol, grad_val), (x[0].T @ joint, x[1].T @ joint, jnp.sum(joint, 0))
 
-  def add_first(grads, first):
+  def add_first(grads: tuple[Any, Any], first: tuple[jax.Array, ...]) -> tuple[Any, Any]:
     """Puts the gradients of both first layers in their place."""
     with_deter, with_stoch, bias = (jnp.split(x, 2, -1) for x in first)
     for i, grad in enumerate(grads):
@@ -212,11 +248,13 @@ def sums_stepwise(agent, pol, val, img: Imagined, *targets):
     return grads
 
   @jax.custom_vjp
-  def total(pol, val, xs):
+  def total(pol: Any, val: Any, xs: tuple[Any, ...]) -> tuple[jax.Array, jax.Array, jax.Array]:
     step = lambda sums, x: (jax.tree.map(jnp.add, sums, losses_at(pol, val, x)), None)
     return jax.lax.scan(step, (jnp.float32(0),) * 3, xs)[0]
 
-  def forward(pol, val, xs):
+  def forward(
+    pol: Any, val: Any, xs: tuple[Any, ...]
+  ) -> tuple[tuple[jax.Array, jax.Array, jax.Array], tuple[Any, Any]]:
     at = lambda x: gradients_at(pol, val, x)
     start = jax.tree.map(
       lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(at, jax.tree.map(lambda x: x[0], xs))
@@ -226,7 +264,9 @@ def sums_stepwise(agent, pol, val, img: Imagined, *targets):
     )
     return out, add_first(jax.tree.map(lambda x: x, grads), first)
 
-  def backward(grads, cotangent):
+  def backward(
+    grads: tuple[Any, Any], cotangent: tuple[jax.Array, jax.Array, jax.Array]
+  ) -> tuple[Any, Any, None]:
     scale = lambda tree, factor: jax.tree.map(lambda g: factor * g, tree)
     # the entropy is a metric, its own gradient is left out; xs hold no gradient
     return scale(grads[0], cotangent[0]), scale(grads[1], cotangent[1]), None
@@ -254,7 +294,16 @@ class Behaviour(NamedTuple):
   metrics: dict[str, jax.Array]
 
 
-def behaviour(agent, params, slow, range_, deter, stoch, key, stepwise: bool) -> Behaviour:
+def behaviour(
+  agent: Agent,
+  params: Any,
+  slow: Any,
+  range_: jax.Array,
+  deter: jax.Array,
+  stoch: jax.Array,
+  key: jax.Array,
+  stepwise: bool,
+) -> Behaviour:
   """Imagines from rows (N, D), (N, S) and gives the losses.
 
   Args:

@@ -15,7 +15,9 @@ def lambda_return(r_t: jax.Array, c_t: jax.Array, v_t: jax.Array, lam: float) ->
     holds the discount
   """
 
-  def step(ret, x):
+  def step(
+    ret: jax.Array, x: tuple[jax.Array, jax.Array, jax.Array]
+  ) -> tuple[jax.Array, jax.Array]:
     r, c, v = x
     ret = r + c * ((1.0 - lam) * v + lam * ret)
     return ret, ret
@@ -40,7 +42,9 @@ def replay_return(
   a true terminal cuts off.
   """
 
-  def step(ret, x):
+  def step(
+    ret: jax.Array, x: tuple[jax.Array, jax.Array, jax.Array, jax.Array]
+  ) -> tuple[jax.Array, jax.Array]:
     r, terminal, last, boot = x
     mix = lam * (1.0 - last)
     ret = r + (1.0 - terminal) * discount * ((1.0 - mix) * boot + mix * ret)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import flax
 import flax.linen as nn
@@ -37,7 +38,7 @@ def in_a_row(draw: Callable, key: jax.Array, shape: tuple[int, ...]) -> jax.Arra
 def kernel_init(fan_in: int, outscale: float = 1.0) -> Callable:
   """Initialiser with the deviation outscale sqrt(1 / fan_in); outscale 0 gives exact zeros."""
 
-  def init(key, shape, dtype=jnp.float32):
+  def init(key: jax.Array, shape: tuple[int, ...], dtype: Any = jnp.float32) -> jax.Array:
     if outscale == 0.0:
       return jnp.zeros(shape, dtype)
     return (
@@ -56,9 +57,9 @@ def parameter(module: nn.Module, name: str, init: Callable, shape: tuple[int, ..
   """
   if not module.has_variable("params", name):
     return module.param(name, init, shape)
-  value = module.get_variable("params", name)
+  value: jax.Array = module.get_variable("params", name)
   if value.shape != shape:
-    raise flax.errors.ScopeParamShapeError(name, module.scope.path_text, shape, value.shape)
+    raise flax.errors.ScopeParamShapeError(name, module.scope.path_text, shape, value.shape)  # type: ignore[union-attr]
   return value
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import optax
@@ -16,8 +18,8 @@ def agc(clip: float = 0.3, floor: float = 1e-3) -> optax.GradientTransformation:
   optax.adaptive_grad_clip uses unit-wise norms, which is another rule.
   """
 
-  def update(grads, state, params):
-    def one(g, p):
+  def update(grads: Any, state: Any, params: Any) -> tuple[Any, Any]:
+    def one(g: jax.Array, p: jax.Array) -> jax.Array:
       limit = clip * jnp.maximum(floor, jnp.linalg.norm(p.reshape(-1)))
       return g / jnp.maximum(1.0, jnp.linalg.norm(g.reshape(-1)) / limit)
 
@@ -33,7 +35,7 @@ def laprop(
   beta1: float = 0.9,
   beta2: float = 0.999,
   eps: float = 1e-20,
-):
+) -> optax.GradientTransformation:
   """AGC, RMS scaling, then momentum (LaProp order), then the learning rate with linear warm-up from
   0.
 

@@ -47,7 +47,7 @@ class Replay(NamedTuple):
   """
 
   data: Record
-  count: jax.Array
+  count: jax.Array  # type: ignore[assignment]
   queue: jax.Array
 
 
@@ -100,7 +100,9 @@ def add(replay: Replay, records: Record, keep: jax.Array) -> Replay:
   """
   capacity = replay.data.reward.shape[1]
 
-  def one(data, count, records, keep):
+  def one(
+    data: Record, count: jax.Array, records: Record, keep: jax.Array
+  ) -> tuple[Record, jax.Array]:
     number = count + jnp.cumsum(keep) - 1
     slot = jnp.where(
       keep, number % capacity, capacity
@@ -118,7 +120,9 @@ def windows(replay: Replay, length: int) -> jax.Array:
   return jnp.sum(jnp.maximum(0, jnp.minimum(replay.count, capacity) - length + 1))
 
 
-def sample(replay: Replay, key: jax.Array, batch: int, length: int, only=None):
+def sample(
+  replay: Replay, key: jax.Array, batch: int, length: int, only: jax.Array | None = None
+) -> tuple[Replay, Batch, tuple[jax.Array, jax.Array]]:
   """Draws windows: first those waiting in the online queue, then uniformly over all windows.
 
   The queue holds every non-overlapping window of each stream once, oldest first, so each fresh
@@ -172,7 +176,9 @@ def sample(replay: Replay, key: jax.Array, batch: int, length: int, only=None):
   return replay._replace(queue=queue + taken * length), batch_, (stream, start)
 
 
-def refresh(replay: Replay, address, latents) -> Replay:
+def refresh(
+  replay: Replay, address: tuple[jax.Array, jax.Array], latents: tuple[jax.Array, jax.Array]
+) -> Replay:
   """Overwrites the stored latents of records 1.. of each window with freshly computed ones, evicted
   records apart.
 

@@ -112,7 +112,9 @@ class RSSM(nn.Module):
       Linear(s.stoch * s.classes, name="post_out"),
     )
 
-  def __call__(self, deter, stoch, action, tokens):
+  def __call__(
+    self, deter: jax.Array, stoch: jax.Array, action: jax.Array, tokens: jax.Array
+  ) -> tuple[jax.Array, jax.Array]:
     """One step; touches every parameter, for initialisation."""
     deter = self.core(deter, stoch, action)
     return self.prior(deter), self.posterior(deter, tokens)
@@ -126,7 +128,14 @@ class RSSM(nn.Module):
     """Deter' (N, D)."""
     return join(self.core_cut(self.cut(deter), deter, stoch, action))
 
-  def core_cut(self, chunks, deter, stoch, action, pre=(None, None)):
+  def core_cut(
+    self,
+    chunks: jax.Array,
+    deter: jax.Array,
+    stoch: jax.Array,
+    action: jax.Array,
+    pre: tuple[jax.Array | None, jax.Array | None] = (None, None),
+  ) -> jax.Array:
     """The core where deter is at hand in both layouts; gives deter' as (blocks, N, D / blocks).
     `pre`: linear parts of x0 and x1, where the caller has them already.
 

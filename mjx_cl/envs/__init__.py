@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import inspect
 import types
+from typing import Any
 
 from mjx_cl.envs.car import Car
 from mjx_cl.envs.car_real import CarReal
@@ -25,14 +26,14 @@ PURE_JAX = types.SimpleNamespace(
 )  # no time is spent outside the compiled program
 
 
-def physics_of(env):
+def physics_of(env: Any) -> Any:
   """The physics backend of a robot: its `name`, and the `seconds` spent in it outside the compiled
   program; of a robot that names none, pure JAX.
   """
   return getattr(env, "physics", PURE_JAX)
 
 
-def make(name: str, physics: str = "auto"):
+def make(name: str, physics: str = "auto") -> Any:
   """Builds environment `name` on a physics backend (`auto`, `native` or `mjx`). A class that takes
   no `physics` has none to choose from.
 
@@ -40,7 +41,7 @@ def make(name: str, physics: str = "auto"):
     UserError for an unknown name, a backend that the robot has not, and whatever goes wrong in a
     robot of another package.
   """
-  build = choose("environment", name, ENVS)
+  build: Any = choose("environment", name, ENVS)
   if name in ENVS.own:
     return build(physics=physics)
   try:

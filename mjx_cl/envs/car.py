@@ -9,7 +9,7 @@ functions: `car_real` (MuJoCo) shares them, so that an agent moves from one to t
 from __future__ import annotations
 
 import types
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +18,11 @@ import numpy as np
 from mjx_cl.envs.course import Course
 from mjx_cl.errors import choose
 from mjx_cl.types import EnvState, Model, Spec, Step, Var
+
+if TYPE_CHECKING:
+  from collections.abc import Iterable
+
+  from mjx_cl.envs.course import Track
 
 FRICTION = 1.0489  # tyre on floor
 STIFFNESS = (4.718, 5.4562)  # front, rear cornering stiffness per unit of load [1/rad]
@@ -102,7 +107,15 @@ def command(action: jax.Array) -> tuple[jax.Array, jax.Array]:
   return STEER_MAX * action[0], SPEED_MIN + 0.5 * (action[1] + 1.0) * (SPEED_MAX - SPEED_MIN)
 
 
-def observe(course: Course, ranges: jax.Array, speed, yaw_rate, steer, sigma, key) -> jax.Array:
+def observe(
+  course: Course,
+  ranges: jax.Array,
+  speed: jax.Array,
+  yaw_rate: jax.Array,
+  steer: jax.Array,
+  sigma: jax.Array,
+  key: jax.Array,
+) -> jax.Array:
   """Observation, float32 (beams + 3,): clip(range + sigma N(0, 1), 0, max) / max, then forward
   speed [m/s], yaw rate [rad/s], steering angle [rad].
 
@@ -117,7 +130,14 @@ def observe(course: Course, ranges: jax.Array, speed, yaw_rate, steer, sigma, ke
   )
 
 
-def progress(course: Course, track, x, y, velocity_x, velocity_y) -> jax.Array:
+def progress(
+  course: Course,
+  track: jax.Array,
+  x: jax.Array,
+  y: jax.Array,
+  velocity_x: jax.Array,
+  velocity_y: jax.Array,
+) -> jax.Array:
   """Speed along the track [m/s], (): the world velocity [m/s] of the car's origin along the track's
   direction at its nearest point.
 
@@ -128,7 +148,9 @@ def progress(course: Course, track, x, y, velocity_x, velocity_y) -> jax.Array:
   return velocity_x * jnp.cos(heading) + velocity_y * jnp.sin(heading)
 
 
-def reward(along: jax.Array, crashed: jax.Array, weights=WEIGHTS) -> jax.Array:
+def reward(
+  along: jax.Array, crashed: jax.Array, weights: jax.Array | tuple[float, ...] = WEIGHTS
+) -> jax.Array:
   """Reward, float32 (): 0.2 along - 5 [crashed], for the speed along the track [m/s]; 1 at the
   highest speed, negative the wrong way round.
 
@@ -190,7 +212,9 @@ def nominal() -> dict[str, jax.Array]:
   return {name: jnp.asarray(value, jnp.float32) for name, value in values.items()}
 
 
-def axle_forces(task, motion: Motion, drive) -> tuple[jax.Array, jax.Array, jax.Array]:
+def axle_forces(
+  task: dict[str, jax.Array], motion: Motion, drive: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
   """Force ahead and to the left [N] of the front and rear tyres in the wheels' own frames, and the
   axles' loads [N]: (2,) each.
 
@@ -214,7 +238,7 @@ def axle_forces(task, motion: Motion, drive) -> tuple[jax.Array, jax.Array, jax.
   front, rear = AXLES[0] - task["com"][0], AXLES[1] + task["com"][0]
   rest = task["mass"] * -task["gravity"][2] * jnp.stack([rear, front]) / WHEELBASE
 
-  def share(grip):
+  def share(grip: jax.Array) -> jax.Array:
     return jnp.clip(drive / jnp.maximum(jnp.sum(grip), 1e-6), -TRACTION, TRACTION)
 
   grip = task["friction"] * rest
@@ -234,7 +258,9 @@ def axle_forces(task, motion: Motion, drive) -> tuple[jax.Array, jax.Array, jax.
   )
 
 
-def derivative(task, motion: Motion, angle, speed, force) -> Motion:
+def derivative(
+  task: dict[str, jax.Array], motion: Motion, angle: jax.Array, speed: jax.Array, force: jax.Array
+) -> Motion:
   """d/dt of the motion under a commanded steering angle [rad] and speed [m/s]: single-track model
   in force form.
 
@@ -278,15 +304,15 @@ def derivative(task, motion: Motion, angle, speed, force) -> Motion:
   )
 
 
-def advance(model: Model, motion: Motion, angle, speed) -> Motion:
+def advance(model: Model, motion: Motion, angle: jax.Array, speed: jax.Array) -> Motion:
   """The motion one control step of 0.05 s later: five RK4 steps of 0.01 s under a constant command.
   Yaw stays in [-pi, pi).
   """
   dt = CONTROL_S / SUBSTEPS
   force = jnp.zeros(3) if model.force is None else model.force
 
-  def substep(_, m):
-    def slope(k, share):
+  def substep(_: jax.Array, m: Motion) -> Motion:
+    def slope(k: Motion, share: float) -> Motion:
       return derivative(
         model.task, jax.tree.map(lambda a, b: a + share * dt * b, m, k), angle, speed, force
       )
@@ -318,7 +344,7 @@ class Car:
     tracks: see Course; by default its own six.
   """
 
-  def __init__(self, physics: str = "auto", tracks=None):
+  def __init__(self, physics: str = "auto", tracks: Iterable[Track] | None = None) -> None:
     choose("physics", physics, dict.fromkeys(("auto", "native", "mjx")))
     self.physics = types.SimpleNamespace(
       name="jax", seconds=0.0
@@ -330,7 +356,7 @@ class Car:
     self.reward_terms = tuple(REWARD_TERMS)
     self.model = Model(mj={}, task=nominal(), force=jnp.zeros(3))
 
-  def pose(self, state: EnvState):
+  def pose(self, state: EnvState) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array, jax.Array]:
     """Privileged: track, x, y [m], yaw [rad] and speed ahead [m/s]."""
     m = state.physics.motion
     return state.physics.track, m.x, m.y, m.yaw, m.vx
@@ -351,7 +377,7 @@ class Car:
     """Action (2,) of the reference driver, which knows where the car is."""
     return pure_pursuit(self, state)
 
-  def _observe(self, model, motion, track, key):
+  def _observe(self, model: Model, motion: Motion, track: jax.Array, key: jax.Array) -> jax.Array:
     ranges = self.course.scan(track, motion.x, motion.y, motion.yaw)
     return observe(
       self.course, ranges, motion.vx, motion.yaw_rate, motion.steer, model.task["noise"], key
@@ -391,7 +417,7 @@ class Car:
 # ---- reference driver ----------------------------------------------------------------------------
 
 
-def pure_pursuit(env, state: EnvState, friction: float = FRICTION) -> jax.Array:
+def pure_pursuit(env: Any, state: EnvState, friction: float = FRICTION) -> jax.Array:
   """Action (2,) of the reference driver, from the true place of the car: `env` has `course` and
   `pose(state)`. Yardstick and demonstrator.
 

@@ -11,7 +11,7 @@ car ("NUC2", ForzaETH's race stack) as far as figures of it were at hand.
 from __future__ import annotations
 
 import importlib.resources
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +23,12 @@ from mjx_cl.envs import car
 from mjx_cl.envs.course import Course
 from mjx_cl.errors import choose
 from mjx_cl.types import EnvState, Model, Step
+
+if TYPE_CHECKING:
+  import types
+  from collections.abc import Callable, Iterable
+
+  from mjx_cl.envs.course import Track
 
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 RADIUS = 0.0492  # of a wheel under load [m]: 0.05 less half of what tyre and floor give way
@@ -122,7 +128,7 @@ def load_model() -> mujoco.MjModel:
   )
 
 
-def widen(model: Model, name: str, share, wheels: tuple[int, ...]) -> Model:
+def widen(model: Model, name: str, share: jax.Array | float, wheels: tuple[int, ...]) -> Model:
   """The model with gap item `name` moved by `share` of its gap: from a simulator's value to the
   real one for 1, and on beyond it.
 
@@ -139,7 +145,7 @@ def widen(model: Model, name: str, share, wheels: tuple[int, ...]) -> Model:
   Args:
     wheels: geoms of the four wheels.
   """
-  item = choose("gap item", name, GAP)
+  item: Any = choose("gap item", name, GAP)
   where, leaf = item.leaf.split(".")
   table = getattr(model, where)
   value, more = table[leaf], share * (item.real - item.simulator)
@@ -153,7 +159,7 @@ def widen(model: Model, name: str, share, wheels: tuple[int, ...]) -> Model:
   return model._replace(**{where: table | {leaf: value}})
 
 
-def ackermann(xp, angle):
+def ackermann(xp: types.ModuleType, angle: Any) -> Any:
   """Angles of the left and right front wheel [rad] at which both roll about one centre, for the
   angle of a wheel in the middle: (..., 2).
 
@@ -164,7 +170,7 @@ def ackermann(xp, angle):
   return xp.stack([xp.arctan(t / (1 - w * t)), xp.arctan(t / (1 + w * t))], -1)
 
 
-def middle(left, right) -> jax.Array:
+def middle(left: jax.Array, right: jax.Array) -> jax.Array:
   """Steering angle [rad] of a wheel in the middle, from the two front wheels: mean of what each of
   them says (see `ackermann`).
   """
@@ -173,7 +179,7 @@ def middle(left, right) -> jax.Array:
   return (jnp.arctan(left / (1 + w * left)) + jnp.arctan(right / (1 - w * right))) / 2
 
 
-def motor_law(mj_model: mujoco.MjModel):
+def motor_law(mj_model: mujoco.MjModel) -> Callable[..., Any]:
   """Motor law of the vehicle: ctrl (..., 2) = steering angle [rad], speed [m/s] -> torques of 2
   steering and 4 wheel motors [N m].
 
@@ -194,7 +200,7 @@ def motor_law(mj_model: mujoco.MjModel):
   dt = float(mj_model.opt.timestep)
   spins = [mj_model.joint(f"spin_{n}").dofadr[0] for n in WHEELS]
 
-  def law(xp, task, ctrl, qpos, qvel):
+  def law(xp: types.ModuleType, task: dict[str, Any], ctrl: Any, qpos: Any, qvel: Any) -> Any:
     goal = xp.clip(
       task["strength"][..., 0] * ctrl[..., 0] + task["steer_offset"], -car.STEER_MAX, car.STEER_MAX
     )
@@ -247,7 +253,7 @@ class CarRealState(NamedTuple):
   key: jax.Array
 
 
-def read_motion(qpos, qvel) -> tuple[car.Motion, jax.Array]:
+def read_motion(qpos: jax.Array, qvel: jax.Array) -> tuple[car.Motion, jax.Array]:
   """car.Motion, and how upright the car is: the z part of its own vertical, 1 on its wheels. From
   qpos (17,), qvel (16,).
   """
@@ -282,13 +288,20 @@ class CarReal:
     tracks: see Course; by default its own six.
   """
 
-  def __init__(self, physics: str = "auto", gap: tuple[str, ...] = tuple(GAP), tracks=None):
+  def __init__(
+    self,
+    physics: str = "auto",
+    gap: tuple[str, ...] = tuple(GAP),
+    tracks: Iterable[Track] | None = None,
+  ) -> None:
     self.course = Course(tracks)
     self.mj_model = load_model()
     self.wheels = tuple(self.mj_model.geom(f"wheel_{n}").id for n in WHEELS)
     leaves = ("body_mass", "body_inertia", "body_ipos", "geom_friction", "dof_damping")
     mj = {name: jnp.asarray(getattr(self.mj_model, name), jnp.float32) for name in leaves}
-    task = {name: car.nominal()[name] for name in ("strength", "velocity_limit", "reward_weights")}
+    task: dict[str, Any] = {
+      name: car.nominal()[name] for name in ("strength", "velocity_limit", "reward_weights")
+    }
     task |= {i.leaf[5:]: i.simulator for i in GAP.values() if i.leaf.startswith("task.")}
     model = Model(
       mj | {"gravity": jnp.asarray(self.mj_model.opt.gravity, jnp.float32)},
@@ -316,11 +329,11 @@ class CarReal:
       bodies=tuple((n, (self.mj_model.body(n).id,)) for n in bodies),
     )
 
-  def widen(self, model: Model, name: str, share) -> Model:
+  def widen(self, model: Model, name: str, share: jax.Array | float) -> Model:
     """The model with gap item `name` moved by `share` of its gap, see the function `widen`."""
     return widen(model, name, share, self.wheels)
 
-  def pose(self, state: EnvState):
+  def pose(self, state: EnvState) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array, jax.Array]:
     """Privileged: track, x, y [m], yaw [rad] and speed ahead [m/s]."""
     m = state.physics.motion
     return state.physics.track, m.x, m.y, m.yaw, m.vx
@@ -342,7 +355,9 @@ class CarReal:
     """Action (2,) of the reference driver, which knows where the car is."""
     return car.pure_pursuit(self, state)
 
-  def _observe(self, model, motion, track, key):
+  def _observe(
+    self, model: Model, motion: car.Motion, track: jax.Array, key: jax.Array
+  ) -> jax.Array:
     key_lidar, key_own = jax.random.split(key)
     ranges = self.course.scan(track, motion.x, motion.y, motion.yaw)
     noise = jax.random.normal(key_own, (2,))

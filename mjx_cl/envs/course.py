@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import functools
 import pathlib
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +18,9 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from mjx_cl.errors import FileError, UserError, choose
+
+if TYPE_CHECKING:
+  from collections.abc import Iterable
 
 WIDTH = 2.2  # [m] of the generated tracks
 SPACING = 0.4  # [m] between centre points
@@ -129,7 +132,7 @@ def build(
   )
 
 
-def _cross(a, b):
+def _cross(a: Any, b: Any) -> Any:
   """Z of the cross product of (..., 2) vectors."""
   return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
@@ -213,7 +216,7 @@ def generate(shape: str | int) -> Track:
   raise UserError(f"no valid track drawn from seed {shape}")
 
 
-def load_csv(path) -> Track:
+def load_csv(path: pathlib.Path | str) -> Track:
   """Track from a centre-line file: one point a line, `x, y, width_right, width_left` [m], `#`
   starts a comment; closed, last point unlike the first.
 
@@ -276,12 +279,12 @@ def load_csv(path) -> Track:
 # ---- windows: which walls can be seen from where -------------------------------------------------
 
 
-def _gap(a0, a1, b0, b1):
+def _gap(a0: np.ndarray, a1: np.ndarray, b0: np.ndarray, b1: np.ndarray) -> np.ndarray:
   """Least distance of segments a, b, given as endpoints (N, 2) each [m], that do not
   cross: (N,).
   """
 
-  def to(p, c, d):
+  def to(p: np.ndarray, c: np.ndarray, d: np.ndarray) -> np.ndarray:
     share = np.clip(((p - c) * (d - c)).sum(1) / ((d - c) ** 2).sum(1), 0, 1)
     return np.linalg.norm(p - c - share[:, None] * (d - c), axis=1)
 
@@ -309,12 +312,12 @@ def reach(track: Track, max_range: float) -> tuple[np.ndarray, np.ndarray]:
     (2 * max_range + 3 * widest) * (grid[1] - grid[0]) / 2
   )  # [m]; all ends are within max_range + widest of the first section
 
-  def ahead(sign):
+  def ahead(sign: int) -> np.ndarray:
     first = (np.arange(num) + (2 if sign > 0 else -1)) % num
     angle = track.heading[first, None] + grid
     normal = np.stack([-np.sin(angle), np.cos(angle)])  # (2, P, directions)
 
-    def along(ends):
+    def along(ends: np.ndarray) -> np.ndarray:
       return normal[0] * ends[:, :1] + normal[1] * ends[:, 1:]
 
     low, high = along(track.left[first]), along(track.right[first])
@@ -356,8 +359,12 @@ class Course:
   """
 
   def __init__(
-    self, tracks=None, beams: int = 64, fov_rad: float = 4.712389, max_range_m: float = 10.0
-  ):
+    self,
+    tracks: Iterable[Track] | None = None,
+    beams: int = 64,
+    fov_rad: float = 4.712389,
+    max_range_m: float = 10.0,
+  ) -> None:
     self.beams, self.max_range = beams, float(max_range_m)
     self.angles = np.linspace(
       -fov_rad / 2, fov_rad / 2, beams
@@ -372,7 +379,9 @@ class Course:
     )  # cells looked at, one number for all places
     longest = max(len(t.centre) for t in self.tracks)
 
-    def stack(rows, wrap=0):  # each track repeats from its first point on, as far as indices reach
+    def stack(
+      rows: Iterable[np.ndarray], wrap: int = 0
+    ) -> jax.Array:  # each track repeats from its first point on, as far as indices reach
       return jnp.asarray(
         np.stack([np.take(r, np.arange(longest + wrap), 0, mode="wrap") for r in rows])
       )
@@ -402,7 +411,9 @@ class Course:
       [np.clip(h - 0.3, 0.0, 0.3) for h in half], jnp.float32
     )  # lateral offset at spawn [m]; 0.3 m holds half a turned car
 
-  def _project(self, track, x, y):
+  def _project(
+    self, track: jax.Array, x: jax.Array, y: jax.Array
+  ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Nearest cell (int32 ()), share of it that lies behind (), and offset from its line
     [m] (2,).
     """
@@ -416,7 +427,9 @@ class Course:
     cell = jnp.argmin(distance)
     return cell, share[cell], off[cell]
 
-  def _nearby(self, track, x, y, yaw):
+  def _nearby(
+    self, track: jax.Array, x: jax.Array, y: jax.Array, yaw: jax.Array
+  ) -> tuple[jax.Array, jax.Array]:
     """Wall points of the window around the car, in its frame [m]: forward and left, (window + 1, 2
     sides) each.
     """
@@ -427,7 +440,7 @@ class Course:
     sin, cos = jnp.sin(yaw), jnp.cos(yaw)
     return cos * points[..., 0] + sin * points[..., 1], cos * points[..., 1] - sin * points[..., 0]
 
-  def at(self, track, s) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+  def at(self, track: jax.Array, s: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
     """X [m], y [m], heading [rad] and curvature [1/m] of the centre line at arc length s [m], any
     real number.
     """
@@ -438,7 +451,7 @@ class Course:
     bend = self._curvature[track, cell] * (1 - share) + self._curvature[track, cell + 1] * share
     return point[0], point[1], self._heading[track, cell] + share * self._turn[track, cell], bend
 
-  def locate(self, track, x, y) -> Place:
+  def locate(self, track: jax.Array, x: jax.Array, y: jax.Array) -> Place:
     """Place of the point x, y [m] along its track, by the nearest point of the centre polyline."""
     cell, share, off = self._project(track, x, y)
     s = (cell + share) * self._cell[track]
@@ -446,7 +459,7 @@ class Course:
     side = jnp.sign(_cross(self._ahead[track, cell], off))
     return Place(s, side * jnp.sqrt(jnp.sum(off * off)), heading, curvature)
 
-  def scan(self, track, x, y, yaw) -> jax.Array:
+  def scan(self, track: jax.Array, x: jax.Array, y: jax.Array, yaw: jax.Array) -> jax.Array:
     """Range of each beam from the car's origin, float32 (beams,) [m], at most `max_range`; exact
     for a point between the walls.
 
@@ -464,7 +477,7 @@ class Course:
     hit = ((side[:-1] >= 0) != (side[1:] >= 0)) & (t >= 0)
     return jnp.min(jnp.where(hit, t, self.max_range), (0, 1), initial=self.max_range)
 
-  def collides(self, track, x, y, yaw) -> jax.Array:
+  def collides(self, track: jax.Array, x: jax.Array, y: jax.Array, yaw: jax.Array) -> jax.Array:
     """Whether the car's rectangle, 0.58 x 0.31 m around its origin, touches a wall: bool ().
 
     A wall piece a + u (b - a), u in [0, 1], is cut to the two slabs |forward| <= 0.29 m and |left|
@@ -483,7 +496,7 @@ class Course:
     leave = jnp.minimum(jnp.minimum(ends[0][1], ends[1][1]), 1.0)
     return jnp.any(enter <= leave)
 
-  def spawn(self, key) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+  def spawn(self, key: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
     """A place to start: track int32 (), x, y [m], yaw [rad]; uniform in track and arc length,
     lateral +-U(0, 0.3) m, heading +-U(0, 0.2) rad.
 

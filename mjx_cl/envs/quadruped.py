@@ -36,7 +36,7 @@ and why:
 from __future__ import annotations
 
 import importlib.resources
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -45,6 +45,9 @@ import numpy as np
 
 from mjx_cl import physics as physics_lib
 from mjx_cl.types import EnvState, Model, Spec, Step, Var
+
+if TYPE_CHECKING:
+  import types
 
 LEGS = ("LF", "RF", "LH", "RH")
 JOINTS = tuple(f"{leg}_{joint}" for leg in LEGS for joint in ("HAA", "HFE", "KFE"))
@@ -168,7 +171,7 @@ class QuadrupedState(NamedTuple):
 # ---- motors --------------------------------------------------------------------------------------
 
 
-def motor_law(xp, task, ctrl, qpos, qvel):
+def motor_law(xp: types.ModuleType, task: dict[str, Any], ctrl: Any, qpos: Any, qvel: Any) -> Any:
   """Torques [N m] (..., 12) for target angles `ctrl` [rad] (..., 12); see physics for who calls it.
 
     tau  = strength clip(80 (ctrl - q) - 5 qd, -most(v + qd), most(v - qd))
@@ -327,8 +330,15 @@ def observe(
 
 
 def reward_terms(
-  before: QuadrupedState, action, qpos, qvel, gravity, acceleration, torque, soft_range
-):
+  before: QuadrupedState,
+  action: jax.Array,
+  qpos: jax.Array,
+  qvel: jax.Array,
+  gravity: jax.Array,
+  acceleration: jax.Array,
+  torque: jax.Array,
+  soft_range: jax.Array,
+) -> tuple[jax.Array, jax.Array, jax.Array]:
   """Unweighted terms of the reward for arriving at (qpos, qvel).
 
     track_velocity    exp(-|v_xy - command|^2 / 0.25)          vertical_velocity   v_z^2
@@ -389,7 +399,7 @@ def reward_terms(
 
 def make_spec(mj_model: mujoco.MjModel) -> Spec:
   """Names, units and groups, read from the tables above and the MuJoCo model."""
-  obs, groups = [], []
+  obs, groups = [], []  # type: ignore[var-annotated]
   for group, names, unit, noise, scale in OBSERVATION:
     groups.append((group, tuple(range(len(obs), len(obs) + len(names)))))
     bound = {"projected_gravity": 1 + noise, "last_action": 1.0}.get(group, float("inf"))
@@ -443,7 +453,7 @@ class Quadruped:
   the penalty of tilt follow it.
   """
 
-  def __init__(self, physics: str = "auto"):
+  def __init__(self, physics: str = "auto") -> None:
     self.mj_model = load_model()
     self.physics = physics_lib.make(physics, self.mj_model, substeps=SUBSTEPS, law=motor_law)
     self.spec = make_spec(self.mj_model)
@@ -526,7 +536,11 @@ class Quadruped:
     action = jnp.clip(action, -1.0, 1.0)
     motor = {name: task[name] for name in ("strength", "velocity_limit")}
     inner, out = self.physics.step(
-      model.mj, before.backend, DEFAULT + ACTION_SCALE * action, motor, model.force
+      model.mj,
+      before.backend,
+      DEFAULT + ACTION_SCALE * action,  # type: ignore[arg-type]
+      motor,
+      model.force,
     )
     qpos, qvel, gravity = (
       out["qpos"],

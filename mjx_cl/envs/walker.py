@@ -81,8 +81,8 @@ def reward(
   qpos: jax.Array,
   qvel: jax.Array,
   mass: jax.Array,
-  weights=WEIGHTS,
-  speed_asked=WALK_SPEED,
+  weights: jax.Array | tuple[float, ...] = WEIGHTS,
+  speed_asked: jax.Array | float = WALK_SPEED,
 ) -> jax.Array:
   """Walk reward in [0, 1], float32 (), for weights (3, 1, 5) of REWARD_TERMS and the speed asked
   for [m/s].
@@ -110,7 +110,7 @@ class Walker:
   kinematics of qpos and qvel, so they are current and equal on both backends.
   """
 
-  def __init__(self, physics: str = "auto"):
+  def __init__(self, physics: str = "auto") -> None:
     self.mj_model = load_model()
     self.physics = physics_lib.make(physics, self.mj_model, substeps=10)
     low, high = self.mj_model.jnt_range[3:].T

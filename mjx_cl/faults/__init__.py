@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import inspect
 import re
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax.numpy as jnp
 
@@ -36,6 +36,13 @@ from mjx_cl.faults.sensor import SENSOR
 from mjx_cl.faults.task import TASK
 from mjx_cl.faults.transfer import TRANSFER
 from mjx_cl.io.plugins import Registry, line
+
+if TYPE_CHECKING:
+  from collections.abc import Iterable
+
+  import jax
+
+  from mjx_cl.faults.presets import Change
 
 FAMILIES = {
   "actuator": ACTUATOR,
@@ -102,14 +109,14 @@ def about(name: str) -> str:
   )
 
 
-def make(name: str, env) -> Fault:
+def make(name: str, env: Any) -> Fault:
   """Builds fault `name` for the robot `env`.
 
   Raises:
     UserError for an unknown name, a fault that has nothing to act on in this robot, and whatever
     goes wrong in one of another package.
   """
-  build = choose("fault", name, FAULTS)
+  build: Any = choose("fault", name, FAULTS)
   try:
     made = build(env)
     if not isinstance(made, Fault):
@@ -132,7 +139,7 @@ def make(name: str, env) -> Fault:
     ) from e
 
 
-def available(env) -> dict[str, Fault]:
+def available(env: Any) -> dict[str, Fault]:
   """Every fault that `env` can have, by name."""
   out = {}
   for name in FAULTS:
@@ -159,7 +166,9 @@ def target_index(fault: Fault, target: str | None) -> int:
   return fault.targets.index(target)
 
 
-def build(changes, env, onset: int = 0):
+def build(
+  changes: Iterable[Change], env: Any, onset: int = 0
+) -> tuple[tuple[Fault, ...], Plan, jax.Array]:
   """The changes of a run (fault_presets.Change) on one robot.
 
   Returns:

@@ -7,6 +7,8 @@ command.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,11 +16,16 @@ import numpy as np
 from mjx_cl.errors import UserError
 from mjx_cl.faults.base import Fault, actuator_targets, fault, read
 
+if TYPE_CHECKING:
+  from collections.abc import Callable
+
+  from mjx_cl.faults.base import Ports
+
 MOST_DELAY = 9  # control steps at severity 1: the hard level of realworldrl_suite
 LOCK = (10.0, 1000.0)  # [kg m^2], [N m s/rad] at severity 1
 
 
-def dofs(env, name: str) -> np.ndarray:
+def dofs(env: Any, name: str) -> np.ndarray:
   """Which degree of freedom each actuator drives, float32 (A, nv) of 0 and 1: `mask @ dofs` is a
   mask of degrees of freedom.
   """
@@ -30,7 +37,7 @@ def dofs(env, name: str) -> np.ndarray:
   return np.eye(model.nv, dtype=np.float32)[model.jnt_dofadr[model.actuator_trnid[:, 0]]]
 
 
-def gear(env) -> Fault:
+def gear(env: Any) -> Fault:
   """One joint's gear ratio falls: a motor of the same command gives (1 - severity) of its torque.
 
     gear_j' = gear_j (1 - severity)
@@ -41,14 +48,16 @@ def gear(env) -> Fault:
   """
   names, mask, single = actuator_targets(env)
 
-  def act(hit, memory, severity, key, ports):
+  def act(
+    hit: jax.Array, memory: Any, severity: jax.Array, key: jax.Array, ports: Ports
+  ) -> tuple[Any, dict[str, jax.Array]]:
     value = ports.model.mj["actuator_gear"]
     return memory, {"mj.actuator_gear": jnp.where(hit[:, None], value * (1.0 - severity), value)}
 
   return fault("gear", env, ("mj.actuator_gear",), names, act, drawn=single, rows=mask)
 
 
-def torque_loss(env) -> Fault:
+def torque_loss(env: Any) -> Fault:
   """A motor gives less torque than it computes (worn magnets, a dropped phase), after its own
   limits.
 
@@ -62,7 +71,9 @@ def torque_loss(env) -> Fault:
   names, mask, single = actuator_targets(env)
   leaf = "task.strength" if "strength" in env.model.task else "mj.actuator_gear"
 
-  def act(hit, memory, severity, key, ports):
+  def act(
+    hit: jax.Array, memory: Any, severity: jax.Array, key: jax.Array, ports: Ports
+  ) -> tuple[Any, dict[str, jax.Array]]:
     value = read(ports, leaf)
     return memory, {
       leaf: jnp.where(hit.reshape((-1,) + (1,) * (value.ndim - 1)), value * (1.0 - severity), value)
@@ -81,7 +92,7 @@ def torque_loss(env) -> Fault:
   )
 
 
-def velocity_limit(env) -> Fault:
+def velocity_limit(env: Any) -> Fault:
   """A drive reaches less speed: its torque falls to zero at a lower one.
 
     v_j' = v_j (1 - 0.95 severity)
@@ -92,14 +103,16 @@ def velocity_limit(env) -> Fault:
   """
   names, mask, single = actuator_targets(env)
 
-  def act(hit, memory, severity, key, ports):
+  def act(
+    hit: jax.Array, memory: Any, severity: jax.Array, key: jax.Array, ports: Ports
+  ) -> tuple[Any, dict[str, jax.Array]]:
     value = ports.model.task["velocity_limit"]
     return memory, {"task.velocity_limit": jnp.where(hit, value * (1.0 - 0.95 * severity), value)}
 
   return fault("velocity_limit", env, ("task.velocity_limit",), names, act, drawn=single, rows=mask)
 
 
-def joint_lock(env) -> Fault:
+def joint_lock(env: Any) -> Fault:
   """A joint seizes: it grows heavy and stiff until it hardly moves.
 
     armature_j' = armature_j + 10 severity^2 [kg m^2],   damping_j' = damping_j + 1,000 severity^2
@@ -115,7 +128,9 @@ def joint_lock(env) -> Fault:
   names, mask, single = actuator_targets(env)
   hits = mask.astype(jnp.float32) @ dofs(env, "joint_lock")
 
-  def act(hit, memory, severity, key, ports):
+  def act(
+    hit: jax.Array, memory: Any, severity: jax.Array, key: jax.Array, ports: Ports
+  ) -> tuple[Any, dict[str, jax.Array]]:
     extra = severity * severity * hit
     armature, damping = ports.model.mj["dof_armature"], ports.model.mj["dof_damping"]
     return memory, {
@@ -128,20 +143,28 @@ def joint_lock(env) -> Fault:
   )
 
 
-def _command(name, env, change, memory=(), not_monotone=""):
+def _command(
+  name: str,
+  env: Any,
+  change: Callable[..., tuple[Any, jax.Array]],
+  memory: Any = (),
+  not_monotone: str = "",
+) -> Fault:
   """A fault of the command alone; change(hit (A,), memory, severity, key, ports) -> (memory',
   ctrl').
   """
   names, mask, single = actuator_targets(env)
 
-  def act(hit, memory, severity, key, ports):
+  def act(
+    hit: jax.Array, memory: Any, severity: jax.Array, key: jax.Array, ports: Ports
+  ) -> tuple[Any, dict[str, jax.Array]]:
     memory, value = change(hit, memory, severity, key, ports)
     return memory, {"ctrl": jnp.where(hit, value, ports.ctrl)}
 
   return fault(name, env, ("ctrl",), names, act, memory, single, not_monotone, mask)
 
 
-def stuck(env) -> Fault:
+def stuck(env: Any) -> Fault:
   """A command sticks at the last value that it had before the fault began.
 
     u_j' = (1 - severity) u_j + severity u_j(onset - 1)
@@ -152,14 +175,16 @@ def stuck(env) -> Fault:
   stick now and then for some steps; here for good.
   """
 
-  def change(hit, held, severity, key, ports):
+  def change(
+    hit: jax.Array, held: jax.Array, severity: jax.Array, key: jax.Array, ports: Ports
+  ) -> tuple[jax.Array, jax.Array]:
     held = jnp.where((severity > 0) & ~ports.first, held, ports.ctrl)
     return held, (1.0 - severity) * ports.ctrl + severity * held
 
   return _command("stuck", env, change, jnp.zeros(len(env.spec.act)))
 
 
-def offset(env) -> Fault:
+def offset(env: Any) -> Fault:
   """A constant is added to a command (a slipped encoder, a bent linkage).
 
     u_j' = clip(u_j + 0.5 severity, -1, 1)
@@ -175,7 +200,7 @@ def offset(env) -> Fault:
   )
 
 
-def dead_band(env) -> Fault:
+def dead_band(env: Any) -> Fault:
   """Small commands do nothing (play, stiction); larger ones are short by the band.
 
     u_j' = sign(u_j) max(|u_j| - 0.5 severity, 0)
@@ -184,13 +209,15 @@ def dead_band(env) -> Fault:
   or all. Owns `ctrl`. Source: none; fault and range are this project's own choice.
   """
 
-  def change(hit, m, severity, key, ports):
+  def change(
+    hit: jax.Array, m: Any, severity: jax.Array, key: jax.Array, ports: Ports
+  ) -> tuple[Any, jax.Array]:
     return m, jnp.sign(ports.ctrl) * jnp.maximum(jnp.abs(ports.ctrl) - 0.5 * severity, 0.0)
 
   return _command("dead_band", env, change)
 
 
-def command_dropout(env) -> Fault:
+def command_dropout(env: Any) -> Fault:
   """A command is lost now and then: the actuator gets 0 in that control step.
 
     P(u_j' = 0) = 0.5 severity, each actuator and step alone
@@ -199,13 +226,15 @@ def command_dropout(env) -> Fault:
   Owns `ctrl`. Source: dropped commands; realworldrl_suite drops observations with 0.01 to 0.1.
   """
 
-  def change(hit, m, severity, key, ports):
+  def change(
+    hit: jax.Array, m: Any, severity: jax.Array, key: jax.Array, ports: Ports
+  ) -> tuple[Any, jax.Array]:
     return m, jnp.where(jax.random.uniform(key, hit.shape) < 0.5 * severity, 0.0, ports.ctrl)
 
   return _command("command_dropout", env, change)
 
 
-def command_delay(env) -> Fault:
+def command_delay(env: Any) -> Fault:
   """A command arrives late.
 
     u_j'(t) = u_j(t - d),   d = ceil(9 severity) control steps
@@ -215,7 +244,9 @@ def command_delay(env) -> Fault:
   episode's start fills it with its first command. Source: realworldrl_suite.
   """
 
-  def change(hit, line, severity, key, ports):
+  def change(
+    hit: jax.Array, line: jax.Array, severity: jax.Array, key: jax.Array, ports: Ports
+  ) -> tuple[jax.Array, jax.Array]:
     line = jnp.where(
       ports.first,
       jnp.broadcast_to(ports.ctrl, line.shape),
@@ -232,7 +263,7 @@ def command_delay(env) -> Fault:
   )
 
 
-def command_noise(env) -> Fault:
+def command_noise(env: Any) -> Fault:
   """Gaussian noise on a command.
 
     u_j' = clip(u_j + n, -1, 1),   n ~ N(0, severity^2)
@@ -241,7 +272,9 @@ def command_noise(env) -> Fault:
   an actuator (drawn), a group or all. Owns `ctrl`. Source: realworldrl_suite.
   """
 
-  def change(hit, m, severity, key, ports):
+  def change(
+    hit: jax.Array, m: Any, severity: jax.Array, key: jax.Array, ports: Ports
+  ) -> tuple[Any, jax.Array]:
     return m, jnp.clip(ports.ctrl + severity * jax.random.normal(key, hit.shape), -1.0, 1.0)
 
   return _command("command_noise", env, change)

@@ -8,7 +8,7 @@ be touched, whatever the fault's author wrote.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +17,11 @@ from mjx_cl.errors import UserError
 from mjx_cl.faults import schedule
 from mjx_cl.keys import OfFaults
 from mjx_cl.types import Model
+
+if TYPE_CHECKING:
+  from collections.abc import Iterable
+
+  import numpy as np
 
 
 class Ports(NamedTuple):
@@ -32,8 +37,8 @@ class Ports(NamedTuple):
   """
 
   model: Model
-  ctrl: jax.Array | None = None
-  obs: jax.Array | None = None
+  ctrl: jax.Array | Any = None
+  obs: jax.Array | Any = None
   first: jax.Array | bool = False
   since: jax.Array | int = 0
 
@@ -102,7 +107,7 @@ def read(ports: Ports, name: str) -> jax.Array:
   """Value of the leaf `name`."""
   kind, _, leaf = name.partition(".")
   return (
-    getattr(ports.model, kind)[leaf]
+    getattr(ports.model, kind)[leaf]  # type: ignore[return-value]
     if leaf
     else ports.model.force
     if kind == "force"
@@ -120,20 +125,20 @@ def write(ports: Ports, name: str, value: jax.Array) -> Ports:
   return (
     ports._replace(model=ports.model._replace(force=value))
     if kind == "force"
-    else ports._replace(**{kind: value})
+    else ports._replace(**{kind: value})  # type: ignore[arg-type]
   )
 
 
 def fault(
   name: str,
-  env,
+  env: Any,
   owns: tuple[str, ...],
-  targets,
-  act,
-  memory=(),
+  targets: Iterable[str],
+  act: Callable[..., Any],
+  memory: Any = (),
   drawn: int | None = None,
   not_monotone: str = "",
-  rows=None,
+  rows: jax.Array | np.ndarray | None = None,
 ) -> Fault:
   """Builds a Fault of `env`.
 
@@ -165,14 +170,14 @@ def fault(
     )
   count = drawn or len(targets)
 
-  def init(key, target=-1):
+  def init(key: jax.Array, target: jax.Array | int = -1) -> State:
     target = jnp.asarray(target)
     index = jnp.where(target < 0, jax.random.randint(key, (), 0, count), target).astype(jnp.int32)
     return State(
       index, index if rows is None else jnp.asarray(rows)[index], jax.tree.map(jnp.asarray, memory)
     )
 
-  def apply(state, severity, key, ports: Ports):
+  def apply(state: State, severity: jax.Array, key: jax.Array, ports: Ports) -> tuple[State, Ports]:
     kept, values = act(state.row, state.memory, severity, key, ports)
     if set(values) != set(owns):
       raise ValueError(
@@ -186,7 +191,7 @@ def fault(
   return Fault(name, tuple(owns), targets, count, init, apply, senses, not_monotone)
 
 
-def require(env, leaf: str, name: str) -> None:
+def require(env: Any, leaf: str, name: str) -> None:
   """Raises UserError unless `env` has the leaf."""
   kind, _, key = leaf.partition(".")
   if kind in ("ctrl", "obs"):
@@ -208,12 +213,14 @@ def owned_model(faults: tuple[Fault, ...], model: Model) -> Model:
   )
 
 
-def as_tuple(faults) -> tuple[Fault, ...]:
+def as_tuple(faults: Fault | Iterable[Fault]) -> tuple[Fault, ...]:
   """One Fault or several -> a tuple."""
   return (faults,) if isinstance(faults, Fault) else tuple(faults)
 
 
-def begin(faults, key: jax.Array, plan: schedule.Plan, target=-1) -> Injection:
+def begin(
+  faults: Fault | Iterable[Fault], key: jax.Array, plan: schedule.Plan, target: jax.Array | int = -1
+) -> Injection:
   """Injection of `faults` before the first step; `target` int32 () or (F,), -1: drawn
   from `key`.
   """
@@ -224,7 +231,9 @@ def begin(faults, key: jax.Array, plan: schedule.Plan, target=-1) -> Injection:
   return Injection(states, schedule.spread(plan, len(faults)), jnp.zeros(len(faults)))
 
 
-def drive(faults, injection: Injection, t: jax.Array, key: jax.Array, ports: Ports):
+def drive(
+  faults: Fault | Iterable[Fault], injection: Injection, t: jax.Array, key: jax.Array, ports: Ports
+) -> tuple[Injection, Ports, jax.Array]:
   """Applies every fault that acts on the driven robot, in order, in control step t.
 
   Returns:
@@ -240,14 +249,14 @@ def drive(faults, injection: Injection, t: jax.Array, key: jax.Array, ports: Por
 
 
 def sense(
-  faults,
+  faults: Fault | Iterable[Fault],
   injection: Injection,
   t: jax.Array,
   key: jax.Array,
   model: Model,
   obs: jax.Array,
-  first=False,
-):
+  first: jax.Array | bool = False,
+) -> tuple[Injection, jax.Array]:
   """Applies every sensor fault to the observation that is read at control step t. Returns
   (injection', obs').
 
@@ -264,7 +273,15 @@ def sense(
   return injection, ports.obs
 
 
-def _apply(faults, injection, t, key, ports, severity, senses):
+def _apply(
+  faults: tuple[Fault, ...],
+  injection: Injection,
+  t: jax.Array,
+  key: jax.Array,
+  ports: Ports,
+  severity: jax.Array,
+  senses: bool,
+) -> tuple[Injection, Ports]:
   states = list(injection.states)
   for i, f in enumerate(faults):
     if f.senses == senses:
@@ -294,7 +311,7 @@ def _check_owned(fault: Fault, before: Ports, after: Ports) -> None:
     )
 
 
-def none(env) -> Fault:
+def none(env: Any) -> Fault:
   """No fault at all: the nominal robot."""
   del env
   return Fault(
@@ -311,7 +328,7 @@ def none(env) -> Fault:
 # ---- targets -------------------------------------------------------------------------------------
 
 
-def actuator_targets(env):
+def actuator_targets(env: Any) -> tuple[tuple[str, ...], jax.Array, int]:
   """Single actuators, then groups, then all: (names, bool mask (targets, A), how many
   are single).
   """
@@ -320,7 +337,7 @@ def actuator_targets(env):
   return _masks(rows, size, len(env.spec.targets))
 
 
-def channel_targets(env):
+def channel_targets(env: Any) -> tuple[tuple[str, ...], jax.Array, int]:
   """Groups of the observation, `all`, then single channels: (names, bool mask (targets, O), how
   many may be drawn).
   """
@@ -332,7 +349,9 @@ def channel_targets(env):
   return _masks(rows, size, max(1, len(groups)), whole=False)
 
 
-def _masks(rows, size, single, whole=True):
+def _masks(
+  rows: Iterable[tuple[str, tuple[int, ...]]], size: int, single: int, whole: bool = True
+) -> tuple[tuple[str, ...], jax.Array, int]:
   rows = list(rows)
   if whole and "all" not in {name for name, _ in rows}:
     rows.append(("all", tuple(range(size))))

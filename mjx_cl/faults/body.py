@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Any
+
 import jax.numpy as jnp
 import numpy as np
 
@@ -11,8 +13,15 @@ from mjx_cl.errors import UserError
 from mjx_cl.faults.actuator import dofs
 from mjx_cl.faults.base import Fault, actuator_targets, fault
 
+if TYPE_CHECKING:
+  from collections.abc import Iterable
 
-def _bodies(env, name: str):
+  import jax
+
+  from mjx_cl.faults.base import Ports
+
+
+def _bodies(env: Any, name: str) -> tuple[tuple[str, ...], jax.Array]:
   """(names, bool mask (targets, nbody)) of spec.bodies."""
   if not env.spec.bodies or getattr(env, "mj_model", None) is None:
     raise UserError(
@@ -25,7 +34,7 @@ def _bodies(env, name: str):
   )
 
 
-def payload(env) -> Fault:
+def payload(env: Any) -> Fault:
   """The trunk carries a load, spread as its own mass is.
 
     m' = m (1 + 0.4 severity M / m),  I' = I m' / m                       M whole mass, m the
@@ -38,7 +47,9 @@ def payload(env) -> Fault:
   """
   if "mass" in env.model.task:
 
-    def act(target, memory, severity, key, ports):
+    def act(
+      target: jax.Array, memory: Any, severity: jax.Array, key: jax.Array, ports: Ports
+    ) -> tuple[Any, dict[str, jax.Array]]:
       grown = 1.0 + 0.4 * severity
       return memory, {
         "task.mass": ports.model.task["mass"] * grown,
@@ -51,7 +62,9 @@ def payload(env) -> Fault:
   trunk = int(env.spec.bodies[0][1][0])
   share = float(mass.sum() / mass[trunk])
 
-  def act(target, memory, severity, key, ports):
+  def act(  # type: ignore[no-redef]
+    target: jax.Array, memory: Any, severity: jax.Array, key: jax.Array, ports: Ports
+  ) -> tuple[Any, dict[str, jax.Array]]:
     grown = jnp.where(jnp.arange(mass.size) == trunk, 1.0 + 0.4 * severity * share, 1.0)
     return memory, {
       "mj.body_mass": ports.model.mj["body_mass"] * grown,
@@ -61,7 +74,7 @@ def payload(env) -> Fault:
   return fault("payload", env, ("mj.body_mass", "mj.body_inertia"), ("trunk",), act)
 
 
-def com(env) -> Fault:
+def com(env: Any) -> Fault:
   """The trunk's centre of mass moves.
 
     r' = r + 0.5 severity g e,   g = sqrt(trace(I) / (2 m)) radius of gyration, e the direction
@@ -77,7 +90,9 @@ def com(env) -> Fault:
   names, directions = heading_targets(env, ("forward", "backward", "left", "right", "up", "down"))
   of_trunk = (jnp.arange(model.nbody) == trunk)[:, None]
 
-  def act(direction, memory, severity, key, ports):
+  def act(
+    direction: jax.Array, memory: Any, severity: jax.Array, key: jax.Array, ports: Ports
+  ) -> tuple[Any, dict[str, jax.Array]]:
     return memory, {
       "mj.body_ipos": ports.model.mj["body_ipos"]
       + jnp.where(of_trunk, 0.5 * severity * gyration * direction, 0.0)
@@ -86,7 +101,7 @@ def com(env) -> Fault:
   return fault("com", env, ("mj.body_ipos",), names, act, rows=directions)
 
 
-def limb_mass(env) -> Fault:
+def limb_mass(env: Any) -> Fault:
   """A limb grows heavier (mud, ice), its inertia with it.   m_b' = m_b (1 + 2 severity)
 
   Severity: 1 triples the mass [kg], the upper end of Nagabandi et al.'s arm. Target: a body other
@@ -95,7 +110,9 @@ def limb_mass(env) -> Fault:
   names, mask = _bodies(env, "limb_mass")
   names, mask = names[1:], mask[1:]
 
-  def act(hit, memory, severity, key, ports):
+  def act(
+    hit: jax.Array, memory: Any, severity: jax.Array, key: jax.Array, ports: Ports
+  ) -> tuple[Any, dict[str, jax.Array]]:
     grown = jnp.where(hit, 1.0 + 2.0 * severity, 1.0)
     return memory, {
       "mj.body_mass": ports.model.mj["body_mass"] * grown,
@@ -105,7 +122,7 @@ def limb_mass(env) -> Fault:
   return fault("limb_mass", env, ("mj.body_mass", "mj.body_inertia"), names, act, rows=mask)
 
 
-def joint_damping(env) -> Fault:
+def joint_damping(env: Any) -> Fault:
   """A joint grows stiff in motion.   damping_j' = damping_j + 10 severity [N m s/rad]
 
   Severity: 1 adds 10 [N m s/rad], the upper end of realworldrl_suite's walker (nominal 0.1).
@@ -114,13 +131,15 @@ def joint_damping(env) -> Fault:
   names, mask, single = actuator_targets(env)
   hits = mask.astype(jnp.float32) @ dofs(env, "joint_damping")
 
-  def act(hit, memory, severity, key, ports):
+  def act(
+    hit: jax.Array, memory: Any, severity: jax.Array, key: jax.Array, ports: Ports
+  ) -> tuple[Any, dict[str, jax.Array]]:
     return memory, {"mj.dof_damping": ports.model.mj["dof_damping"] + 10.0 * severity * hit}
 
   return fault("joint_damping", env, ("mj.dof_damping",), names, act, drawn=single, rows=hits)
 
 
-def joint_friction(env) -> Fault:
+def joint_friction(env: Any) -> Fault:
   """Dry friction in a joint.   frictionloss_j' = frictionloss_j + 0.25 severity tau_j [N m]
 
   Severity: 1 adds a quarter of the motor's greatest torque tau_j [N m]. Target: a joint (drawn), a
@@ -144,7 +163,9 @@ def joint_friction(env) -> Fault:
       "choose physics native"
     )
 
-  def act(greatest, memory, severity, key, ports):
+  def act(
+    greatest: jax.Array, memory: Any, severity: jax.Array, key: jax.Array, ports: Ports
+  ) -> tuple[Any, dict[str, jax.Array]]:
     return memory, {
       "mj.dof_frictionloss": ports.model.mj["dof_frictionloss"] + 0.25 * severity * greatest
     }
@@ -160,7 +181,7 @@ def joint_friction(env) -> Fault:
   )
 
 
-def range_loss(env) -> Fault:
+def range_loss(env: Any) -> Fault:
   """A joint's range shrinks towards the angle at which the robot stands.   low' = low + 0.95
     severity (q0 - low), high alike
 
@@ -185,7 +206,9 @@ def range_loss(env) -> Fault:
   middle[joints, 0] = np.clip(stance, *model.jnt_range[joints].T)
   hits = jnp.zeros((len(names), model.njnt), bool).at[:, joints].set(mask)
 
-  def act(hit, memory, severity, key, ports):
+  def act(
+    hit: jax.Array, memory: Any, severity: jax.Array, key: jax.Array, ports: Ports
+  ) -> tuple[Any, dict[str, jax.Array]]:
     value = ports.model.mj["jnt_range"]
     return memory, {
       "mj.jnt_range": jnp.where(hit[:, None], value + 0.95 * severity * (middle - value), value)
@@ -204,7 +227,7 @@ DIRECTIONS = {
 }
 
 
-def heading_targets(env, names):
+def heading_targets(env: Any, names: Iterable[str]) -> tuple[tuple[str, ...], jax.Array]:
   """(names, unit vectors (targets, 3)) of the directions in which the robot's trunk is free to
   move.
   """
@@ -213,7 +236,7 @@ def heading_targets(env, names):
   return tuple(kept), jnp.asarray([DIRECTIONS[n] for n in kept], jnp.float32)
 
 
-def force_map(env) -> np.ndarray:
+def force_map(env: Any) -> np.ndarray:
   """(3, nv): a force F (world axes) [N] on the trunk is the generalised force F @ map.
 
   The trunk's slide joints, or the translations of its free joint (the force then acts at the body's

@@ -7,7 +7,7 @@ actions, beside the robot without any fault.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +16,11 @@ import numpy as np
 from mjx_cl import faults as faults_lib
 from mjx_cl.faults import presets, schedule
 from mjx_cl.keys import OfStep
+
+if TYPE_CHECKING:
+  from collections.abc import Callable, Sequence
+
+  from mjx_cl.types import Model
 
 SEVERITIES = (0.0, 0.25, 0.5, 0.75, 1.0)
 AFTER = (1, 10, 100)  # control steps at which the size of the difference is reported
@@ -78,7 +83,9 @@ class Certificate(NamedTuple):
 
 
 def lanes(
-  faults: dict[str, faults_lib.Fault], severities=SEVERITIES, targets: bool = True
+  faults: dict[str, faults_lib.Fault],
+  severities: Sequence[float] = SEVERITIES,
+  targets: bool = True,
 ) -> list[Lane]:
   """Every severity on the first target, and severity 1 on all others; of a sensor, whose channels
   are many, on those that may be drawn.
@@ -92,7 +99,7 @@ def lanes(
   return out
 
 
-def preset_lanes(env, faults: dict[str, faults_lib.Fault]) -> list[Lane]:
+def preset_lanes(env: Any, faults: dict[str, faults_lib.Fault]) -> list[Lane]:
   """One lane for every preset that this robot can have."""
   out = []
   for name, preset in presets.PRESETS.items():
@@ -105,7 +112,7 @@ def preset_lanes(env, faults: dict[str, faults_lib.Fault]) -> list[Lane]:
   return out
 
 
-def actions(env, steps: int, seed: int, size: float = 1.0) -> np.ndarray:
+def actions(env: Any, steps: int, seed: int, size: float = 1.0) -> np.ndarray:
   """A smooth command signal, float32 (steps, A) in [-1, 1]: two sines of drawn frequency and phase,
   0.9 and 0.4 times `size`.
   """
@@ -121,7 +128,14 @@ def actions(env, steps: int, seed: int, size: float = 1.0) -> np.ndarray:
   return np.clip(size * signal, -1, 1).astype(np.float32)
 
 
-def live(env, faults: tuple, model, key: jax.Array, injection, signal: jax.Array):
+def live(
+  env: Any,
+  faults: tuple,
+  model: Model,
+  key: jax.Array,
+  injection: faults_lib.Injection,
+  signal: jax.Array,
+) -> tuple[jax.Array, jax.Array, jax.Array]:
   """One robot of nominal `model` under `signal` (T, A), never reset. Returns (obs (T, O), reward
   (T,), terminated (T,)) of arriving.
   """
@@ -129,7 +143,9 @@ def live(env, faults: tuple, model, key: jax.Array, injection, signal: jax.Array
   state, obs = env.init(model, key_env)
   injection, _ = faults_lib.sense(faults, injection, jnp.int32(0), key, model, obs, True)
 
-  def step(carry, x):
+  def step(
+    carry: tuple[Any, faults_lib.Injection], x: tuple[jax.Array, jax.Array]
+  ) -> tuple[tuple[Any, faults_lib.Injection], tuple[jax.Array, jax.Array, jax.Array]]:
     state, injection = carry
     t, action = x
     now = jax.random.fold_in(key, t)
@@ -150,7 +166,7 @@ def live(env, faults: tuple, model, key: jax.Array, injection, signal: jax.Array
   return jax.lax.scan(step, (state, injection), (times, signal))[1]
 
 
-def program(env, faults: tuple):
+def program(env: Any, faults: tuple) -> Callable[..., Any]:
   """(model, key, plans, targets, signal) -> (obs, reward, terminated) of every lane and of the same
   robot in a program without faults, jitted.
 
@@ -159,7 +175,9 @@ def program(env, faults: tuple):
   """
   none = faults_lib.none(env)
 
-  def run(model, key, plans, targets, signal):
+  def run(
+    model: Model, key: jax.Array, plans: schedule.Plan, targets: jax.Array, signal: jax.Array
+  ) -> tuple[tuple[jax.Array, jax.Array, jax.Array], tuple[jax.Array, jax.Array, jax.Array]]:
     one = lambda plan, target: live(
       env, faults, model, key, faults_lib.begin(faults, jax.random.key(0), plan, target), signal
     )
@@ -176,7 +194,9 @@ def program(env, faults: tuple):
   return jax.jit(run)
 
 
-def plans(faults: dict[str, faults_lib.Fault], chosen: list[Lane], onset: int):
+def plans(
+  faults: dict[str, faults_lib.Fault], chosen: list[Lane], onset: int
+) -> tuple[schedule.Plan, jax.Array]:
   """Plan (lanes, F) and targets (lanes, F): each lane has its own fault or faults, the others rest
   at severity 0.
 
@@ -222,14 +242,14 @@ def plans(faults: dict[str, faults_lib.Fault], chosen: list[Lane], onset: int):
 
 
 def certify(
-  env,
+  env: Any,
   faults: dict[str, faults_lib.Fault] | None = None,
-  severities=SEVERITIES,
+  severities: Sequence[float] = SEVERITIES,
   chosen: list[Lane] | None = None,
   onset: int = 25,
   steps: int = 240,
   seed: int = 0,
-  sizes=(1.0, 0.4),
+  sizes: Sequence[float] = (1.0, 0.4),
 ) -> list[Certificate]:
   """Certificates of `faults` (all that the robot can have) on `env`.
 
@@ -247,9 +267,9 @@ def certify(
   nominal = Lane(next(iter(faults)), next(iter(faults.values())).targets[0], 0.0)
   run = program(env, tuple(faults.values()))
   model = faults_lib.owned_model(tuple(faults.values()), env.model)
-  under = []
+  under: list[list[Certificate]] = []
   for k, size in enumerate(sizes):
-    signal, out = jnp.asarray(actions(env, steps, seed + k, size)), []
+    signal, out = jnp.asarray(actions(env, steps, seed + k, size)), []  # type: ignore[var-annotated]
     for part in parts(chosen):
       plan, target = plans(faults, part + [nominal] * (WIDTH - len(part)), onset)
       rows, plain = jax.tree.map(
@@ -270,7 +290,7 @@ def best(rows: tuple[Certificate, ...]) -> Certificate:
     identical=identical,
     early=any(r.early for r in rows),
     finite=all(r.finite for r in rows),
-    diff_1=max((r.diff_1 for r in rows), default=None)
+    diff_1=max((r.diff_1 for r in rows), default=None)  # type: ignore[type-var]
     if rows[0].fault == "none"
     else chosen.diff_1,
   )
@@ -291,7 +311,14 @@ def parts(chosen: list[Lane]) -> list[list[Lane]]:
   return out
 
 
-def compare(env, faults, chosen, rows, plain, onset) -> list[Certificate]:
+def compare(
+  env: Any,
+  faults: dict[str, faults_lib.Fault],
+  chosen: list[Lane],
+  rows: tuple[np.ndarray, ...],
+  plain: tuple[np.ndarray, ...],
+  onset: int,
+) -> list[Certificate]:
   """Rows of the lanes, the last of which is the nominal robot, against that one; it is held against
   the program without faults.
   """
@@ -347,7 +374,7 @@ def compare(env, faults, chosen, rows, plain, onset) -> list[Certificate]:
       else (faults_lib.family(lane.fault), faults[lane.fault].not_monotone)
     )
     out.append(
-      Certificate(
+      Certificate(  # type: ignore[call-arg]
         env.spec.name,
         lane.fault,
         kind,
@@ -356,7 +383,7 @@ def compare(env, faults, chosen, rows, plain, onset) -> list[Certificate]:
         not at.size,
         first is not None and first < begin,
         None if first is None else first - begin,
-        *values,
+        *values,  # type: ignore[arg-type]
         monotone(chosen, differs, size, i),
         reason,
         bool(sound[i]),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,11 +12,16 @@ from mjx_cl.errors import UserError
 from mjx_cl.faults.base import Fault, fault, read
 from mjx_cl.faults.body import force_map, heading_targets
 
+if TYPE_CHECKING:
+  from collections.abc import Iterable
+
+  from mjx_cl.faults.base import Ports
+
 PUSH_EVERY = 100  # control steps between two pushes
 PUSH_FOR = 4  # control steps that one lasts
 
 
-def friction(env) -> Fault:
+def friction(env: Any) -> Fault:
   """Grip is lost: under all feet (a slippery ground) or under one foot, wheel or axle (a sock).
 
     mu_i' = mu_i (1 - 0.95 severity)
@@ -41,7 +48,9 @@ def friction(env) -> Fault:
     check_priority(env, everything)
   mask = jnp.asarray([[i in hit for i in range(size)] for _, hit in feet])
 
-  def act(hit, memory, severity, key, ports):
+  def act(
+    hit: jax.Array, memory: Any, severity: jax.Array, key: jax.Array, ports: Ports
+  ) -> tuple[Any, dict[str, jax.Array]]:
     value = read(ports, leaf)
     return memory, {
       leaf: jnp.where(
@@ -52,7 +61,7 @@ def friction(env) -> Fault:
   return fault("friction", env, (leaf,), names, act, rows=mask)
 
 
-def check_priority(env, geoms) -> None:
+def check_priority(env: Any, geoms: Iterable[int]) -> None:
   """Raises UserError where a foot's friction is masked by what it stands on."""
   import mujoco
 
@@ -70,7 +79,7 @@ def check_priority(env, geoms) -> None:
     )
 
 
-def slope(env) -> Fault:
+def slope(env: Any) -> Fault:
   """The ground is no longer level: gravity tilts, the ground stays where it is.
 
     g' = |g| (sin(a) e - cos(a) z),   a = 20 degrees severity, e the direction downhill
@@ -82,7 +91,9 @@ def slope(env) -> Fault:
   names, directions = heading_targets(env, ("forward", "backward", "left", "right"))
   leaf = "task.gravity" if "gravity" in env.model.task else "mj.gravity"
 
-  def act(direction, memory, severity, key, ports):
+  def act(
+    direction: jax.Array, memory: Any, severity: jax.Array, key: jax.Array, ports: Ports
+  ) -> tuple[Any, dict[str, jax.Array]]:
     value = read(ports, leaf)
     angle = jnp.deg2rad(20.0) * severity
     tilted = jnp.linalg.norm(value) * (
@@ -93,7 +104,7 @@ def slope(env) -> Fault:
   return fault("slope", env, (leaf,), names, act, rows=directions)
 
 
-def whole_mass(env) -> float:
+def whole_mass(env: Any) -> float:
   """Mass of the nominal robot [kg]."""
   return (
     float(np.asarray(env.model.task["mass"]))
@@ -102,7 +113,7 @@ def whole_mass(env) -> float:
   )
 
 
-def wind(env) -> Fault:
+def wind(env: Any) -> Fault:
   """A steady force on the trunk.   F = 0.3 severity M g e [N]
 
   Severity: 1 is 30 % of the weight [N]. Target: the direction of the wind in the world (drawn),
@@ -113,13 +124,15 @@ def wind(env) -> Fault:
   names, directions = heading_targets(env, ("forward", "backward", "left", "right"))
   blows = 0.3 * 9.81 * whole_mass(env) * directions @ force_map(env)
 
-  def act(blow, memory, severity, key, ports):
-    return memory, {"force": ports.model.force + severity * blow}
+  def act(
+    blow: jax.Array, memory: Any, severity: jax.Array, key: jax.Array, ports: Ports
+  ) -> tuple[Any, dict[str, jax.Array]]:
+    return memory, {"force": ports.model.force + severity * blow}  # type: ignore[operator]
 
   return fault("wind", env, ("force",), names, act, rows=blows)
 
 
-def push(env) -> Fault:
+def push(env: Any) -> Fault:
   """Blows to the trunk: every 100 control steps, for 4, each in a direction drawn anew.
 
     F = severity M dv / (4 dt) e [N],   dv = 1.5 m/s, e = forward or backward (and sideways where
@@ -134,13 +147,15 @@ def push(env) -> Fault:
     1.5 * whole_mass(env) / (PUSH_FOR * env.spec.control_s) * directions @ force_map(env)
   )  # (directions, nv)
 
-  def act(target, memory, severity, key, ports):
+  def act(
+    target: jax.Array, memory: Any, severity: jax.Array, key: jax.Array, ports: Ports
+  ) -> tuple[Any, dict[str, jax.Array]]:
     phase = jnp.mod(ports.since, PUSH_EVERY)
     which = jnp.where(phase == 0, jax.random.randint(key, (), 0, directions.shape[0]), memory)
     strength = jnp.where(phase < PUSH_FOR, severity, 0.0)
     chosen = (jnp.arange(blows.shape[0]) == which)[:, None]
     return which, {
-      "force": ports.model.force + strength * jnp.sum(jnp.where(chosen, blows, 0.0), 0)
+      "force": ports.model.force + strength * jnp.sum(jnp.where(chosen, blows, 0.0), 0)  # type: ignore[operator]
     }
 
   return fault("push", env, ("force",), ("trunk",), act, jnp.int32(0))

@@ -4,13 +4,18 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from mjx_cl.errors import UserError
 from mjx_cl.faults.presets import FOREVER, SCHEDULES
+
+if TYPE_CHECKING:
+  from collections.abc import Sequence
+
+  from jax.typing import ArrayLike
 
 
 class Plan(NamedTuple):
@@ -33,7 +38,12 @@ class Plan(NamedTuple):
 
 
 def plan(
-  severity=0.0, onset=0, duration=FOREVER, schedule="abrupt", period=1000, share=0.5
+  severity: ArrayLike | Sequence[float] = 0.0,
+  onset: ArrayLike | Sequence[float] = 0,
+  duration: ArrayLike | Sequence[float] = FOREVER,
+  schedule: str | ArrayLike | Sequence[float] = "abrupt",
+  period: ArrayLike | Sequence[float] = 1000,
+  share: ArrayLike | Sequence[float] = 0.5,
 ) -> Plan:
   """A Plan from numbers or arrays; `schedule` is a name or an array of indices."""
   if isinstance(schedule, str):

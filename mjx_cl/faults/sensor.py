@@ -8,11 +8,18 @@ from the groups. Where a fault remembers, an episode's start fills its memory an
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Any
+
 import jax
 import jax.numpy as jnp
 
 from mjx_cl.errors import UserError
 from mjx_cl.faults.base import Fault, channel_targets, fault
+
+if TYPE_CHECKING:
+  from collections.abc import Callable
+
+  from mjx_cl.faults.base import Ports
 
 MOST_DELAY = 9  # control steps at severity 1
 BURST = (
@@ -24,21 +31,29 @@ BURST = (
 DRIFT_STEPS = 2000  # control steps until a drift is complete
 
 
-def _sensor(name, env, change, memory=(), not_monotone=""):
+def _sensor(
+  name: str,
+  env: Any,
+  change: Callable[..., tuple[Any, jax.Array]],
+  memory: Any = (),
+  not_monotone: str = "",
+) -> Fault:
   """A fault of the observation alone; change(memory, severity, key, ports, scale) -> (memory',
   obs').
   """
   names, mask, single = channel_targets(env)
   scale = jnp.asarray([v.scale for v in env.spec.obs], jnp.float32)
 
-  def act(hit, memory, severity, key, ports):
+  def act(
+    hit: jax.Array, memory: Any, severity: jax.Array, key: jax.Array, ports: Ports
+  ) -> tuple[Any, dict[str, jax.Array]]:
     memory, value = change(memory, severity, key, ports, scale)
     return memory, {"obs": jnp.where(hit, value, ports.obs)}
 
   return fault(name, env, ("obs",), names, act, memory, single, not_monotone, mask)
 
 
-def bias(env) -> Fault:
+def bias(env: Any) -> Fault:
   """A constant is added to a reading.   x_i' = x_i + 2 severity scale_i
 
   Severity: 1 is two typical deviations [unit of the channel]. Target: a group of channels (drawn),
@@ -50,7 +65,7 @@ def bias(env) -> Fault:
   )
 
 
-def drift(env) -> Fault:
+def drift(env: Any) -> Fault:
   """A reading wanders off in a straight line.   x_i' = x_i + 2 severity scale_i min(1, (since + 1)
     / 2,000)
 
@@ -59,14 +74,16 @@ def drift(env) -> Fault:
   of Danesh and Fern 2021; the range is this project's own choice.
   """
 
-  def change(m, severity, key, ports, scale):
+  def change(
+    m: Any, severity: jax.Array, key: jax.Array, ports: Ports, scale: jax.Array
+  ) -> tuple[Any, jax.Array]:
     share = jnp.clip((ports.since + 1) / DRIFT_STEPS, 0.0, 1.0)
     return m, ports.obs + 2.0 * severity * scale * share
 
   return _sensor("drift", env, change)
 
 
-def scale(env) -> Fault:
+def scale(env: Any) -> Fault:
   """A sensor's gain falls.   x_i' = x_i (1 - 0.9 severity)
 
   Severity: 1 leaves a tenth of the gain [1]. Target: a group of channels (drawn), all, or one
@@ -78,7 +95,7 @@ def scale(env) -> Fault:
   )
 
 
-def noise(env) -> Fault:
+def noise(env: Any) -> Fault:
   """Gaussian noise on a reading.   x_i' = x_i + n,  n ~ N(0, (severity scale_i)^2)
 
   Severity: standard deviation [typical deviations]; realworldrl_suite's levels are 0.1, 0.3, 1.0 in
@@ -95,7 +112,7 @@ def noise(env) -> Fault:
   )
 
 
-def dropout(env) -> Fault:
+def dropout(env: Any) -> Fault:
   """A reading is lost now and then: 0 in its place.   P(x_i' = 0) = 0.5 severity, each channel and
     step alone
 
@@ -115,7 +132,7 @@ def dropout(env) -> Fault:
   )
 
 
-def freeze(env) -> Fault:
+def freeze(env: Any) -> Fault:
   """A reading stands still: it is not renewed.   P(x_i'(t) = x_i'(t - 1)) = severity, each channel
     and step alone
 
@@ -128,7 +145,9 @@ def freeze(env) -> Fault:
   of realworldrl_suite.
   """
 
-  def change(held, severity, key, ports, _):
+  def change(
+    held: jax.Array, severity: jax.Array, key: jax.Array, ports: Ports, _: jax.Array
+  ) -> tuple[jax.Array, jax.Array]:
     hold = (jax.random.uniform(key, ports.obs.shape) < severity) & ~jnp.asarray(ports.first)
     value = jnp.where(hold, held, ports.obs)
     return value, value
@@ -136,7 +155,7 @@ def freeze(env) -> Fault:
   return _sensor("freeze", env, change, jnp.zeros(len(env.spec.obs)))
 
 
-def _burst(left, severity, key, ports):
+def _burst(left: jax.Array, severity: jax.Array, key: jax.Array, ports: Ports) -> jax.Array:
   """Control steps (O,) that the burst of each channel still lasts, this one included; a new one may
   begin where none is under way.
   """
@@ -148,7 +167,7 @@ def _burst(left, severity, key, ports):
   return jnp.where(left > 0, left, jnp.where(begins, lasts, 0))
 
 
-def dropout_burst(env) -> Fault:
+def dropout_burst(env: Any) -> Fault:
   """A reading is lost now and then for a while: 0 in its place.   A burst begins with P = 0.1
     severity, each channel alone, and lasts ceil(10 severity) control steps
 
@@ -158,14 +177,16 @@ def dropout_burst(env) -> Fault:
   channel that reads 0. Source: dropped observations of realworldrl_suite.
   """
 
-  def change(left, severity, key, ports, _):
+  def change(
+    left: jax.Array, severity: jax.Array, key: jax.Array, ports: Ports, _: jax.Array
+  ) -> tuple[jax.Array, jax.Array]:
     left = _burst(left, severity, key, ports)
     return jnp.maximum(left - 1, 0), jnp.where(left > 0, 0.0, ports.obs)
 
   return _sensor("dropout_burst", env, change, jnp.zeros(len(env.spec.obs), jnp.int32))
 
 
-def freeze_burst(env) -> Fault:
+def freeze_burst(env: Any) -> Fault:
   """A reading stands still now and then for a while.   A burst begins with P = 0.1 severity, each
     channel alone, and holds the last reading for ceil(10 severity) control steps
 
@@ -175,7 +196,13 @@ def freeze_burst(env) -> Fault:
   Not visible to: a channel that does not change. Source: stuck sensors of realworldrl_suite.
   """
 
-  def change(memory, severity, key, ports, _):
+  def change(
+    memory: tuple[jax.Array, jax.Array],
+    severity: jax.Array,
+    key: jax.Array,
+    ports: Ports,
+    _: jax.Array,
+  ) -> tuple[tuple[jax.Array, jax.Array], jax.Array]:
     left, held = memory
     left = jnp.where(jnp.asarray(ports.first), 0, _burst(left, severity, key, ports))
     value = jnp.where(left > 0, held, ports.obs)
@@ -189,7 +216,7 @@ def freeze_burst(env) -> Fault:
   )
 
 
-def delay(env) -> Fault:
+def delay(env: Any) -> Fault:
   """A reading arrives late.   x_i'(t) = x_i(t - d),  d = ceil(9 severity) control steps
 
   Severity: 1/3, 2/3, 1 are delays of 3, 6, 9 [control steps], realworldrl_suite's easy, medium,
@@ -197,7 +224,9 @@ def delay(env) -> Fault:
   readings; an episode's start fills it with its first reading. Source: realworldrl_suite.
   """
 
-  def change(line, severity, key, ports, _):
+  def change(
+    line: jax.Array, severity: jax.Array, key: jax.Array, ports: Ports, _: jax.Array
+  ) -> tuple[jax.Array, jax.Array]:
     line = jnp.where(
       ports.first,
       jnp.broadcast_to(ports.obs, line.shape),
@@ -214,7 +243,7 @@ def delay(env) -> Fault:
   )
 
 
-def lidar_loss(env) -> Fault:
+def lidar_loss(env: Any) -> Fault:
   """Beams of a sector return nothing: they read the greatest range.   x_i' = high_i for the first
     ceil(severity n) of the sector's n beams
 
@@ -233,7 +262,9 @@ def lidar_loss(env) -> Fault:
   )  # place in the sector, 2 outside it
   high = jnp.asarray([v.high if v.high < 1e9 else 0.0 for v in env.spec.obs], jnp.float32)
 
-  def act(place, memory, severity, key, ports):
+  def act(
+    place: jax.Array, memory: Any, severity: jax.Array, key: jax.Array, ports: Ports
+  ) -> tuple[Any, dict[str, jax.Array]]:
     return memory, {"obs": jnp.where(place < severity, high, ports.obs)}
 
   return fault("lidar_loss", env, ("obs",), [name for name, _ in beams], act, rows=rank)

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Any
+
 import jax.numpy as jnp
 import numpy as np
 
 from mjx_cl.errors import UserError
 from mjx_cl.faults.base import Fault, fault
 
+if TYPE_CHECKING:
+  import jax
 
-def reward_weight(env) -> Fault:
+  from mjx_cl.faults.base import Ports
+
+
+def reward_weight(env: Any) -> Fault:
   """One term of the reward loses its weight.   w_k' = w_k (1 - severity)
 
   Severity: lost share [1]. Target: a term of the reward that counts (drawn; env.reward_terms). Owns
@@ -27,7 +34,9 @@ def reward_weight(env) -> Fault:
       "does not have"
     )
 
-  def act(hit, memory, severity, key, ports):
+  def act(
+    hit: jax.Array, memory: Any, severity: jax.Array, key: jax.Array, ports: Ports
+  ) -> tuple[Any, dict[str, jax.Array]]:
     value = ports.model.task["reward_weights"]
     return memory, {"task.reward_weights": jnp.where(hit, value * (1.0 - severity), value)}
 
@@ -41,7 +50,7 @@ def reward_weight(env) -> Fault:
   )
 
 
-def command_range(env) -> Fault:
+def command_range(env: Any) -> Fault:
   """More is asked for: commands (or the speed to reach) leave the range of the training.   range' =
     range (1 + severity)
 
@@ -49,7 +58,9 @@ def command_range(env) -> Fault:
   Source: none; fault and range are this project's own choice.
   """
 
-  def act(target, memory, severity, key, ports):
+  def act(
+    target: jax.Array, memory: Any, severity: jax.Array, key: jax.Array, ports: Ports
+  ) -> tuple[Any, dict[str, jax.Array]]:
     return memory, {"task.command_range": ports.model.task["command_range"] * (1.0 + severity)}
 
   return fault("command_range", env, ("task.command_range",), ("command",), act)

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Any
+
 import jax.numpy as jnp
 
 from mjx_cl.errors import UserError
 from mjx_cl.faults.base import Fault, fault
 from mjx_cl.types import Model
 
+if TYPE_CHECKING:
+  import jax
 
-def gap(env) -> Fault:
+  from mjx_cl.faults.base import Ports
+
+
+def gap(env: Any) -> Fault:
   """One item of the gap between simulator and car, or all of them, appears or grows (env.widen).
 
     x' = x + severity (x_real - x_simulator),  acceleration, grip and mass:  x' = x (x_real /
@@ -26,7 +33,9 @@ def gap(env) -> Fault:
     )
   leaves = tuple(sorted({item.leaf for item in items.values()}))
 
-  def act(target, memory, severity, key, ports):
+  def act(
+    target: jax.Array, memory: Any, severity: jax.Array, key: jax.Array, ports: Ports
+  ) -> tuple[Any, dict[str, jax.Array]]:
     model = Model(dict(ports.model.mj), dict(ports.model.task), ports.model.force)
     for i, name in enumerate(items):
       model = env.widen(

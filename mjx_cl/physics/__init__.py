@@ -16,11 +16,29 @@ the actuators get, at every physics step. `xp` is numpy (native, the whole batch
 written with `xp` alone and with `...` indices. `task` holds the leaves of types.Model.task.
 """
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
 from mjx_cl.errors import UserError
 from mjx_cl.io import runtime
 
+if TYPE_CHECKING:
+  from collections.abc import Callable
 
-def make(name: str, mj_model, substeps: int, outputs: tuple[str, ...] = ("qpos", "qvel"), law=None):
+  import mujoco
+
+  from mjx_cl.physics.mjx import Mjx
+  from mjx_cl.physics.native import Native
+
+
+def make(
+  name: str,
+  mj_model: mujoco.MjModel,
+  substeps: int,
+  outputs: tuple[str, ...] = ("qpos", "qvel"),
+  law: Callable[..., Any] | None = None,
+) -> Mjx | Native:
   """Builds a backend. `auto` is `runtime.default_physics()`."""
   if name == "auto":
     name = runtime.default_physics()
@@ -35,7 +53,7 @@ def make(name: str, mj_model, substeps: int, outputs: tuple[str, ...] = ("qpos",
   raise UserError(f"unknown physics {name!r}; choose from: auto, native, mjx")
 
 
-def leaves(mj_model, *names: str, backend=None) -> dict:
+def leaves(mj_model: mujoco.MjModel, *names: str, backend: Any = None) -> dict:
   """Nominal values of model fields as float32 arrays, for types.Model.mj; `gravity` is mjOption's.
 
   Fields that `backend` names as `inert`, because they do nothing there, are left out.

@@ -20,10 +20,14 @@ import functools
 import threading
 import traceback
 import weakref
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jaxlib
 import numpy as np
+
+if TYPE_CHECKING:
+  from collections.abc import Callable
 
 TARGET = "mjx_cl_host"
 TESTED = "0.9.2"  # the jaxlib whose struct layouts these are
@@ -35,7 +39,7 @@ _METADATA, _EXECUTE, _INTERNAL = (
 _P, _N = ctypes.c_void_p, ctypes.c_size_t
 
 
-def _struct(*fields):
+def _struct(*fields: tuple[str, Any]) -> Any:
   """A struct of the interface: its size, its extensions, then `fields`."""
   return type(
     "Struct", (ctypes.Structure,), {"_fields_": [("struct_size", _N), ("extension", _P), *fields]}
@@ -48,7 +52,7 @@ _Metadata = type(
   (ctypes.Structure,),
   {"_fields_": [("struct_size", _N), ("version", _Version), ("traits", ctypes.c_uint32)]},
 )
-_Extension = type(
+_Extension: Any = type(
   "Extension",
   (ctypes.Structure,),
   {
@@ -96,18 +100,18 @@ _lock = threading.Lock()
 _BETWEEN = "|"  # in an attribute: between name and word
 
 
-def _array(buffer: _Buffer) -> np.ndarray:
+def _array(buffer: Any) -> np.ndarray:
   """The buffer's numbers, uint32, without a copy."""
   shape = buffer.dims[: buffer.rank]
   size = 4 * int(np.prod(shape, dtype=np.int64))
   return (
-    np.frombuffer((ctypes.c_char * size).from_address(buffer.data), np.uint32).reshape(shape)
+    np.frombuffer((ctypes.c_char * size).from_address(buffer.data), np.uint32).reshape(shape)  # type: ignore[call-overload]
     if size
     else np.zeros(shape, np.uint32)
   )
 
 
-def _look_up(name: str, word: str):
+def _look_up(name: str, word: str) -> Callable[[np.ndarray], np.ndarray]:
   function = _functions.get(name)
   if function is None:
     raise LookupError(
@@ -116,7 +120,7 @@ def _look_up(name: str, word: str):
   return functools.partial(function, word)
 
 
-def _run(frame) -> None:
+def _run(frame: Any) -> None:
   """One call: the function named by the only attribute, on the only operand."""
   span = frame.attributes.at[0].contents
   name, _, word = ctypes.string_at(span.data, span.size).decode().partition(_BETWEEN)
@@ -126,7 +130,7 @@ def _run(frame) -> None:
 
 
 @ctypes.CFUNCTYPE(_P, ctypes.POINTER(_Frame))
-def _handler(pointer):
+def _handler(pointer: Any) -> int | None:
   """XLA_FFI_Handler: null, or an XLA_FFI_Error."""
   frame = pointer.contents
   if frame.extension:
@@ -161,7 +165,7 @@ def _register() -> bool:
   return True
 
 
-def shared(name: str, make):
+def shared(name: str, make: Callable[[], Any]) -> Any:
   """What is registered under `name`, or else `make()`, registered for as long as someone holds it:
   a function (word, uint32 array) -> uint32 array.
   """

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +13,9 @@ import numpy as np
 
 from mjx_cl.errors import UserError
 from mjx_cl.physics.fields import DERIVING
+
+if TYPE_CHECKING:
+  from collections.abc import Callable
 
 with contextlib.redirect_stdout(
   io.StringIO()
@@ -31,8 +35,8 @@ class Mjx:
     mj_model: mujoco.MjModel,
     substeps: int,
     outputs: tuple[str, ...] = ("qpos", "qvel"),
-    law=None,
-  ):
+    law: Callable[..., Any] | None = None,
+  ) -> None:
     self.mj_model, self.substeps, self.outputs, self.law = mj_model, substeps, tuple(outputs), law
     # MJX decides at compile time which constraints exist
     self.inert = () if (mj_model.dof_frictionloss > 0).any() else ("dof_frictionloss",)
@@ -40,13 +44,13 @@ class Mjx:
     self._model = _anywhere(mjx.put_model(mj_model, impl="jax"))
     self._data = _anywhere(mjx.make_data(mj_model, impl="jax"))
 
-  def init(self, qpos: jax.Array, qvel: jax.Array):
+  def init(self, qpos: jax.Array, qvel: jax.Array) -> mjx.Data:
     """mjx.Data at qpos (nq,), qvel (nv,)."""
     return self._data.replace(
       qpos=jnp.asarray(qpos, jnp.float32), qvel=jnp.asarray(qvel, jnp.float32)
     )
 
-  def model(self, fields: dict[str, jax.Array]):
+  def model(self, fields: dict[str, jax.Array]) -> mjx.Model:
     """The mjx.Model with `fields` in place of its own, and the constants that follow from them.
 
     Raises:
@@ -66,7 +70,7 @@ class Mjx:
       model = model.replace(**self.derived(model))
     return model
 
-  def derived(self, model) -> dict[str, jax.Array]:
+  def derived(self, model: mjx.Model) -> dict[str, jax.Array]:
     """What mj_setConst recomputes of masses and MJX uses, in pure JAX at qpos0: no interpolation,
     so faults of mass may be combined.
 
@@ -105,7 +109,14 @@ class Mjx:
       "body_invweight0": jnp.stack(weights),
     }
 
-  def step(self, fields: dict[str, jax.Array], state, ctrl: jax.Array, task=None, force=None):
+  def step(
+    self,
+    fields: dict[str, jax.Array],
+    state: mjx.Data,
+    ctrl: jax.Array,
+    task: dict[str, jax.Array] | None = None,
+    force: jax.Array | None = None,
+  ) -> tuple[mjx.Data, dict[str, jax.Array]]:
     """`substeps` physics steps of one robot, see `Native.step`."""
     model = self.model(fields)
     if force is not None:
@@ -118,9 +129,11 @@ class Mjx:
       )
     else:
 
-      def one(carry, _):
+      def one(
+        carry: tuple[mjx.Data, jax.Array, jax.Array], _: None
+      ) -> tuple[tuple[mjx.Data, jax.Array, jax.Array], None]:
         d = carry[0]
-        actuators = jnp.asarray(self.law(jnp, task, ctrl, d.qpos, d.qvel), d.ctrl.dtype)
+        actuators = jnp.asarray(self.law(jnp, task, ctrl, d.qpos, d.qvel), d.ctrl.dtype)  # type: ignore[misc]
         return (mjx.step(model, d.replace(ctrl=actuators)), actuators, d.qvel), None
 
       (state, actuators, before), _ = jax.lax.scan(
@@ -132,7 +145,7 @@ class Mjx:
     return state, {o: getattr(state, o) for o in self.outputs} | extra
 
 
-def _anywhere(tree):
+def _anywhere(tree: Any) -> Any:
   """The same arrays, bound to no device. MJX binds its own, which binds all that a step returns: a
   program called with what it returned itself would be compiled a second time, for bound arguments,
   and robots could not be sharded.
@@ -140,7 +153,7 @@ def _anywhere(tree):
   return jax.tree.map(lambda x: jnp.asarray(np.asarray(x)), tree)
 
 
-def _below(model, body: int, root: int) -> bool:
+def _below(model: mujoco.MjModel, body: int, root: int) -> bool:
   """Whether `body` is `root` or hangs on it."""
   while body != root and body:
     body = model.body_parentid[body]

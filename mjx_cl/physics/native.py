@@ -16,6 +16,7 @@ import threading
 import time
 import types
 import uuid
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +26,9 @@ import numpy as np
 from mjx_cl.errors import UserError
 from mjx_cl.physics import host_call
 from mjx_cl.physics.fields import DERIVING
+
+if TYPE_CHECKING:
+  from collections.abc import Callable
 
 
 def float64_bits(x: jax.Array) -> jax.Array:
@@ -43,7 +47,9 @@ def float64_bits(x: jax.Array) -> jax.Array:
   return jnp.stack([low, high], -1).reshape(-1)
 
 
-def identity(mj_model: mujoco.MjModel, substeps: int, outputs: tuple[str, ...], law) -> str:
+def identity(
+  mj_model: mujoco.MjModel, substeps: int, outputs: tuple[str, ...], law: Callable[..., Any] | None
+) -> str:
   """A name for all that a host's results depend on: 32 hexadecimal digits, the same in every
   process, of the model's bytes, the arguments and the motor law.
 
@@ -61,7 +67,7 @@ def identity(mj_model: mujoco.MjModel, substeps: int, outputs: tuple[str, ...], 
   return digest.hexdigest()[:32]
 
 
-def _words(x):
+def _words(x: Any) -> tuple[Any, ...]:
   """What tells a motor law from another, or a value that it closes over."""
   if x is None or x is Ellipsis or isinstance(x, (bool, int, float, complex, str, bytes)):
     return (type(x).__name__, x)
@@ -104,8 +110,8 @@ class Native:
     mj_model: mujoco.MjModel,
     substeps: int,
     outputs: tuple[str, ...] = ("qpos", "qvel"),
-    law=None,
-  ):
+    law: Callable[..., Any] | None = None,
+  ) -> None:
     try:
       import mjbatch  # noqa: F401
     except ImportError:
@@ -146,8 +152,13 @@ class Native:
     )
 
   def step(
-    self, fields: dict[str, jax.Array], state: jax.Array, ctrl: jax.Array, task=None, force=None
-  ):
+    self,
+    fields: dict[str, jax.Array],
+    state: jax.Array,
+    ctrl: jax.Array,
+    task: dict[str, jax.Array] | None = None,
+    force: jax.Array | None = None,
+  ) -> tuple[jax.Array, dict[str, jax.Array]]:
     """`substeps` x mj_step of one robot; a vmap of it steps all robots in one call on all threads.
 
     Everything crosses to the host and back as one array of bits each way: one operand, whatever the
@@ -189,7 +200,13 @@ class Host:
     seconds: spent in calls.
   """
 
-  def __init__(self, mj_model: mujoco.MjModel, substeps: int, outputs: tuple[str, ...], law):
+  def __init__(
+    self,
+    mj_model: mujoco.MjModel,
+    substeps: int,
+    outputs: tuple[str, ...],
+    law: Callable[..., Any] | None,
+  ) -> None:
     import mjbatch
 
     self._mjbatch = mjbatch
@@ -203,7 +220,7 @@ class Host:
     self.shapes = {o: np.shape(getattr(data, o)) for o in outputs}
     if law is not None:
       self.shapes |= {"ctrl": (mj_model.nu,), "qvel_before": (mj_model.nv,)}
-    self._batches: dict[int, object] = {}
+    self._batches: dict[tuple[int, tuple[str, ...], bool], tuple[Any, dict[str, np.ndarray]]] = {}
     self._lock = threading.Lock()
     self.seconds = 0.0
 
@@ -229,7 +246,14 @@ class Host:
       [rows] + [out[o].reshape(lead + (-1,)).view(np.uint32) for o in self.shapes], -1
     )
 
-  def step(self, fields, state, ctrl, task=None, force=None):
+  def step(
+    self,
+    fields: dict[str, np.ndarray],
+    state: np.ndarray,
+    ctrl: np.ndarray,
+    task: dict[str, np.ndarray] | None = None,
+    force: np.ndarray | None = None,
+  ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """`Native.step` on NumPy arrays with any leading axes: (rows, {output: float32})."""
     begin = time.perf_counter()
     state = np.asarray(state)
@@ -266,7 +290,9 @@ class Host:
       self.seconds += time.perf_counter() - begin
       return rows, out | extra
 
-  def _write_fields(self, batch, views, fields, num: int) -> None:
+  def _write_fields(
+    self, batch: Any, views: dict[str, np.ndarray], fields: dict[str, np.ndarray], num: int
+  ) -> None:
     """Model fields of every robot, in double precision where they are the nominal ones; constants
     derived of a changed mass are renewed.
     """
@@ -288,7 +314,9 @@ class Host:
     if stale.any():
       batch.set_const(np.flatnonzero(stale))
 
-  def _batch(self, num: int, fields: tuple[str, ...], force: bool):
+  def _batch(
+    self, num: int, fields: tuple[str, ...], force: bool
+  ) -> tuple[Any, dict[str, np.ndarray]]:
     key = (num, fields, force)
     if key not in self._batches:
       batch = self._mjbatch.Batch(self.mj_model, num, forward=self._forward)

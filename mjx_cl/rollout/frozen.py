@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,8 +14,11 @@ from mjx_cl.keys import OfSeed
 from mjx_cl.rollout.monitor import Monitor
 from mjx_cl.rollout.scan import Rollout, nest, start
 
+if TYPE_CHECKING:
+  from collections.abc import Callable, Iterable
 
-def stream_keys(seeds, streams: int) -> jax.Array:
+
+def stream_keys(seeds: Iterable[int], streams: int) -> jax.Array:
   """Keys of `streams` streams for each seed, (len(seeds) * streams,); the first of a seed is the
   one that `run` uses.
   """
@@ -26,16 +31,16 @@ def stream_keys(seeds, streams: int) -> jax.Array:
 
 
 def record(
-  env,
-  trained,
-  keys,
+  env: Any,
+  trained: Any,
+  keys: jax.Array,
   steps: int,
   fault: str = "none",
   severity: float = 0.0,
   onset: int = 0,
   target: int = -1,
   form: str = "paper",
-  progress=lambda done, steps: None,
+  progress: Callable[[int, int], Any] = lambda done, steps: None,
 ) -> dict[str, np.ndarray]:
   """Acts with a frozen agent and returns its residual streams.
 

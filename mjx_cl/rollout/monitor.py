@@ -16,7 +16,7 @@ the steps left; fewer than
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +25,10 @@ import numpy as np
 from mjx_cl.dreamer import rssm
 from mjx_cl.errors import UserError
 from mjx_cl.types import Spec, Var
+
+if TYPE_CHECKING:
+  from mjx_cl.dreamer.agent import Agent
+  from mjx_cl.rollout.scan import Row
 
 GROUPS = 8  # parts of the observation with a residual of their own
 LATENT = 16  # dimensions of the latent's projection
@@ -77,7 +81,7 @@ def unknown(leading: tuple[int, ...], variables: int) -> Residual:
   )
 
 
-def watched(spec) -> tuple[tuple[str, tuple[int, ...]], ...]:
+def watched(spec: Spec) -> tuple[tuple[str, tuple[int, ...]], ...]:
   """(name, indices) of the eight parts: `spec.watched`, or the observation in eight stretches of
   about equal length.
   """
@@ -119,13 +123,13 @@ class Monitor:
 
   def __init__(
     self,
-    agent,
+    agent: Agent,
     n: int = 15,
     form: str = "paper",
     actions: str = "recorded",
     least: int = 5,
-    spec=None,
-  ):
+    spec: Spec | None = None,
+  ) -> None:
     if form not in ("paper", "streaming"):
       raise UserError(f"unknown residual form {form!r}; choose from: paper, streaming")
     if actions not in ("recorded", "policy"):
@@ -162,7 +166,9 @@ class Monitor:
       zeros().astype(bool),
     )
 
-  def update(self, params, history: History, rows, keys: jax.Array):
+  def update(
+    self, params: Any, history: History, rows: Row, keys: jax.Array
+  ) -> tuple[History, Residual]:
     """Residuals of one chunk.
 
     Args:
@@ -191,7 +197,9 @@ class Monitor:
     )
     return self._last(history, seq), residual
 
-  def update_each(self, params, history: History, rows, keys: jax.Array):
+  def update_each(
+    self, params: Any, history: History, rows: Row, keys: jax.Array
+  ) -> tuple[History, Residual]:
     """`update` with a key for each member, (groups, members): no member's residuals depend on which
     others there are, but for the last digit.
     """
@@ -199,11 +207,11 @@ class Monitor:
     each = lambda h, r, k: self.update(params, alone(h), alone(r), k)
     return jax.tree.map(lambda x: x[:, :, :, 0], jax.vmap(each, (2, 2, 1), 2)(history, rows, keys))
 
-  def remember(self, history: History, rows) -> History:
+  def remember(self, history: History, rows: Row) -> History:
     """The history after a chunk, as `update` gives it, without looking."""
     return self._last(history, self._join(history, rows))
 
-  def _join(self, history: History, rows) -> History:
+  def _join(self, history: History, rows: Row) -> History:
     done = rows.terminated | rows.truncated
     chunk = History(
       rows.deter, rows.stoch, rows.action, rows.final_obs, rows.reward, done, jnp.ones_like(done)
@@ -213,7 +221,9 @@ class Monitor:
   def _last(self, history: History, seq: History) -> History:
     return jax.tree.map(lambda x: x[-(self.n - 1) :], seq) if self.n > 1 else history
 
-  def _group(self, params, seq: History, key):
+  def _group(
+    self, params: Any, seq: History, key: jax.Array
+  ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
     """One parameter set; seq has leading (n - 1 + T, members)."""
     n, total, members = self.n, seq.done.shape[0], seq.done.shape[1]
     rows = total - n + 1
@@ -251,7 +261,9 @@ class Monitor:
     mean = jnp.where(good[..., None], mean, jnp.nan)
     return jnp.mean(mean[..., :-1], -1), mean[..., -1], mean[..., :-1], good
 
-  def _look(self, params, obs, deter, stoch):
+  def _look(
+    self, params: Any, obs: jax.Array, deter: jax.Array, stoch: jax.Array
+  ) -> tuple[jax.Array, jax.Array]:
     """Surprise [nats] and projected latent (16,) of decisions: obs (..., O), deter (..., D), stoch
     (..., stoch) int.
     """

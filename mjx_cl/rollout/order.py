@@ -15,6 +15,8 @@ with five 60 % more.
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import numpy as np
 
@@ -34,7 +36,7 @@ class Lanes:
       plain: streams lie in their own order.
   """
 
-  def __init__(self, arms: int, seeds: int, backend: str | None = None):
+  def __init__(self, arms: int, seeds: int, backend: str | None = None) -> None:
     self.plain = arms == 1 or arms * seeds <= ALIKE or (backend or jax.default_backend()) != "cpu"
     width = 1 if self.plain else 1 << (arms - 1).bit_length()
     self.order = (
@@ -44,14 +46,14 @@ class Lanes:
     )
     self.place = np.array([int(np.argmax(self.order == stream)) for stream in range(arms * seeds)])
 
-  def spread(self, tree):
+  def spread(self, tree: Any) -> Any:
     """Leaves (streams, ...) -> (lanes, ...)."""
     return tree if self.plain else jax.tree.map(lambda x: x[self.order], tree)
 
-  def gather(self, tree):
+  def gather(self, tree: Any) -> Any:
     """Leaves (lanes, ...) -> (streams, ...)."""
     return tree if self.plain else jax.tree.map(lambda x: x[self.place], tree)
 
-  def gather_rows(self, tree):
+  def gather_rows(self, tree: Any) -> Any:
     """Leaves (T, lanes, ...) -> NumPy (T, streams, ...)."""
     return tree if self.plain else jax.tree.map(lambda x: np.asarray(x)[:, self.place], tree)

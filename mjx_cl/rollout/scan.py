@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +20,13 @@ from mjx_cl.dreamer.agent import Carry
 from mjx_cl.dreamer.replay import Record
 from mjx_cl.keys import OfStep
 from mjx_cl.types import EnvState
+
+if TYPE_CHECKING:
+  from collections.abc import Sequence
+
+  from jax.typing import ArrayLike
+
+  from mjx_cl.types import Step
 
 STRETCH = 16  # control steps under one random action, where a robot is shaken
 
@@ -76,14 +83,14 @@ class Row(NamedTuple):
 
 
 def start(
-  env,
-  agent,
-  fault,
+  env: Any,
+  agent: Any,
+  fault: faults_lib.Fault | tuple[faults_lib.Fault, ...],
   key: jax.Array,
-  severity=0.0,
-  onset=0,
-  duration=faults_lib.FOREVER,
-  target=-1,
+  severity: ArrayLike | Sequence[float] = 0.0,
+  onset: ArrayLike | Sequence[float] = 0,
+  duration: ArrayLike | Sequence[float] = faults_lib.FOREVER,
+  target: jax.Array | int = -1,
   plan: faults_lib.Plan | None = None,
 ) -> Stream:
   """A fresh stream; its robot, fault target and every later draw come from `key`.
@@ -122,7 +129,7 @@ def start(
   )
 
 
-def nest(function: Callable, in_axes_group, in_axes_member) -> Callable:
+def nest(function: Callable, in_axes_group: Any, in_axes_member: Any) -> Callable:
   """Vmap over groups, then over members."""
   return jax.vmap(jax.vmap(function, in_axes_member), in_axes_group)
 
@@ -140,20 +147,22 @@ class Rollout:
 
   def __init__(
     self,
-    env,
-    agent,
-    fault,
+    env: Any,
+    agent: Any,
+    fault: faults_lib.Fault | tuple[faults_lib.Fault, ...],
     repeat: int = 1,
     deterministic: bool = False,
-    expert=None,
+    expert: Callable[[Stream], jax.Array] | None = None,
     expert_noise: float = 0.0,
-  ):
+  ) -> None:
     self.env, self.agent, self.fault, self.repeat = env, agent, fault, repeat
     self.model = faults_lib.owned_model(faults_lib.as_tuple(fault), env.model)
     self.deterministic, self.expert, self.expert_noise = deterministic, expert, expert_noise
     self.chunk = functools.partial(jax.jit, static_argnames=("length",))(self._chunk)
 
-  def _decide(self, params, stream: Stream, drive, shake):
+  def _decide(
+    self, params: Any, stream: Stream, drive: jax.Array, shake: jax.Array | None
+  ) -> tuple[Carry, jax.Array, jax.Array, jax.Array]:
     key = jax.random.fold_in(stream.key, stream.t)
     key_act, key_expert = jax.random.split(jax.random.fold_in(key, OfStep.ACT))
     carry, action = self.agent.act(params, stream.agent, stream.obs, key_act, self.deterministic)
@@ -172,7 +181,7 @@ class Rollout:
       carry = carry._replace(action=action)
     return carry, action, demo, has_demo
 
-  def _control(self, stream: Stream, action):
+  def _control(self, stream: Stream, action: jax.Array) -> tuple[Any, Step, jax.Array]:
     """One control step of one robot under its faults."""
     now = jax.random.fold_in(stream.key, stream.t)
     injection, ports, severity = self._drive(stream, now, action)
@@ -192,13 +201,22 @@ class Rollout:
       jnp.max(severity),
     )
 
-  def _drive(self, stream: Stream, now, action):
+  def _drive(
+    self, stream: Stream, now: jax.Array, action: jax.Array
+  ) -> tuple[faults_lib.Injection, faults_lib.Ports, jax.Array]:
     ports = faults_lib.Ports(self.model, ctrl=action, first=stream.first)
     return faults_lib.drive(
       self.fault, stream.injection, stream.t, jax.random.fold_in(now, OfStep.FAULTS), ports
     )
 
-  def _chunk(self, params, streams: Stream, length: int, drive=None, shake=None):
+  def _chunk(
+    self,
+    params: Any,
+    streams: Stream,
+    length: int,
+    drive: jax.Array | None = None,
+    shake: jax.Array | None = None,
+  ) -> tuple[Any, Row]:
     """`length` decisions.
 
     Args:
@@ -218,7 +236,7 @@ class Rollout:
     control = nest(self._control, (0, 0), (0, 0))
     params = jax.vmap(self.agent.prepare)(params)
 
-    def step(streams: Stream, _):
+    def step(streams: Stream, _: Any) -> tuple[Stream, Row]:
       carry, action, demo, has_demo = decide(params, streams, drive, shake)
       before = streams
       streams, out, severity = control(streams, action)
@@ -266,10 +284,10 @@ class Rollout:
 
     return jax.lax.scan(step, streams, None, length=length)
 
-  def _reset(self, streams: Stream, done):
+  def _reset(self, streams: Stream, done: jax.Array) -> Stream:
     """Starts a new episode where `done`; keys fold in the step, so a reset is reproducible."""
 
-    def one(stream: Stream, done):
+    def one(stream: Stream, done: jax.Array) -> Stream:
       now = jax.random.fold_in(stream.key, stream.t)
       _, ports, _ = self._drive(
         stream, now, jnp.zeros(len(self.env.spec.act))
@@ -336,7 +354,7 @@ def records(rows: Row) -> tuple[Record, jax.Array]:
     none,
   )
 
-  def weave(a, b):
+  def weave(a: jax.Array, b: jax.Array) -> jax.Array:
     x = jnp.stack([a, b], 1).reshape((-1,) + a.shape[1:])  # (2 T, groups, members, ...)
     return jnp.moveaxis(x, 0, 2)
 

@@ -9,7 +9,7 @@ is kept.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +20,11 @@ from mjx_cl.dreamer.agent import Carry
 from mjx_cl.errors import UserError
 from mjx_cl.rollout.scan import Rollout, Row, Stream, expand, start
 from mjx_cl.types import EnvState
+
+if TYPE_CHECKING:
+  from jax.typing import ArrayLike
+
+  from mjx_cl.types import Step
 
 
 class Arrival(NamedTuple):
@@ -64,8 +69,8 @@ class Arriving(Rollout):
   so that the next one begins by the ordinary reset.
   """
 
-  def _control(self, stream: Arrival, action):
-    later, out, severity = super()._control(stream, action)
+  def _control(self, stream: Arrival, action: jax.Array) -> tuple[Any, Step, jax.Array]:  # type: ignore[override]
+    later, out, severity = super()._control(stream, action)  # type: ignore[arg-type]
     waits = stream.t < stream.enter
     env = jax.tree.map(lambda rest, moved: jnp.where(waits, rest, moved), stream.env, later.env)
     out = out._replace(
@@ -98,7 +103,15 @@ class Transfer:
     UserError for another `repeat`, or robots that differ in what the agent sees or does.
   """
 
-  def __init__(self, before, after, agent, faults, repeat: int = 1, deterministic: bool = False):
+  def __init__(
+    self,
+    before: Any,
+    after: Any,
+    agent: Any,
+    faults: tuple[faults_lib.Fault, ...],
+    repeat: int = 1,
+    deterministic: bool = False,
+  ) -> None:
     if repeat != 1:
       raise UserError(
         "a change of robots needs an agent that decides in every control step; this one holds "
@@ -118,7 +131,9 @@ class Transfer:
     self.after = Arriving(after, agent, faults, 1, deterministic)
     self._part, self._merge = jax.jit(part), jax.jit(merge)
 
-  def start(self, key: jax.Array, target, plan, due) -> Moving:
+  def start(
+    self, key: jax.Array, target: jax.Array | int, plan: faults_lib.Plan, due: ArrayLike
+  ) -> Moving:
     """A fresh stream. key, target, plan: see rollout.start, of the faults of `after`. due: int32
     (), see Arrival; FOREVER: never changes.
     """
@@ -126,7 +141,7 @@ class Transfer:
     after = start(self.after.env, self.agent, self.after.fault, key, target=target, plan=plan)
     return Moving(before, Arrival(*after, jnp.int32(due), jnp.int32(faults_lib.FOREVER)))
 
-  def chunk(self, params, streams: Moving, length: int) -> tuple[Moving, Row]:
+  def chunk(self, params: Any, streams: Moving, length: int) -> tuple[Moving, Row]:
     """`length` decisions of every stream: (streams', Row with leading (length, groups, members)).
     Runs on the host.
     """

@@ -22,7 +22,7 @@ class BraxEnv(base.Env):
     **settings: FaultSettings.
   """
 
-  def __init__(self, env: Any, fault: str | None = None, **settings: Any):
+  def __init__(self, env: Any, fault: str | None = None, **settings: Any) -> None:
     self.env, self.faulty = env, fault is not None
     self.rollout, self._begin = join(env, fault=fault or "none", **settings)
 
@@ -33,7 +33,7 @@ class BraxEnv(base.Env):
       state, obs = self.env.init(self.env.model, rng)
       return base.State(state, obs, zero, zero, {})
     stream = self._begin(rng)
-    info = {"stream": stream._replace(env=()), "severity": zero}
+    info = {"stream": stream._replace(env=()), "severity": zero}  # type: ignore[arg-type]
     return base.State(stream.env, stream.obs, zero, zero, {}, info)
 
   def step(self, state: base.State, action: jax.Array) -> base.State:

@@ -32,7 +32,7 @@ class Puppet:
   x U(-1, 1): 0 is no command at all.
   """
 
-  def __init__(self, act_size: int, spread: float = 0.0):
+  def __init__(self, act_size: int, spread: float = 0.0) -> None:
     self.act_size, self.spread = act_size, spread
     self.size = types.SimpleNamespace(stoch=1, classes=1)
 
@@ -154,7 +154,9 @@ class Robots:
     untouched: bool (num,), no control step since the last reset.
   """
 
-  def __init__(self, env: Any, physics: str, num: int, **fault: Any):
+  streams: Stream | Any
+
+  def __init__(self, env: Any, physics: str, num: int, **fault: Any) -> None:
     self._made = (env, physics, num), fault
     self.env, self.num = envs.make(env, physics) if isinstance(env, str) else env, num
     self.rollout, begin = join(self.env, **fault)
@@ -176,8 +178,8 @@ class Robots:
 
   def __setstate__(self, state: dict[str, Any]) -> None:
     place, fault = state["made"]
-    self.__init__(*place, **fault)
-    back = lambda x: jax.random.wrap_key_data(x.data) if isinstance(x, _Bits) else jnp.asarray(x)
+    self.__init__(*place, **fault)  # type: ignore[misc]
+    back = lambda x: jax.random.wrap_key_data(x.data) if isinstance(x, _Bits) else jnp.asarray(x)  # type: ignore[arg-type]
     self.streams = jax.tree.map(back, state["streams"], is_leaf=lambda x: isinstance(x, _Bits))
     self.untouched = state["untouched"]
 
@@ -193,7 +195,9 @@ class Robots:
     self.untouched = np.ones(self.num, bool)
     return np.array(self.streams.obs[0])
 
-  def step(self, actions: np.ndarray, pending: Sequence[bool]) -> tuple[np.ndarray, ...]:
+  def step(
+    self, actions: np.ndarray, pending: Sequence[bool] | np.ndarray
+  ) -> tuple[np.ndarray, ...]:
     """One control step of all robots but those `pending`, which get a new episode in its place
     while their fault clock stands still.
 

@@ -27,7 +27,9 @@ class GymnasiumEnv(gymnasium.Env):
     **fault: FaultSettings.
   """
 
-  def __init__(self, env: Any, seed: int = 0, physics: str = "auto", **fault: Any):
+  action_space: Box
+
+  def __init__(self, env: Any, seed: int = 0, physics: str = "auto", **fault: Any) -> None:
     self.robots, self._seed = Robots(env, physics, 1, **fault), seed
     spec = self.robots.env.spec
     self.metadata = {"render_modes": [], "render_fps": 1.0 / spec.control_s}
@@ -62,9 +64,11 @@ class GymnasiumVector(gymnasium.vector.VectorEnv):
     **fault: FaultSettings.
   """
 
+  action_space: Box
+
   def __init__(
     self, env: Any, num_envs: int = 1, seed: int = 0, physics: str = "auto", **fault: Any
-  ):
+  ) -> None:
     if num_envs < 1:
       raise UserError(f"num_envs must be above 0; got {num_envs}")
     self.robots, self.num_envs, self._seed = Robots(env, physics, num_envs, **fault), num_envs, seed
@@ -76,7 +80,7 @@ class GymnasiumVector(gymnasium.vector.VectorEnv):
     }
     self.single_observation_space, self.single_action_space = _box(spec.obs), _box(spec.act)
     self.observation_space = batch_space(self.single_observation_space, num_envs)
-    self.action_space = batch_space(self.single_action_space, num_envs)
+    self.action_space = batch_space(self.single_action_space, num_envs)  # type: ignore[assignment]
     self._pending = np.zeros(num_envs, bool)
 
   def reset(
@@ -89,7 +93,7 @@ class GymnasiumVector(gymnasium.vector.VectorEnv):
     if seed is None:
       return self.robots.reset(), {}
     one = isinstance(seed, (int, np.integer))
-    seeds = [seed + i for i in range(self.num_envs)] if one else list(seed)
+    seeds = [seed + i for i in range(self.num_envs)] if one else list(seed)  # type: ignore[arg-type, operator]
     if len(seeds) != self.num_envs:
       raise UserError(
         f"give one seed, or one for each of the {self.num_envs} robots; got {len(seeds)}"
