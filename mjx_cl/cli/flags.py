@@ -47,7 +47,7 @@ class Train:
   preset: str = "cpu"
   """Learner and schedule, see `mjx-cl list presets`."""
   demonstrator: str | None = None
-  default: none.
+  """A policy's .npz, `reference`: the robot's own driver (car), or `ppo`: train one with brax;
   default: none.
   """
   agent: str | None = None
