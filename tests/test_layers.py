@@ -14,7 +14,9 @@ ROOT = pathlib.Path(mjx_cl.__file__).parent
 
 
 def imports(root: pathlib.Path) -> dict[str, set[str]]:
-  """{module: modules of the same package that it names in an import, anywhere in its file}."""
+  """{module: modules of the same package that it names in an import, anywhere in its file but
+  below `if TYPE_CHECKING`, which never runs}.
+  """
   name = lambda p: ".".join(p.relative_to(root.parent).with_suffix("").parts).removesuffix(
     ".__init__"
   )
@@ -22,7 +24,16 @@ def imports(root: pathlib.Path) -> dict[str, set[str]]:
   for module, path in files.items():
     named = set()
     package = module if path.name == "__init__.py" else module.rpartition(".")[0]
-    for node in ast.walk(ast.parse(path.read_text())):
+    tree = ast.parse(path.read_text())
+    unread = {
+      id(inner)
+      for node in ast.walk(tree)
+      if isinstance(node, ast.If) and getattr(node.test, "id", "") == "TYPE_CHECKING"
+      for inner in ast.walk(node)
+    }
+    for node in ast.walk(tree):
+      if id(node) in unread:
+        continue
       if isinstance(node, ast.Import):
         named |= {a.name for a in node.names}
       elif isinstance(node, ast.ImportFrom):

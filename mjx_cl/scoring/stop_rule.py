@@ -429,7 +429,7 @@ def _relive(
         state,
         signals,
         posture,
-        False,
+        False,  # type: ignore[arg-type]
         since,
         now,
         False,

@@ -502,7 +502,7 @@ class Trainer:
     drawn: that follows from its key and its clock.
     """
     key = jax.random.fold_in(jax.random.fold_in(stream.key, OfStream.TRAINING_FAULT), stream.t)
-    fresh = faults.begin(self.fault, key, self._drawn(key), self.target)
+    fresh = faults.begin(self.fault, key, self._drawn(key), self.target)  # type: ignore[arg-type]
     return stream._replace(
       injection=jax.tree.map(
         lambda a, b: jnp.where(ended, jnp.asarray(a, b.dtype), b), fresh, stream.injection
