@@ -434,8 +434,8 @@ def test_parts_run_once_go_on_and_merge(mjx, refused, mini, tmp_path, monkeypatc
   monkeypatch.setattr(
     run.Runner,
     "__init__",
-    lambda self, config, folder: (
-      begun.append(pathlib.Path(folder).name) or init(self, config, folder)
+    lambda self, config, folder, programs=None: (
+      begun.append(pathlib.Path(folder).name) or init(self, config, folder, programs)
     ),
   )
 
@@ -570,7 +570,7 @@ def test_an_agent_by_folder_is_read_anew_when_it_is_written_anew(saved, tmp_path
   config = RunConfig("car", agent=str(folder))
   first = merge.cards(config)["agent_card"]
   (folder / "card.json").write_text(json.dumps(first | {"seed": 5}))
-  assert folders.differing(merge.cards(config)["agent_card"], first, deep=True) == ["seed"]
+  assert folders.differing(first, merge.cards(config)["agent_card"], deep=True) == ["seed"]
 
 
 @pytest.mark.parametrize(
