@@ -26,6 +26,7 @@ from mjx_cl.cli import app, commands, display
 from mjx_cl.config import PRESETS, RunConfig
 from mjx_cl.errors import FileError
 from mjx_cl.faults import presets
+from mjx_cl.io import folders
 from mjx_cl.io import tables as store
 from mjx_cl.runs import run
 from mjx_cl.sizes import SIZES
@@ -584,7 +585,7 @@ def full(*_, **__):
 
 
 def test_a_full_disk_at_the_start_is_one_line(refused, saved, tmp_path, monkeypatch):  # noqa: F811
-  monkeypatch.setattr(store, "open", full, raising=False)
+  monkeypatch.setattr(folders, "open", full, raising=False)
   assert "No space left" in refused(
     1, "run", "walker", "--agent", saved, "--seeds", "1", "--out", tmp_path / "out"
   )
@@ -605,7 +606,7 @@ def test_a_full_disk_at_a_checkpoint_is_one_line(mjx, begun, monkeypatch):
   monkeypatch.setattr(run.np, "savez", full)
   code, _, err = mjx(*argv, "--resume")
   *_, last = err.splitlines()
-  assert code == 1 and last.startswith("mjx-cl: ") and "No space left" in last and "intact" in last
+  assert code == 1 and last.startswith("mjx-cl: ") and "No space left" in last and "unchanged" in last
   assert content(out) == before
 
 
