@@ -16,6 +16,7 @@ from mjx_cl.config import AdaptConfig, RunConfig
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.faults.presets import changes
 from mjx_cl.io import folders, plugins, tables
+from mjx_cl.runs.settings import check
 from mjx_cl.scoring import stop_rule
 from mjx_cl.training import agents
 
@@ -73,6 +74,7 @@ def identity(config: RunConfig) -> dict:
   `oracle_stops` that its arms are told, and the SHA-256 of the `files` that robot, fault or
   detector stand in.
   """
+  config = check(config)  # one that was built by hand may lack what follows from the others
   found, told = threshold_of(config), stop_rule.told(config)
   sources = {
     name: plugins.file_of(name)

@@ -606,7 +606,9 @@ def test_a_full_disk_at_a_checkpoint_is_one_line(mjx, begun, monkeypatch):
   monkeypatch.setattr(run.np, "savez", full)
   code, _, err = mjx(*argv, "--resume")
   *_, last = err.splitlines()
-  assert code == 1 and last.startswith("mjx-cl: ") and "No space left" in last and "unchanged" in last
+  assert (
+    code == 1 and last.startswith("mjx-cl: ") and "No space left" in last and "unchanged" in last
+  )
   assert content(out) == before
 
 

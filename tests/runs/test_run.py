@@ -764,7 +764,7 @@ class Stub:
 
   signals, notes = 0, []
 
-  def __init__(self, config, out):
+  def __init__(self, config, out, programs=None):
     self.chunk = 0
 
   def step(self):
