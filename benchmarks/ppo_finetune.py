@@ -50,6 +50,7 @@ from mjx_cl.errors import FileError, UserError  # noqa: E402
 from mjx_cl.faults.presets import becomes, changes  # noqa: E402
 from mjx_cl.io import tables  # noqa: E402
 from mjx_cl.rollout.scan import Rollout, nest, start  # noqa: E402
+from mjx_cl.runs.settings import check
 from mjx_cl.scoring import intervals, normalised_recovery, recovery  # noqa: E402
 from mjx_cl.training import demonstrator
 
@@ -163,13 +164,15 @@ def measure(args) -> dict:
   for name in ("lr", "epochs", "minibatches", "horizon"):
     if not getattr(args, name) > 0:
       raise UserError(f"{name} must be above 0; got {getattr(args, name)}")
-  config = RunConfig(
-    args.env,
-    fault=args.fault,
-    onset=args.onset,
-    steps=args.steps,
-    seeds=args.seeds,
-    first_seed=args.first_seed,
+  config = check(
+    RunConfig(
+      args.env,
+      fault=args.fault,
+      onset=args.onset,
+      steps=args.steps,
+      seeds=args.seeds,
+      first_seed=args.first_seed,
+    )
   )
   if becomes(config):
     raise UserError(
