@@ -12,9 +12,8 @@ import threading
 os.environ.setdefault(
   "MJX_CL_CACHE", str(pathlib.Path(tempfile.gettempdir()) / "mjx_cl_tests_cache")
 )  # shared by all runs and processes; XLA keys what it holds by the flags below
-# LLVM leaves programs as they are: nearly all of the tests' time is compiling, two fifths of it
-# with
-# this. Flags of one's own come later and win; processes that tests start inherit it.
+# LLVM leaves programs as they are, which shortens compiling. Flags of one's own come later and win;
+# processes that tests start inherit it.
 os.environ["XLA_FLAGS"] = (
   f"--xla_backend_optimization_level=0 {os.environ.get('XLA_FLAGS', '')}".rstrip()
 )

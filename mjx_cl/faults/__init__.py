@@ -169,7 +169,7 @@ def target_index(fault: Fault, target: str | None) -> int:
 def build(
   changes: Iterable[Change], env: Any, onset: int = 0
 ) -> tuple[tuple[Fault, ...], Plan, jax.Array]:
-  """The changes of a run (fault_presets.Change) on one robot.
+  """The changes of a run (presets.Change) on one robot.
 
   Returns:
     (faults, plan, targets): tuple of F Faults, Plan with leading (F,), int32 (F,); what

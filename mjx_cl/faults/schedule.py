@@ -1,5 +1,5 @@
 """When a fault acts: a factor in [0, 1] on its severity, as a pure function of the control step.
-`SCHEDULES` (fault_presets.py) is the one table.
+`SCHEDULES` (presets.py) is the one table.
 """
 
 from __future__ import annotations

@@ -129,10 +129,8 @@ def setup(devices: int = 1) -> None:
 
   Args:
     devices: as how many devices a CPU counts. A program that is sharded over them keeps the cores
-      busy with a share each, which a single program does only within its
-      larger products: ten seeds of a training take 0.59 to 0.73 of ten times one
-        (results/dreamer_update_xeon.json), 0.96 on one device. What is not sharded stays on the
-      first device and has all cores as before. A count in the user's own XLA_FLAGS or
+      busy with a share each, which a single program does only within its larger products. What is
+      not sharded stays on the first device and has all cores as before. A count in the user's own XLA_FLAGS or
       JAX_NUM_CPU_DEVICES is left as it is.
 
   Synchronous dispatch: a jax.pure_callback converts its arguments on a thread of the CPU client,

@@ -51,7 +51,7 @@ class Ledger(NamedTuple):
   Attributes:
     config: of the run. spec: of the robot. repeat: control steps of a decision. chunk_steps:
       control steps of a chunk.
-    changes: of fault_presets.Change, the faults. becomes: name of the robot that it turns into, or
+    changes: of presets.Change, the faults. becomes: name of the robot that it turns into, or
       None.
     labels: (arm, seed) of each stream. breaks: bool (groups,), whether its robot breaks. names: its
       fault and target, "none" where it is spared.
