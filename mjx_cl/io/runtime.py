@@ -130,8 +130,8 @@ def setup(devices: int = 1) -> None:
   Args:
     devices: as how many devices a CPU counts. A program that is sharded over them keeps the cores
       busy with a share each, which a single program does only within its larger products. What is
-      not sharded stays on the first device and has all cores as before. A count in the user's own XLA_FLAGS or
-      JAX_NUM_CPU_DEVICES is left as it is.
+      not sharded stays on the first device and has all cores as before. A count in the user's own
+      XLA_FLAGS or JAX_NUM_CPU_DEVICES is left as it is.
 
   Synchronous dispatch: a jax.pure_callback converts its arguments on a thread of the CPU client,
   and with asynchronous dispatch that conversion can wait for itself (jax issues 24255 and 25861).
