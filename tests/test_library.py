@@ -28,7 +28,7 @@ def test_robot_fault_detector_and_agent_by_name():
   fault = mjx_cl.make_fault("gear", env)
   assert "right_hip" in fault.targets and env.spec.name == "walker"
   trained = mjx_cl.load_agent("walker")
-  assert jax.tree.leaves(trained.state.params) and trained.card["env"] == "walker"
+  assert jax.tree.leaves(trained.train.params) and trained.card["env"] == "walker"
   assert mjx_cl.make_detector("cusum").init()
 
 

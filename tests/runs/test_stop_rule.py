@@ -802,7 +802,9 @@ def test_an_arm_that_is_told_needs_to_be(config):
     (dict(fault="car/transfer-then-socks", env="car", severity=None), "changes once"),
   ):
     with pytest.raises(UserError, match=text):
-      dataclasses.replace(config, **dict(arms=("oracle-stop",), snapshots=0, stops="x") | wrong)
+      settings.check(
+        dataclasses.replace(config, **dict(arms=("oracle-stop",), snapshots=0, stops="x") | wrong)
+      )
   together = dataclasses.replace(
     config, arms=("oracle-stop",), snapshots=0, stops="x", fault="any/all-easy", severity=None
   )

@@ -20,7 +20,7 @@ from mjx_cl.config import AdaptConfig, RunConfig
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.io import folders, memory, tables
 from mjx_cl.render import figures
-from mjx_cl.runs import merge, run
+from mjx_cl.runs import merge, run, settings
 from mjx_cl.runs import suite as bench
 from mjx_cl.scoring import stop_rule
 
@@ -846,7 +846,8 @@ def test_a_stream_whose_loss_fails_is_given_up_alone_and_named(mini, tmp_path, s
 
 def test_a_table_of_unlike_parts_has_nulls(tmp_path):
   """Columns that only some parts have, such as those of a later version, are null elsewhere."""
-  plan = bench.Suite("s", "", tuple(bench.Part(n, RunConfig("walker")) for n in "ab"))
+  config = settings.check(RunConfig("walker"))
+  plan = bench.Suite("s", "", tuple(bench.Part(n, config) for n in "ab"))
   own = {k: [v] for k, v in lived(0, "none", None, 0.9, affected=False).items()}
   for part, columns in zip(
     plan.parts, ({k: 2 * v for k, v in own.items()} | {"x": [1.0, 2.0]}, own | {"y": [3.0]})
