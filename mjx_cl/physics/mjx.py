@@ -113,19 +113,17 @@ class Mjx:
     model = self.model(fields)
     if force is not None:
       state = state.replace(qfrc_applied=jnp.asarray(force, state.qfrc_applied.dtype))
-    extra = {}
-    if self.law is None:
+    extra, law = {}, self.law
+    if law is None:
       state = state.replace(ctrl=jnp.asarray(ctrl, state.ctrl.dtype))
       state, _ = jax.lax.scan(
         lambda d, _: (mjx.step(model, d), None), state, None, length=self.substeps
       )
     else:
 
-      def one(
-        carry: tuple[mjx.Data, jax.Array, jax.Array], _: None
-      ) -> tuple[tuple[mjx.Data, jax.Array, jax.Array], None]:
+      def one(carry: tuple[mjx.Data, jax.Array, jax.Array], _: None) -> tuple[Any, None]:
         d = carry[0]
-        actuators = jnp.asarray(self.law(jnp, task, ctrl, d.qpos, d.qvel), d.ctrl.dtype)  # type: ignore[misc]
+        actuators = jnp.asarray(law(jnp, task, ctrl, d.qpos, d.qvel), d.ctrl.dtype)
         return (mjx.step(model, d.replace(ctrl=actuators)), actuators, d.qvel), None
 
       (state, actuators, before), _ = jax.lax.scan(
