@@ -49,7 +49,13 @@ SUBSTEPS = 5  # RK4 steps of a control step
 
 
 class CarState(NamedTuple):
-  """State of one car: motion, int32 () index of its track, and the key of its lidar's noise."""
+  """State of one car.
+
+  Attributes:
+    motion: of the car.
+    track: int32 (), index of its track.
+    key: of its lidar's noise.
+  """
 
   motion: Motion
   track: jax.Array
@@ -59,11 +65,17 @@ class CarState(NamedTuple):
 def nominal() -> dict[str, jax.Array]:
   """What a fault may change beside `Model.force`: `Model.task`, all float32.
 
-  friction (2,): of the front and rear tyres. mass () [kg]. inertia () [kg m2]. com (2,) [m]: shift
-  of the centre of gravity ahead, height. strength (2,): share of the steering angle, of the motor's
-  force that arrives. velocity_limit (2,): of the steering [rad/s], of the motor [m/s]. steer_lag_s
-  () [s]. noise () [m]: deviation of the lidar. gravity (3,) [m/s2]: in the world frame; a
-  horizontal part is a tilted floor. reward_weights (2,): see `reward`.
+  Returns:
+    friction: (2,), of the front and rear tyres.
+    mass: () [kg].
+    inertia: () [kg m2].
+    com: (2,), shift of the centre of gravity ahead, its height [m].
+    strength: (2,), share of the steering angle, of the motor's force that arrives.
+    velocity_limit: (2,), of the steering [rad/s], of the motor [m/s].
+    steer_lag_s: () [s].
+    noise: (), deviation of the lidar [m].
+    gravity: (3,) in the world frame; a horizontal part is a tilted floor [m/s2].
+    reward_weights: (2,), see `reward`.
   """
   values = dict(
     friction=[FRICTION] * 2,
@@ -86,14 +98,14 @@ def axle_forces(
   """Force ahead and to the left [N] of the front and rear tyres in the wheels' own frames, and the
   axles' loads [N]: (2,) each.
 
-    N_f = (m g l_r - F h) / (l_f + l_r), N_r = (m g l_f + F h) / (l_f + l_r)         F = drive force
-      under the loads at rest
-    q   = clip(drive / sum mu N, -0.95, 0.95)                                         share of the
-      grip that drives or brakes
-    F_x = q mu N,   F_y = sqrt(1 - q^2) mu N tanh(C alpha)                            per axle:
-      slope C mu N at q = 0, friction ellipse
-    alpha = -atan2(w, max(|u|, 1))                       u, w = velocity of the axle's centre along
-      and across its wheels [m/s]
+    N_f = (m g l_r - F h) / (l_f + l_r),  N_r = (m g l_f + F h) / (l_f + l_r)
+    q   = clip(drive / sum mu N, -0.95, 0.95)
+    F_x = q mu N,  F_y = sqrt(1 - q^2) mu N tanh(C alpha)
+    alpha = -atan2(w, max(|u|, 1))
+
+  with F the drive force under the loads at rest, q the share of the grip that drives or brakes, per
+  axle a slope C mu N at q = 0 and a friction ellipse, and (u, w) the velocity of the axle's centre
+  along and across its wheels [m/s].
 
   All four wheels drive and brake through one shaft, as in the chassis that F1TENTH builds on: their
   speeds are equal, so both axles use the same share of their grip. (The gym's 9.51 m/s2 needs four
@@ -133,10 +145,12 @@ def derivative(
   in force form.
 
     steer' = clip((strength_0 angle - steer) / lag, -limit_0, limit_0)
-    a      = clip(k (min(speed, limit_1) - vx), -9.51, 9.51),   drive = strength_1 m_nominal a
-      k = 4.755 1/s to speed up, 19.02 to brake
-    vx'    = sum F_ahead / m + vy r,   vy' = sum F_left / m - vx r,   r' = (l_f F_left,front - l_r
-      F_left,rear + M) / I            r = yaw rate
+    a      = clip(k (min(speed, limit_1) - vx), -9.51, 9.51),  drive = strength_1 m_nominal a
+    vx'    = sum F_ahead / m + vy r
+    vy'    = sum F_left / m - vx r
+    r'     = (l_f F_left,front - l_r F_left,rear + M) / I
+
+  with k = 4.755 1/s to speed up, 19.02 to brake, and r the yaw rate.
 
   Args:
     force: (3,), outer force on the centre of gravity along world x, y [N], moment M about the

@@ -128,12 +128,11 @@ def widen(model: Model, name: str, share: jax.Array | float, wheels: tuple[int, 
   """The model with gap item `name` moved by `share` of its gap: from a simulator's value to the
   real one for 1, and on beyond it.
 
-    acceleration, grip, mass: x (real / simulator)^share             mass: of every body; grip:
-      friction of the wheels
-    the others:               x + share (real - simulator)           yaw_inertia: all of it in the
-      chassis
-  Masses scale the wheels' part of the yaw inertia too: with the whole gap it is 0.0569 kg m2, 1.9 %
-  below the real one.
+    acceleration, grip (of the wheels), mass (of every body): x (real / simulator)^share
+    the others:                                               x + share (real - simulator)
+
+  Yaw inertia changes in the chassis alone. Masses scale the wheels' part of it too: with the whole
+  gap it is 0.0569 kg m2, 1.9 % below the real one.
 
   Share 0 leaves every bit. A fault of the same item is this function of its severity; constants
   that follow from masses are the backend's business.
@@ -179,12 +178,11 @@ def motor_law(mj_model: mujoco.MjModel) -> Callable[..., Any]:
   """Motor law of the vehicle: ctrl (..., 2) = steering angle [rad], speed [m/s] -> torques of 2
   steering and 4 wheel motors [N m].
 
-    steering, per wheel: rate = clip((goal - angle) (1 - exp(-dt / lag)) / dt, -limit_0, limit_0),
-    torque = rate x damping of the hinge
-      goal = ackermann(clip(strength_0 angle_commanded + offset, +-0.4189))
-    motor: a = clip(k (min(speed, limit_1) - r w), +-a_max)                  w = mean speed of the
-      four wheels [rad/s]
-      torque of a wheel = strength_1 m a r / 4 + c (w - w_axle)              c = 0.01 N m s/rad
+    goal   = ackermann(clip(strength_0 angle_commanded + offset, +-0.4189))
+    rate   = clip((goal - angle) (1 - exp(-dt / lag)) / dt, -limit_0, limit_0)
+    torque = rate x damping of the hinge                        of a steering motor
+    a      = clip(k (min(speed, limit_1) - r w), +-a_max)       w = mean speed of the wheels [rad/s]
+    torque = strength_1 m a r / 4 + c (w - w_axle)              of a wheel, c = 0.01 N m s/rad
 
   k = 4.755 1/s to speed up, 19.02 to brake, and four driven wheels, as in `car`. One shaft turns
   both axles (the second term, as stiff as the physics step allows); behind it left and right share
@@ -260,10 +258,14 @@ class CarReal(racing.Racer):
 
   Touching a wall, or tipping over by 60 degrees, terminates; 1,200 control steps of 0.05 s
   truncate. Reset as in `car`, on settled springs. `Model.task` as in `car` where the name is the
-  same: strength (2,), velocity_limit (2,) [rad/s, m/s], steer_lag_s () [s], noise () [m],
-  reward_weights (2,); besides accel_max () [m/s2], speed_lag_s () [s], delay () [control steps, 0
-  to 3; a fraction gives the command's mean over the step], steer_offset () [rad], speed_noise ()
-  [m/s], yaw_rate_noise () [rad/s].
+  same; besides
+
+    accel_max: () [m/s2].
+    speed_lag_s: () [s].
+    delay: (), 0 to 3; a fraction gives the command's mean over the step [control steps].
+    steer_offset: () [rad].
+    speed_noise: () [m/s].
+    yaw_rate_noise: () [rad/s].
 
   Args:
     physics: `auto`, `native` or `mjx`.

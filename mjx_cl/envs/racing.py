@@ -169,11 +169,12 @@ def pure_pursuit(env: Any, state: EnvState, friction: float = FRICTION) -> jax.A
   """Action (2,) of the reference driver, from the true place of the car: `env` has `course` and
   `pose(state)`. Yardstick and demonstrator.
 
-    steering = atan(2 L sin(eta) / d)            towards the centre line's point 0.6 m + 0.15 s *
-      speed ahead; eta, d seen from the rear axle
-    speed    = min over points z = 0 .. 3 m ahead of sqrt(0.8 mu g / |curvature| + 2 * 0.4 mu g z),
-      at most 5 m/s, and no farther from the
-               car's own speed than what the speed control answers with 0.5 mu g
+    steering = atan(2 L sin(eta) / d)
+    speed    = min over z = 0 .. 3 m of sqrt(0.8 mu g / |curvature(z)| + 2 * 0.4 mu g z)
+
+  with eta and d, seen from the rear axle, the direction and distance of the centre line's point
+  0.6 m + 0.15 s * speed ahead, and z a distance ahead along the centre line. The speed is at most
+  5 m/s, and no farther from the car's own than what the speed control answers with 0.5 mu g.
 
   Source: Coulter 1992, Implementation of the pure pursuit path tracking algorithm, CMU-RI-TR-92-01.
   """
