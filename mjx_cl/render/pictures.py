@@ -101,8 +101,7 @@ def painter(
     raise UserError(
       f"environment {env.spec.name!r} has no MuJoCo model to look at; choose from: auto, top"
     )
-  library = gl_library()
-  if library:
+  if library := gl_library():
     return Offscreen(env, width, height, library), f"MuJoCo ({library})"
   say(
     "no GL library for MuJoCo's renderer (Debian: apt install libegl1, or libosmesa6); drawing "
@@ -118,16 +117,15 @@ def check(
   out = pathlib.Path(out)
   if out.suffix.lower() not in SUFFIXES:
     raise UserError(f"--out must end in {' or '.join(SUFFIXES)}; got {str(out)!r}")
-  if not 1 <= steps <= MOST_STEPS:
-    raise UserError(
-      f"steps must lie in 1..{MOST_STEPS:,}, whose pictures are kept in memory; got {steps}"
-    )
+  for name, value, low, high, words in (
+    ("steps", steps, 1, MOST_STEPS, f"1..{MOST_STEPS:,}, whose pictures are kept in memory"),
+    ("width", width, 64, 4096, "64..4096"),
+    ("height", height, 64, 4096, "64..4096"),
+    ("fps", fps, 1, 50, "1..50"),
+  ):
+    if not low <= value <= high:
+      raise UserError(f"{name} must lie in {words}; got {value}")
   check_seeds(seed)
-  for name, value in (("width", width), ("height", height)):
-    if not 64 <= value <= 4096:
-      raise UserError(f"{name} must lie in 64..4096; got {value}")
-  if not 1 <= fps <= 50:
-    raise UserError(f"fps must lie in 1..50; got {fps}")
   if out.suffix.lower() == ".mp4":
     ffmpeg()
   if out.is_dir():

@@ -81,8 +81,9 @@ class FaultSettings:
       UserError for what `presets.resolve` refuses, and for a preset that turns the robot into
       another one.
     """
+    robot = env.spec.name
     changes = presets.resolve(
-      env.spec.name,
+      robot,
       self.fault,
       None if self.target == "random" else self.target,
       self.severity,
@@ -91,7 +92,6 @@ class FaultSettings:
       self.period,
       self.share,
     )
-    robot = env.spec.name
     if presets.named(self.fault) and (other := presets.find(self.fault, robot).becomes):
       raise UserError(
         f"preset {self.fault!r} turns the robot into {other!r}, which only `mjx-cl run` does; take "
