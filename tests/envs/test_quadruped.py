@@ -654,7 +654,7 @@ def test_each_reward_weight_has_its_term(native):
 
 
 def test_gravity_turns_the_observed_direction(native):
-  """A slope is tilted gravity: what the robot senses as down, and what counts as tilt, follow it."""
+  """A slope is tilted gravity: what the robot senses as down and what counts as tilt follow it."""
   qpos, qvel = jnp.asarray(pose()[0]), jnp.zeros(18)
   tilted = jnp.asarray([9.81 * np.sin(0.3), 0, -9.81 * np.cos(0.3)])
   np.testing.assert_allclose(

@@ -1,4 +1,4 @@
-"""The two physics backends: bits, independence of what was stepped before, and parity between them."""
+"""The two physics backends: bits, independence of what was stepped before, and parity."""
 
 import copy
 
