@@ -160,7 +160,7 @@ def test_a_field_without_batch_axis_is_shared_by_all(walker, same):
 # as far from itself when qpos moves by 3e-7. And MJX's float32 solver ends elsewhere in one physics
 # step, by up to 1 rad/s, and comes back in those that follow: one of 4,096 control steps in a
 # program that LLVM does not optimise, where the same state alone, or optimised, agrees to 1e-5; at
-# the joint stops of a long fall one robot in ten. Wrong physics shows in all robots that meet it, see
+# the joint stops of a long fall one robot in ten. Wrong physics shows in all that meet it, see
 # `test_wrong_physics_is_noticed`. Tolerances are about ten times what was measured on a CPU (jax
 # 0.9.2, mujoco 3.14.0, AVX2 and AVX-512, either level of LLVM), the figures stand beside them.
 
