@@ -157,12 +157,13 @@ def test_a_field_without_batch_axis_is_shared_by_all(walker, same):
 # Both start from the same float32 state; C MuJoCo then computes in float64, MJX in float32. They
 # are compared by quantiles over many robots, since single ones part for two reasons that are no
 # error of the model. A foot touches or leaves the floor one physics step earlier: there C MuJoCo is
-# as far from itself when qpos moves by 3e-7. And MJX's float32 solver ends elsewhere in one physics
-# step, by up to 1 rad/s, and comes back in those that follow: one of 4,096 control steps in a
-# program that LLVM does not optimise, where the same state alone, or optimised, agrees to 1e-5; at
-# the joint stops of a long fall one robot in ten. Wrong physics shows in all that meet it, see
-# `test_wrong_physics_is_noticed`. Tolerances are about ten times what was measured on a CPU (jax
-# 0.9.2, mujoco 3.14.0, AVX2 and AVX-512, either level of LLVM), the figures stand beside them.
+# as far from itself when qpos moves by 3e-7. And MJX's solver, whose float32 rounds an improvement
+# to less than the tolerance of 1e-8, ends an iteration early: the velocity is up to 1 rad/s off in
+# that physics step and comes back in those that follow. A program that LLVM does not optimise does
+# so in one of 4,096 control steps, to which the optimised one, or a tolerance of 1e-10, agrees to
+# 1e-5. Wrong physics shows in all that meet it, see `test_wrong_physics_is_noticed`. Tolerances are
+# about ten times what was measured on a CPU (jax 0.9.2, mujoco 3.14.0, AVX2 and AVX-512, either
+# level of LLVM), the figures stand beside them.
 
 
 def errors(a, b):
@@ -226,7 +227,7 @@ def close(position, speed):
 
 
 def explained(far):
-  """The unusual step: but for one in a thousand, where MJX's solver ends elsewhere (met: one in
+  """The unusual step: but for one in a thousand, where MJX's solver ends early (met: one in
   4,096 without LLVM's optimisation, none with it), C MuJoCo differs from itself as far.
   """
   return far.mean() < 1e-3
@@ -327,7 +328,7 @@ def test_parity_of_100_steps_without_contact(walker, pair, fields):
   )  # and the legs have moved by more than a radian
   position, speed = found[-1]
   # measured with LLVM's optimisation 3.5e-5, 1.3e-4; 7.6e-5, 6.2e-4. Without it, where MJX's
-  # solver ends elsewhere at joint stops, 4.6e-5, 9.8e-4; 1.2e-4, 2.6e-3
+  # solver may end early at joint stops, 4.6e-5, 9.8e-4; 1.2e-4, 2.6e-3
   assert np.median(position) < 3e-4 and np.quantile(position, 0.9) < 5e-3
   assert np.median(speed) < 7e-4 and np.quantile(speed, 0.9) < 2e-2
   init, step = pair["native"]
