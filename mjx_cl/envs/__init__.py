@@ -2,10 +2,7 @@
 `make(name)` builds one.
 """
 
-from __future__ import annotations
-
 import inspect
-import types
 from typing import Any
 
 from mjx_cl.envs.car import Car
@@ -14,6 +11,7 @@ from mjx_cl.envs.quadruped import Quadruped
 from mjx_cl.envs.walker import Walker
 from mjx_cl.errors import PluginError, UserError, choose
 from mjx_cl.io.plugins import Registry, line
+from mjx_cl.physics import PURE_JAX
 from mjx_cl.types import Spec
 
 ENVS = Registry(
@@ -21,9 +19,6 @@ ENVS = Registry(
   "environment",
   {"walker": Walker, "quadruped": Quadruped, "car": Car, "car_real": CarReal},
 )
-PURE_JAX = types.SimpleNamespace(
-  name="jax", seconds=0.0
-)  # no time is spent outside the compiled program
 
 
 def physics_of(env: Any) -> Any:

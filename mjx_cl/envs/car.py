@@ -1,187 +1,61 @@
 """Car: a 1:10 scale racing car keeps fast and off the walls of a track that it sees by lidar. The
 simulator, pure JAX on every backend.
 
-Parameters, command layer and integrator follow the F1TENTH gym's car (O'Kelly et al. 2020); the
-tyre saturates and each axle has its own friction. Observation, action and reward are module
-functions: `car_real` (MuJoCo) shares them, so that an agent moves from one to the other.
+Integrator and single-track model follow the F1TENTH gym's car (O'Kelly et al. 2020); the tyre
+saturates and each axle has its own friction. The rest of the task is in `racing`.
 """
 
-from __future__ import annotations
-
-import types
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Iterable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from mjx_cl.envs.course import Course
+from mjx_cl.envs.racing import (
+  ACCEL_MAX,
+  AXLES,
+  CONTROL_S,
+  FRICTION,
+  GAIN_DOWN,
+  GAIN_UP,
+  GRAVITY,
+  INERTIA,
+  LIDAR_SIGMA,
+  MASS,
+  REWARD_TERMS,
+  SPEED_MAX,
+  STEER_LAG,
+  STEER_MAX,
+  STEER_RATE,
+  WHEELBASE,
+  Motion,
+  Racer,
+  command,
+  observe,
+  reward,
+  spec,
+)
+from mjx_cl.envs.tracks import Track
 from mjx_cl.errors import choose
-from mjx_cl.types import EnvState, Model, Spec, Step, Var
+from mjx_cl.physics import PURE_JAX
+from mjx_cl.types import EnvState, Model, Step
 
-if TYPE_CHECKING:
-  from collections.abc import Iterable
-
-  from mjx_cl.envs.course import Track
-
-FRICTION = 1.0489  # tyre on floor
 STIFFNESS = (4.718, 5.4562)  # front, rear cornering stiffness per unit of load [1/rad]
-AXLES = (0.15875, 0.17145)  # from the centre of gravity to the front and rear axle [m]
-WHEELBASE = 0.3302  # [m]
 HEIGHT = 0.074  # of the centre of gravity [m]
-MASS, INERTIA = 3.74, 0.04712  # [kg], [kg m2] about the vertical
-STEER_MAX, STEER_RATE = 0.4189, 3.2  # [rad], [rad/s]
-STEER_LAG = 0.02  # [s]; stands for the gym's buffer of two 10 ms steps
-ACCEL_MAX = 9.51  # [m/s2], either way; the gym lowers it above 7.319 m/s only
-GAIN_UP, GAIN_DOWN = (
-  10 * ACCEL_MAX / 20,
-  10 * ACCEL_MAX / 5,
-)  # speed control [1/s], for the gym's range of -5 to 20 m/s
-GRAVITY = 9.81  # [m/s2]
-SPEED_MIN, SPEED_MAX = 0.5, 5.0  # commanded [m/s]
 TRACTION = 0.95  # share of the grip that drive or brake force may take
 SLOW = 1.0  # [m/s]; wheel speed below which slip is taken at this speed
-LIDAR_SIGMA = 0.01  # [m]
-REWARD_TERMS = {"speed": 0.2, "crash": -5.0}  # weights, see `reward`
-WEIGHTS = tuple(REWARD_TERMS.values())
-CONTROL_S, SUBSTEPS = 0.05, 5  # [s], RK4 steps in it
-EPISODE = 1200  # control steps: 60 s
-
-
-# ---- what the simulator and the MuJoCo car share -------------------------------------------------
-
-
-def spec(name: str, course: Course, acceptance: float) -> Spec:
-  """Spec of a car on `course`: the lidar's beams from right to left, then speed, yaw rate and
-  steering angle; steering and motor as action.
-
-  Scales are deviations over 160 cars and 30 s of the reference driver; one number for all beams.
-  """
-  lidar = tuple(Var(f"lidar_{k:02d}", "1", 0, 1, scale=0.15) for k in range(course.beams))
-  own = (
-    Var("speed", "m/s", scale=0.3),
-    Var("yaw_rate", "rad/s", scale=1.2),
-    Var("steering", "rad", -STEER_MAX, STEER_MAX, scale=0.11),
-  )
-  beams, side = np.arange(course.beams), np.pi / 4
-  parts = {
-    "lidar": beams,
-    "lidar_right": beams[course.angles < -side],
-    "lidar_front": beams[np.abs(course.angles) <= side],
-    "lidar_left": beams[course.angles > side],
-    "motion": course.beams + np.arange(3),
-  }
-  fans = tuple(
-    (f"lidar_{side}", tuple(int(i) for i in at))
-    for side, at in zip(
-      ("right", "front_right", "front", "front_left", "left"), np.array_split(beams, 5)
-    )
-  )
-  motion = tuple((v.name, (course.beams + k,)) for k, v in enumerate(own))
-  return Spec(
-    name=name,
-    obs=lidar + own,
-    act=(Var("steering", "1", -1, 1), Var("motor", "1", -1, 1)),
-    control_s=CONTROL_S,
-    episode_steps=EPISODE,
-    acceptance=acceptance,
-    posture=None,
-    targets=("steering", "motor"),
-    obs_groups=tuple((part, tuple(int(i) for i in at)) for part, at in parts.items()),
-    feet=(("front", (0,)), ("rear", (1,))),
-    watched=fans + motion,
-  )
-
-
-def command(action: jax.Array) -> tuple[jax.Array, jax.Array]:
-  """Steering angle [rad] and speed [m/s] that an action (2,), clipped to [-1, 1], asks for.
-
-    angle = 0.4189 a_0,   speed = 0.5 + (a_1 + 1) / 2 * 4.5
-
-  At 5 m/s the lidar sees 2 s ahead, and curves below a radius of 2.4 m exceed the tyres' grip (v^2
-  / r > mu g), so that a good driver must brake. The car never parks: standing would be a safe
-  policy with nothing to learn from, and a car that faces a wall, with no reverse gear, would wait
-  there until the time limit.
-  """
-  action = jnp.clip(action, -1.0, 1.0)
-  return STEER_MAX * action[0], SPEED_MIN + 0.5 * (action[1] + 1.0) * (SPEED_MAX - SPEED_MIN)
-
-
-def observe(
-  course: Course,
-  ranges: jax.Array,
-  speed: jax.Array,
-  yaw_rate: jax.Array,
-  steer: jax.Array,
-  sigma: jax.Array,
-  key: jax.Array,
-) -> jax.Array:
-  """Observation, float32 (beams + 3,): clip(range + sigma N(0, 1), 0, max) / max, then forward
-  speed [m/s], yaw rate [rad/s], steering angle [rad].
-
-  Args:
-    ranges: (beams,) [m], `course.scan`'s.
-    sigma: deviation of the lidar's noise [m], ().
-    key: of the noise.
-  """
-  noisy = ranges + sigma * jax.random.normal(key, ranges.shape)
-  return jnp.concatenate(
-    [jnp.clip(noisy, 0.0, course.max_range) / course.max_range, jnp.stack([speed, yaw_rate, steer])]
-  )
-
-
-def progress(
-  course: Course,
-  track: jax.Array,
-  x: jax.Array,
-  y: jax.Array,
-  velocity_x: jax.Array,
-  velocity_y: jax.Array,
-) -> jax.Array:
-  """Speed along the track [m/s], (): the world velocity [m/s] of the car's origin along the track's
-  direction at its nearest point.
-
-  Speed ahead of the car itself would also pay for driving in circles, which the car can do between
-  the walls.
-  """
-  heading = course.locate(track, x, y).heading
-  return velocity_x * jnp.cos(heading) + velocity_y * jnp.sin(heading)
-
-
-def reward(
-  along: jax.Array, crashed: jax.Array, weights: jax.Array | tuple[float, ...] = WEIGHTS
-) -> jax.Array:
-  """Reward, float32 (): 0.2 along - 5 [crashed], for the speed along the track [m/s]; 1 at the
-  highest speed, negative the wrong way round.
-
-  5 is what a new start costs, 10 control steps from standstill at half of the full reward: even a
-  policy that is blind to what follows an end gains nothing by crashing.
-
-  Args:
-    weights: (2,) of `REWARD_TERMS` [s/m, 1].
-  """
-  return weights[0] * along + weights[1] * crashed
-
-
-# ---- dynamics ------------------------------------------------------------------------------------
-
-
-class Motion(NamedTuple):
-  """What the dynamics integrate, each float32 (): place and yaw in the world, velocity of the
-  centre of gravity in the car's frame.
-  """
-
-  x: jax.Array  # [m]
-  y: jax.Array  # [m]
-  yaw: jax.Array  # [rad]
-  vx: jax.Array  # [m/s], ahead
-  vy: jax.Array  # [m/s], to the left
-  yaw_rate: jax.Array  # [rad/s]
-  steer: jax.Array  # [rad]
+SUBSTEPS = 5  # RK4 steps of a control step
 
 
 class CarState(NamedTuple):
-  """State of one car: motion, int32 () index of its track, and the key of its lidar's noise."""
+  """State of one car.
+
+  Attributes:
+    motion: of the car.
+    track: int32 (), index of its track.
+    key: of its lidar's noise.
+  """
 
   motion: Motion
   track: jax.Array
@@ -191,11 +65,17 @@ class CarState(NamedTuple):
 def nominal() -> dict[str, jax.Array]:
   """What a fault may change beside `Model.force`: `Model.task`, all float32.
 
-  friction (2,): of the front and rear tyres. mass () [kg]. inertia () [kg m2]. com (2,) [m]: shift
-  of the centre of gravity ahead, height. strength (2,): share of the steering angle, of the motor's
-  force that arrives. velocity_limit (2,): of the steering [rad/s], of the motor [m/s]. steer_lag_s
-  () [s]. noise () [m]: deviation of the lidar. gravity (3,) [m/s2]: in the world frame; a
-  horizontal part is a tilted floor. reward_weights (2,): see `reward`.
+  Returns:
+    friction: (2,), of the front and rear tyres.
+    mass: () [kg].
+    inertia: () [kg m2].
+    com: (2,), shift of the centre of gravity ahead, its height [m].
+    strength: (2,), share of the steering angle, of the motor's force that arrives.
+    velocity_limit: (2,), of the steering [rad/s], of the motor [m/s].
+    steer_lag_s: () [s].
+    noise: (), deviation of the lidar [m].
+    gravity: (3,) in the world frame; a horizontal part is a tilted floor [m/s2].
+    reward_weights: (2,), see `reward`.
   """
   values = dict(
     friction=[FRICTION] * 2,
@@ -218,14 +98,14 @@ def axle_forces(
   """Force ahead and to the left [N] of the front and rear tyres in the wheels' own frames, and the
   axles' loads [N]: (2,) each.
 
-    N_f = (m g l_r - F h) / (l_f + l_r), N_r = (m g l_f + F h) / (l_f + l_r)         F = drive force
-      under the loads at rest
-    q   = clip(drive / sum mu N, -0.95, 0.95)                                         share of the
-      grip that drives or brakes
-    F_x = q mu N,   F_y = sqrt(1 - q^2) mu N tanh(C alpha)                            per axle:
-      slope C mu N at q = 0, friction ellipse
-    alpha = -atan2(w, max(|u|, 1))                       u, w = velocity of the axle's centre along
-      and across its wheels [m/s]
+    N_f = (m g l_r - F h) / (l_f + l_r),  N_r = (m g l_f + F h) / (l_f + l_r)
+    q   = clip(drive / sum mu N, -0.95, 0.95)
+    F_x = q mu N,  F_y = sqrt(1 - q^2) mu N tanh(C alpha)
+    alpha = -atan2(w, max(|u|, 1))
+
+  with F the drive force under the loads at rest, q the share of the grip that drives or brakes, per
+  axle a slope C mu N at q = 0 and a friction ellipse, and (u, w) the velocity of the axle's centre
+  along and across its wheels [m/s].
 
   All four wheels drive and brake through one shaft, as in the chassis that F1TENTH builds on: their
   speeds are equal, so both axles use the same share of their grip. (The gym's 9.51 m/s2 needs four
@@ -265,10 +145,12 @@ def derivative(
   in force form.
 
     steer' = clip((strength_0 angle - steer) / lag, -limit_0, limit_0)
-    a      = clip(k (min(speed, limit_1) - vx), -9.51, 9.51),   drive = strength_1 m_nominal a
-      k = 4.755 1/s to speed up, 19.02 to brake
-    vx'    = sum F_ahead / m + vy r,   vy' = sum F_left / m - vx r,   r' = (l_f F_left,front - l_r
-      F_left,rear + M) / I            r = yaw rate
+    a      = clip(k (min(speed, limit_1) - vx), -9.51, 9.51),  drive = strength_1 m_nominal a
+    vx'    = sum F_ahead / m + vy r
+    vy'    = sum F_left / m - vx r
+    r'     = (l_f F_left,front - l_r F_left,rear + M) / I
+
+  with k = 4.755 1/s to speed up, 19.02 to brake, and r the yaw rate.
 
   Args:
     force: (3,), outer force on the centre of gravity along world x, y [N], moment M about the
@@ -329,10 +211,7 @@ def advance(model: Model, motion: Motion, angle: jax.Array, speed: jax.Array) ->
   return motion._replace(yaw=(motion.yaw + jnp.pi) % (2 * jnp.pi) - jnp.pi)
 
 
-# ---- environment ---------------------------------------------------------------------------------
-
-
-class Car:
+class Car(Racer):
   """The simulated car on tracks of its own. Touching a wall terminates, 1,200 control steps of 0.05
   s truncate.
 
@@ -346,36 +225,11 @@ class Car:
 
   def __init__(self, physics: str = "auto", tracks: Iterable[Track] | None = None) -> None:
     choose("physics", physics, dict.fromkeys(("auto", "native", "mjx")))
-    self.physics = types.SimpleNamespace(
-      name="jax", seconds=0.0
-    )  # no time is spent outside the compiled program
+    self.physics = PURE_JAX
     self.course = Course(tracks)
-    self.spec = spec(
-      "car", self.course, acceptance=0.6
-    )  # 3 m/s along the track and no crash; the reference driver earns 0.93
-    self.reward_terms = tuple(REWARD_TERMS)
+    # 3 m/s along the track and no crash; the reference driver earns 0.93
+    self.spec = spec("car", self.course, acceptance=0.6)
     self.model = Model(mj={}, task=nominal(), force=jnp.zeros(3))
-
-  def pose(self, state: EnvState) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array, jax.Array]:
-    """Privileged: track, x, y [m], yaw [rad] and speed ahead [m/s]."""
-    m = state.physics.motion
-    return state.physics.track, m.x, m.y, m.yaw, m.vx
-
-  termination_rate = "collision_rate"  # what the share of terminated episodes is called
-
-  def measure(self, state: EnvState) -> dict[str, jax.Array]:
-    """mean_speed_m_s: speed along the track, float32 ()."""
-    m = state.physics.motion
-    sin, cos = jnp.sin(m.yaw), jnp.cos(m.yaw)
-    return {
-      "mean_speed_m_s": progress(
-        self.course, state.physics.track, m.x, m.y, cos * m.vx - sin * m.vy, sin * m.vx + cos * m.vy
-      )
-    }
-
-  def reference(self, state: EnvState) -> jax.Array:
-    """Action (2,) of the reference driver, which knows where the car is."""
-    return pure_pursuit(self, state)
 
   def _observe(self, model: Model, motion: Motion, track: jax.Array, key: jax.Array) -> jax.Array:
     ranges = self.course.scan(track, motion.x, motion.y, motion.yaw)
@@ -398,50 +252,9 @@ class Car:
     track = state.physics.track
     key_noise, key = jax.random.split(state.physics.key)
     motion = advance(model, state.physics.motion, *command(action))
-    sin, cos = jnp.sin(motion.yaw), jnp.cos(motion.yaw)
-    along = progress(
-      self.course,
-      track,
-      motion.x,
-      motion.y,
-      cos * motion.vx - sin * motion.vy,
-      sin * motion.vx + cos * motion.vy,
-    )
+    along = self.along(track, motion)
     crashed = self.course.collides(track, motion.x, motion.y, motion.yaw)
     obs, step = self._observe(model, motion, track, key_noise), state.step + 1
     earned = reward(along, crashed, model.task["reward_weights"])
     truncated = ~crashed & (step >= self.spec.episode_steps)
     return EnvState(CarState(motion, track, key), step), Step(obs, earned, crashed, truncated, obs)
-
-
-# ---- reference driver ----------------------------------------------------------------------------
-
-
-def pure_pursuit(env: Any, state: EnvState, friction: float = FRICTION) -> jax.Array:
-  """Action (2,) of the reference driver, from the true place of the car: `env` has `course` and
-  `pose(state)`. Yardstick and demonstrator.
-
-    steering = atan(2 L sin(eta) / d)            towards the centre line's point 0.6 m + 0.15 s *
-      speed ahead; eta, d seen from the rear axle
-    speed    = min over points z = 0 .. 3 m ahead of sqrt(0.8 mu g / |curvature| + 2 * 0.4 mu g z),
-      at most 5 m/s, and no farther from the
-               car's own speed than what the speed control answers with 0.5 mu g
-
-  Source: Coulter 1992, Implementation of the pure pursuit path tracking algorithm, CMU-RI-TR-92-01.
-  """
-  track, x, y, yaw, speed = env.pose(state)
-  s = env.course.locate(track, x, y).s
-  goal_x, goal_y, _, _ = env.course.at(track, s + 0.6 + 0.15 * jnp.maximum(speed, 0.0))
-  dx, dy = goal_x - x + AXLES[1] * jnp.cos(yaw), goal_y - y + AXLES[1] * jnp.sin(yaw)
-  square = dx * dx + dy * dy
-  across = jnp.cos(yaw) * dy - jnp.sin(yaw) * dx  # d sin(eta)
-  angle = jnp.arctan(2 * WHEELBASE * across / square)
-  ahead = jnp.arange(0.0, 3.01, 0.2)
-  curvature = jax.vmap(lambda z: env.course.at(track, s + z)[3])(ahead)
-  grip = friction * GRAVITY
-  fastest = jnp.min(
-    jnp.sqrt(0.8 * grip / jnp.maximum(jnp.abs(curvature), 1e-3) + 0.8 * grip * ahead)
-  )
-  fastest = jnp.clip(fastest, speed - 0.5 * grip / GAIN_DOWN, speed + 0.5 * grip / GAIN_UP)
-  action = jnp.stack([angle / STEER_MAX, 2 * (fastest - SPEED_MIN) / (SPEED_MAX - SPEED_MIN) - 1])
-  return jnp.clip(action, -1.0, 1.0)

@@ -8,10 +8,10 @@ items of `GAP`, each named, with its source, and switchable; together they are o
 car ("NUC2", ForzaETH's race stack) as far as figures of it were at hand.
 """
 
-from __future__ import annotations
-
 import importlib.resources
-from typing import TYPE_CHECKING, Any, NamedTuple
+import types
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,30 +19,25 @@ import mujoco
 import numpy as np
 
 from mjx_cl import physics as physics_lib
-from mjx_cl.envs import car
+from mjx_cl.envs import racing
+from mjx_cl.envs.car import nominal
 from mjx_cl.envs.course import Course
+from mjx_cl.envs.racing import Motion
+from mjx_cl.envs.tracks import Track
 from mjx_cl.errors import choose
 from mjx_cl.types import EnvState, Model, Step
-
-if TYPE_CHECKING:
-  import types
-  from collections.abc import Callable, Iterable
-
-  from mjx_cl.envs.course import Track
 
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 RADIUS = 0.0492  # of a wheel under load [m]: 0.05 less half of what tyre and floor give way
 TRACK = 0.25  # between left and right wheels [m]
 WHEEL_INERTIA = 0.00015  # of a wheel about its axle [kg m2]
-SHAFT = (
-  0.01  # torque on a wheel per difference of its axle's speed from the mean of both [N m s/rad]
-)
+# torque on a wheel per difference of its axle's speed from the mean of both [N m s/rad]
+SHAFT = 0.01
 # of the steering hinges [N m s/rad]; with a servo torque of as much per rad/s they turn at the rate
 # asked for
 STEER_DAMPING = 0.5
-INERTIAL_MASS = (
-  car.MASS + 4 * WHEEL_INERTIA / RADIUS**2
-)  # what the motor accelerates, spinning wheels included: 3.98 [kg]
+# what the motor accelerates, spinning wheels included: 3.98 [kg]
+INERTIAL_MASS = racing.MASS + 4 * WHEEL_INERTIA / RADIUS**2
 SUBSTEPS = 10  # physics steps of 0.005 s in a control step of 0.05 s
 LONGEST_DELAY = 3  # of a command [control steps]
 
@@ -52,7 +47,8 @@ class Item(NamedTuple):
 
   Attributes:
     unit: of the two values.
-    simulator, real: value in `car`, and of the real car.
+    simulator: value in `car`.
+    real: value of the real car.
     leaf: of the Model, that carries it.
     source: of the real value; "estimate" where none was found.
   """
@@ -67,7 +63,7 @@ class Item(NamedTuple):
 GAP = {
   "steering_lag": Item(
     "s",
-    car.STEER_LAG,
+    racing.STEER_LAG,
     0.158,
     "task.steer_lag_s",
     "ForzaETH race stack, NUC2: steering as first-order lag",
@@ -87,11 +83,11 @@ GAP = {
     "estimate: filter and ramp of the motor controller's speed loop",
   ),
   "acceleration": Item(
-    "m/s2", car.ACCEL_MAX, 3.0, "task.accel_max", "ForzaETH race stack, NUC2: acceleration +-3"
+    "m/s2", racing.ACCEL_MAX, 3.0, "task.accel_max", "ForzaETH race stack, NUC2: acceleration +-3"
   ),
   "lidar_noise": Item(
     "m",
-    car.LIDAR_SIGMA,
+    racing.LIDAR_SIGMA,
     0.03,
     "task.noise",
     "data sheet of the usual scanner, Hokuyo UST-10LX: repeatability sigma < 30 mm",
@@ -105,13 +101,13 @@ GAP = {
   "steering_offset": Item(
     "rad", 0.0, 0.02, "task.steer_offset", "estimate: trim of the servo horn, 1 degree"
   ),
-  "mass": Item("kg", car.MASS, 3.54, "mj.body_mass", "ForzaETH race stack, NUC2"),
+  "mass": Item("kg", racing.MASS, 3.54, "mj.body_mass", "ForzaETH race stack, NUC2"),
   "yaw_inertia": Item(
-    "kg m2", car.INERTIA, 0.05797, "mj.body_inertia", "ForzaETH race stack, NUC2"
+    "kg m2", racing.INERTIA, 0.05797, "mj.body_inertia", "ForzaETH race stack, NUC2"
   ),
   "grip": Item(
     "1",
-    car.FRICTION,
+    racing.FRICTION,
     0.65,
     "mj.geom_friction",
     "ForzaETH race stack, NUC2: peak D of the Pacejka fits, front 0.650, rear 0.618",
@@ -132,12 +128,11 @@ def widen(model: Model, name: str, share: jax.Array | float, wheels: tuple[int, 
   """The model with gap item `name` moved by `share` of its gap: from a simulator's value to the
   real one for 1, and on beyond it.
 
-    acceleration, grip, mass: x (real / simulator)^share             mass: of every body; grip:
-      friction of the wheels
-    the others:               x + share (real - simulator)           yaw_inertia: all of it in the
-      chassis
-  Masses scale the wheels' part of the yaw inertia too: with the whole gap it is 0.0569 kg m2, 1.9 %
-  below the real one.
+    acceleration, grip (of the wheels), mass (of every body): x (real / simulator)^share
+    the others:                                               x + share (real - simulator)
+
+  Yaw inertia changes in the chassis alone. Masses scale the wheels' part of it too: with the whole
+  gap it is 0.0569 kg m2, 1.9 % below the real one.
 
   Share 0 leaves every bit. A fault of the same item is this function of its severity; constants
   that follow from masses are the backend's business.
@@ -166,7 +161,7 @@ def ackermann(xp: types.ModuleType, angle: Any) -> Any:
   tan d_left = tan d / (1 - w tan d),   tan d_right = tan d / (1 + w tan d),   w = half the track /
     wheelbase
   """
-  t, w = xp.tan(angle), TRACK / 2 / car.WHEELBASE
+  t, w = xp.tan(angle), TRACK / 2 / racing.WHEELBASE
   return xp.stack([xp.arctan(t / (1 - w * t)), xp.arctan(t / (1 + w * t))], -1)
 
 
@@ -174,7 +169,7 @@ def middle(left: jax.Array, right: jax.Array) -> jax.Array:
   """Steering angle [rad] of a wheel in the middle, from the two front wheels: mean of what each of
   them says (see `ackermann`).
   """
-  w = TRACK / 2 / car.WHEELBASE
+  w = TRACK / 2 / racing.WHEELBASE
   left, right = jnp.tan(left), jnp.tan(right)
   return (jnp.arctan(left / (1 + w * left)) + jnp.arctan(right / (1 - w * right))) / 2
 
@@ -183,12 +178,11 @@ def motor_law(mj_model: mujoco.MjModel) -> Callable[..., Any]:
   """Motor law of the vehicle: ctrl (..., 2) = steering angle [rad], speed [m/s] -> torques of 2
   steering and 4 wheel motors [N m].
 
-    steering, per wheel: rate = clip((goal - angle) (1 - exp(-dt / lag)) / dt, -limit_0, limit_0),
-    torque = rate x damping of the hinge
-      goal = ackermann(clip(strength_0 angle_commanded + offset, +-0.4189))
-    motor: a = clip(k (min(speed, limit_1) - r w), +-a_max)                  w = mean speed of the
-      four wheels [rad/s]
-      torque of a wheel = strength_1 m a r / 4 + c (w - w_axle)              c = 0.01 N m s/rad
+    goal   = ackermann(clip(strength_0 angle_commanded + offset, +-0.4189))
+    rate   = clip((goal - angle) (1 - exp(-dt / lag)) / dt, -limit_0, limit_0)
+    torque = rate x damping of the hinge                        of a steering motor
+    a      = clip(k (min(speed, limit_1) - r w), +-a_max)       w = mean speed of the wheels [rad/s]
+    torque = strength_1 m a r / 4 + c (w - w_axle)              of a wheel, c = 0.01 N m s/rad
 
   k = 4.755 1/s to speed up, 19.02 to brake, and four driven wheels, as in `car`. One shaft turns
   both axles (the second term, as stiff as the physics step allows); behind it left and right share
@@ -201,33 +195,20 @@ def motor_law(mj_model: mujoco.MjModel) -> Callable[..., Any]:
   spins = [mj_model.joint(f"spin_{n}").dofadr[0] for n in WHEELS]
 
   def law(xp: types.ModuleType, task: dict[str, Any], ctrl: Any, qpos: Any, qvel: Any) -> Any:
-    goal = xp.clip(
-      task["strength"][..., 0] * ctrl[..., 0] + task["steer_offset"], -car.STEER_MAX, car.STEER_MAX
-    )
-    gain, most = (
-      (1 - xp.exp(-dt / xp.maximum(task["steer_lag_s"], 0.01)[..., None])) / dt,
-      task["velocity_limit"][..., :1],
-    )
-    rate = xp.clip(
-      (ackermann(xp, goal) - xp.stack([qpos[..., i] for i in angles], -1)) * gain, -most, most
-    )
-    front, rear = (
-      (qvel[..., spins[0]] + qvel[..., spins[1]]) / 2,
-      (qvel[..., spins[2]] + qvel[..., spins[3]]) / 2,
-    )
+    goal = task["strength"][..., 0] * ctrl[..., 0] + task["steer_offset"]
+    goal = ackermann(xp, xp.clip(goal, -racing.STEER_MAX, racing.STEER_MAX))
+    gain = (1 - xp.exp(-dt / xp.maximum(task["steer_lag_s"], 0.01)[..., None])) / dt
+    most = task["velocity_limit"][..., :1]
+    rate = xp.clip((goal - xp.stack([qpos[..., i] for i in angles], -1)) * gain, -most, most)
+    front = (qvel[..., spins[0]] + qvel[..., spins[1]]) / 2
+    rear = (qvel[..., spins[2]] + qvel[..., spins[3]]) / 2
     error = xp.minimum(ctrl[..., 1], task["velocity_limit"][..., 1]) - RADIUS * (front + rear) / 2
-    accel = xp.clip(
-      xp.where(error > 0, car.GAIN_UP, car.GAIN_DOWN) * error, -task["accel_max"], task["accel_max"]
-    )
+    accel = xp.where(error > 0, racing.GAIN_UP, racing.GAIN_DOWN) * error
+    accel = xp.clip(accel, -task["accel_max"], task["accel_max"])
     torque = INERTIAL_MASS * RADIUS / 4 * task["strength"][..., 1] * accel
     shaft = SHAFT * (rear - front) / 2
-    return xp.concatenate(
-      [
-        STEER_DAMPING * rate,
-        xp.stack([torque + shaft, torque + shaft, torque - shaft, torque - shaft], -1),
-      ],
-      -1,
-    )
+    wheels = [torque + shaft, torque + shaft, torque - shaft, torque - shaft]
+    return xp.concatenate([STEER_DAMPING * rate, xp.stack(wheels, -1)], -1)
 
   return law
 
@@ -237,7 +218,7 @@ class CarRealState(NamedTuple):
 
   Attributes:
     backend: of the physics; opaque.
-    motion: car.Motion, of the chassis' origin (the centre of gravity), projected on the floor.
+    motion: Motion, of the chassis' origin (the centre of gravity), projected on the floor.
     track: int32 (), index of its track.
     sent: float32 (3, 2), the last commands, newest first: steering angle [rad], speed [m/s]; zero
       before the first.
@@ -246,21 +227,21 @@ class CarRealState(NamedTuple):
   """
 
   backend: object
-  motion: car.Motion
+  motion: Motion
   track: jax.Array
   sent: jax.Array
   speed: jax.Array
   key: jax.Array
 
 
-def read_motion(qpos: jax.Array, qvel: jax.Array) -> tuple[car.Motion, jax.Array]:
-  """car.Motion, and how upright the car is: the z part of its own vertical, 1 on its wheels. From
+def read_motion(qpos: jax.Array, qvel: jax.Array) -> tuple[Motion, jax.Array]:
+  """Motion, and how upright the car is: the z part of its own vertical, 1 on its wheels. From
   qpos (17,), qvel (16,).
   """
   w, x, y, z = qpos[3], qpos[4], qpos[5], qpos[6]
   yaw = jnp.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
   sin, cos = jnp.sin(yaw), jnp.cos(yaw)
-  motion = car.Motion(
+  motion = Motion(
     qpos[0],
     qpos[1],
     yaw,
@@ -272,15 +253,19 @@ def read_motion(qpos: jax.Array, qvel: jax.Array) -> tuple[car.Motion, jax.Array
   return motion, 1 - 2 * (x * x + y * y)
 
 
-class CarReal:
+class CarReal(racing.Racer):
   """The four-wheel car on the tracks of `car`, with the reality gap switched on by name.
 
   Touching a wall, or tipping over by 60 degrees, terminates; 1,200 control steps of 0.05 s
   truncate. Reset as in `car`, on settled springs. `Model.task` as in `car` where the name is the
-  same: strength (2,), velocity_limit (2,) [rad/s, m/s], steer_lag_s () [s], noise () [m],
-  reward_weights (2,); besides accel_max () [m/s2], speed_lag_s () [s], delay () [control steps, 0
-  to 3; a fraction gives the command's mean over the step], steer_offset () [rad], speed_noise ()
-  [m/s], yaw_rate_noise () [rad/s].
+  same; besides
+
+    accel_max: () [m/s2].
+    speed_lag_s: () [s].
+    delay: (), 0 to 3; a fraction gives the command's mean over the step [control steps].
+    steer_offset: () [rad].
+    speed_noise: () [m/s].
+    yaw_rate_noise: () [rad/s].
 
   Args:
     physics: `auto`, `native` or `mjx`.
@@ -297,14 +282,13 @@ class CarReal:
     self.course = Course(tracks)
     self.mj_model = load_model()
     self.wheels = tuple(self.mj_model.geom(f"wheel_{n}").id for n in WHEELS)
-    leaves = ("body_mass", "body_inertia", "body_ipos", "geom_friction", "dof_damping")
-    mj = {name: jnp.asarray(getattr(self.mj_model, name), jnp.float32) for name in leaves}
+    leaves = ("body_mass", "body_inertia", "body_ipos", "geom_friction", "dof_damping", "gravity")
     task: dict[str, Any] = {
-      name: car.nominal()[name] for name in ("strength", "velocity_limit", "reward_weights")
+      name: nominal()[name] for name in ("strength", "velocity_limit", "reward_weights")
     }
     task |= {i.leaf[5:]: i.simulator for i in GAP.values() if i.leaf.startswith("task.")}
     model = Model(
-      mj | {"gravity": jnp.asarray(self.mj_model.opt.gravity, jnp.float32)},
+      physics_lib.leaves(self.mj_model, *leaves),
       {name: jnp.asarray(value, jnp.float32) for name, value in task.items()},
       jnp.zeros(self.mj_model.nv),
     )
@@ -316,56 +300,30 @@ class CarReal:
     mujoco.mj_setConst(self.mj_model, data)
     mujoco.mj_step(self.mj_model, data, 400)  # 2 s: the springs settle
     self._rest = jnp.asarray(data.qpos, jnp.float32)
-    self.model, self.gap_items, self.reward_terms = model, GAP, tuple(car.REWARD_TERMS)
+    self.model, self.gap_items = model, GAP
     self.physics = physics_lib.make(physics, self.mj_model, SUBSTEPS, law=motor_law(self.mj_model))
-    spec = car.spec(
-      "car_real", self.course, acceptance=0.5
-    )  # no crash; the reference driver earns 0.95 without the gap, 0.64 with
+    # no crash; the reference driver earns 0.95 without the gap, 0.64 with
+    spec = racing.spec("car_real", self.course, acceptance=0.5)
     front, rear = self.wheels[:2], self.wheels[2:]
-    bodies = ("chassis",) + WHEELS
+    own = tuple((n, (g,)) for n, g in zip(WHEELS, self.wheels))
     self.spec = spec._replace(
-      feet=(("front", front), ("rear", rear))
-      + tuple((n, (g,)) for n, g in zip(WHEELS, self.wheels)),
-      bodies=tuple((n, (self.mj_model.body(n).id,)) for n in bodies),
+      feet=(("front", front), ("rear", rear), *own),
+      bodies=tuple((n, (self.mj_model.body(n).id,)) for n in ("chassis", *WHEELS)),
     )
 
   def widen(self, model: Model, name: str, share: jax.Array | float) -> Model:
     """The model with gap item `name` moved by `share` of its gap, see the function `widen`."""
     return widen(model, name, share, self.wheels)
 
-  def pose(self, state: EnvState) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array, jax.Array]:
-    """Privileged: track, x, y [m], yaw [rad] and speed ahead [m/s]."""
-    m = state.physics.motion
-    return state.physics.track, m.x, m.y, m.yaw, m.vx
-
   agents_of = "car"  # same observation, action and reward: what was learnt there may drive here
-  termination_rate = "collision_rate"
 
-  def measure(self, state: EnvState) -> dict[str, jax.Array]:
-    """mean_speed_m_s: speed along the track, float32 ()."""
-    m = state.physics.motion
-    sin, cos = jnp.sin(m.yaw), jnp.cos(m.yaw)
-    return {
-      "mean_speed_m_s": car.progress(
-        self.course, state.physics.track, m.x, m.y, cos * m.vx - sin * m.vy, sin * m.vx + cos * m.vy
-      )
-    }
-
-  def reference(self, state: EnvState) -> jax.Array:
-    """Action (2,) of the reference driver, which knows where the car is."""
-    return car.pure_pursuit(self, state)
-
-  def _observe(
-    self, model: Model, motion: car.Motion, track: jax.Array, key: jax.Array
-  ) -> jax.Array:
+  def _observe(self, model: Model, motion: Motion, track: jax.Array, key: jax.Array) -> jax.Array:
     key_lidar, key_own = jax.random.split(key)
     ranges = self.course.scan(track, motion.x, motion.y, motion.yaw)
     noise = jax.random.normal(key_own, (2,))
-    speed, yaw_rate = (
-      motion.vx + model.task["speed_noise"] * noise[0],
-      motion.yaw_rate + model.task["yaw_rate_noise"] * noise[1],
-    )
-    return car.observe(
+    speed = motion.vx + model.task["speed_noise"] * noise[0]
+    yaw_rate = motion.yaw_rate + model.task["yaw_rate_noise"] * noise[1]
+    return racing.observe(
       self.course, ranges, speed, yaw_rate, motion.steer, model.task["noise"], key_lidar
     )
 
@@ -376,7 +334,7 @@ class CarReal:
     zero = jnp.zeros(())
     turn = jnp.stack([jnp.cos(yaw / 2), zero, zero, jnp.sin(yaw / 2)])
     qpos = jnp.concatenate([jnp.stack([x, y]), self._rest[2:3], turn, self._rest[7:]])
-    motion = car.Motion(x, y, yaw, zero, zero, zero, zero)
+    motion = Motion(x, y, yaw, zero, zero, zero, zero)
     state = CarRealState(
       self.physics.init(qpos, jnp.zeros(self.mj_model.nv)),
       motion,
@@ -395,7 +353,7 @@ class CarReal:
     speed'  = command + exp(-0.05 s / lag) (speed - command)
     """
     last = state.physics
-    sent = jnp.concatenate([jnp.stack(car.command(action))[None], last.sent])
+    sent = jnp.concatenate([jnp.stack(racing.command(action))[None], last.sent])
     delay = jnp.clip(model.task["delay"], 0.0, LONGEST_DELAY)
     whole = jnp.minimum(delay.astype(jnp.int32), LONGEST_DELAY - 1)
     angle, speed = sent[whole] + (delay - whole) * (sent[whole + 1] - sent[whole])
@@ -407,12 +365,12 @@ class CarReal:
     )
     motion, upright = read_motion(out["qpos"], out["qvel"])
     key_noise, key = jax.random.split(last.key)
-    along = car.progress(
+    along = racing.progress(
       self.course, last.track, motion.x, motion.y, out["qvel"][0], out["qvel"][1]
     )
     crashed = self.course.collides(last.track, motion.x, motion.y, motion.yaw) | ~(upright > 0.5)
     obs, step = self._observe(model, motion, last.track, key_noise), state.step + 1
-    earned = car.reward(along, crashed, model.task["reward_weights"])
+    earned = racing.reward(along, crashed, model.task["reward_weights"])
     truncated = ~crashed & (step >= self.spec.episode_steps)
     arrived = CarRealState(backend, motion, last.track, sent[:-1], speed, key)
     return EnvState(arrived, step), Step(obs, earned, crashed, truncated, obs)

@@ -4,8 +4,6 @@ Model, observation, reward and reset follow DeepMind Control Suite's walker-walk
 figures from dm_control 1.0.50).
 """
 
-from __future__ import annotations
-
 import importlib.resources
 
 import jax
@@ -18,7 +16,7 @@ from mjx_cl.types import EnvState, Model, Spec, Step, Var
 STAND_HEIGHT = 1.2  # [m]
 WALK_SPEED = 1.0  # [m/s]
 BODIES = ("torso", "right_thigh", "right_leg", "right_foot", "left_thigh", "left_leg", "left_foot")
-# deviation of each channel over 64 robots and 900 steps of the shipped agent
+# deviation of each channel while the shipped agent walks
 SCALES = (
   0.027, 0.14, 0.46, 0.34, 0.22, 0.46, 0.52, 0.67, 0.045, 0.14, 0.2, 0.21, 0.1, 0.28, 0.067, 0.67,
   0.55, 2.2, 10.0, 16.0, 15.0, 3.0, 5.7, 7.4,
@@ -89,8 +87,8 @@ def reward(
 
   standing = 1 if height >= 1.2 m else 0.1 ** (((1.2 - height) / 0.6) ** 2)
   upright  = (1 + cos(torso angle)) / 2
-  reward   = (3 standing + upright) / 4 * (5 clip(v_x / speed asked, 0, 1) + 1) / 6       v_x =
-    centre-of-mass velocity [m/s]
+  reward   = (3 standing + upright) / 4 * (5 clip(v_x / speed asked, 0, 1) + 1) / 6
+  v_x      = velocity of the centre of mass [m/s]
   """
   height = 1.3 + qpos[0]
   short = jnp.maximum(STAND_HEIGHT - height, 0.0) / 0.6
@@ -99,6 +97,47 @@ def reward(
   _, speed = jax.jvp(lambda q: center_x(q, mass), (qpos,), (qvel,))
   move = jnp.clip(speed / speed_asked, 0.0, 1.0)
   return (weights[0] * standing + weights[1] * upright) / 4.0 * (weights[2] * move + 1.0) / 6.0
+
+
+def make_spec(mj_model: mujoco.MjModel) -> Spec:
+  """Names, units and groups, with the model's numbers of geoms and bodies."""
+  obs = (
+    *(Var(f"{b}_{k}", "1", -1, 1) for b in BODIES for k in ("xx", "xz")),
+    Var("height", "m"),
+    Var("vel_rootz", "m/s"),
+    Var("vel_rootx", "m/s"),
+    Var("vel_rooty", "rad/s"),
+    *(Var(f"vel_{j}", "rad/s") for j in JOINTS),
+  )
+  return Spec(
+    name="walker",
+    obs=tuple(v._replace(scale=s) for v, s in zip(obs, SCALES)),
+    act=tuple(Var(j, "1", -1, 1) for j in JOINTS),
+    control_s=0.025,
+    episode_steps=1000,
+    # mean reward per step; one that stands still earns 0.17, one that walks and never falls 0.95
+    acceptance=0.8,
+    posture=(14, 0.9),  # mean torso height [m]; 1.2 is standing, 0.3 is lying
+    targets=JOINTS,
+    act_groups=(("right_leg", (0, 1, 2)), ("left_leg", (3, 4, 5)), ("all", tuple(range(6)))),
+    obs_groups=(
+      ("orientations", tuple(range(14))),
+      ("height", (14,)),
+      ("velocities", tuple(range(15, 24))),
+    ),
+    feet=tuple((foot, (mj_model.geom(foot).id,)) for foot in ("right_foot", "left_foot")),
+    bodies=tuple((b, (mj_model.body(b).id,)) for b in BODIES),
+    watched=(
+      ("torso_orientation", (0, 1)),
+      ("right_orientation", tuple(range(2, 8))),
+      ("left_orientation", tuple(range(8, 14))),
+      ("height", (14,)),
+      ("torso_velocity", (15, 16)),
+      ("torso_pitch_rate", (17,)),
+      ("right_velocity", (18, 19, 20)),
+      ("left_velocity", (21, 22, 23)),
+    ),
+  )
 
 
 class Walker:
@@ -116,45 +155,7 @@ class Walker:
     low, high = self.mj_model.jnt_range[3:].T
     self._low, self._high = jnp.asarray(low, jnp.float32), jnp.asarray(high, jnp.float32)
     self._mass = jnp.asarray(self.mj_model.body_mass[1:], jnp.float32)
-    orientation = [Var(f"{b}_{k}", "1", -1, 1) for b in BODIES for k in ("xx", "xz")]
-    speeds = [Var("vel_rootz", "m/s"), Var("vel_rootx", "m/s"), Var("vel_rooty", "rad/s")] + [
-      Var(f"vel_{j}", "rad/s") for j in JOINTS
-    ]
-    obs = tuple(
-      v._replace(scale=s) for v, s in zip(orientation + [Var("height", "m")] + speeds, SCALES)
-    )
-    self.spec = Spec(
-      name="walker",
-      obs=obs,
-      act=tuple(Var(j, "1", -1, 1) for j in JOINTS),
-      control_s=0.025,
-      episode_steps=1000,
-      # mean reward per step; one that stands still earns 0.17, one that walks and never falls 0.95
-      acceptance=0.8,
-      posture=(14, 0.9),  # mean torso height [m]; 1.2 is standing, 0.3 is lying
-      targets=JOINTS,
-      act_groups=(("right_leg", (0, 1, 2)), ("left_leg", (3, 4, 5)), ("all", tuple(range(6)))),
-      obs_groups=(
-        ("orientations", tuple(range(14))),
-        ("height", (14,)),
-        ("velocities", tuple(range(15, 24))),
-      ),
-      feet=(
-        ("right_foot", (self.mj_model.geom("right_foot").id,)),
-        ("left_foot", (self.mj_model.geom("left_foot").id,)),
-      ),
-      bodies=tuple((b, (self.mj_model.body(b).id,)) for b in BODIES),
-      watched=(
-        ("torso_orientation", (0, 1)),
-        ("right_orientation", tuple(range(2, 8))),
-        ("left_orientation", tuple(range(8, 14))),
-        ("height", (14,)),
-        ("torso_velocity", (15, 16)),
-        ("torso_pitch_rate", (17,)),
-        ("right_velocity", (18, 19, 20)),
-        ("left_velocity", (21, 22, 23)),
-      ),
-    )
+    self.spec = make_spec(self.mj_model)
     self.reward_terms = tuple(REWARD_TERMS)
     self.model = Model(
       mj=physics_lib.leaves(
@@ -170,9 +171,9 @@ class Walker:
         "jnt_range",
         "gravity",
         backend=self.physics,
-      ),
+      ),  # fmt: skip
       task={
-        "reward_weights": jnp.asarray(list(REWARD_TERMS.values()), jnp.float32),
+        "reward_weights": jnp.asarray(WEIGHTS, jnp.float32),
         "command_range": jnp.asarray([WALK_SPEED], jnp.float32),
       },
       force=jnp.zeros(self.mj_model.nv),
@@ -185,8 +186,7 @@ class Walker:
     if "jnt_range" in model.mj:  # a joint that has lost range starts within what is left
       legs = jnp.clip(legs, *model.mj["jnt_range"][3:].T)
     root = jax.random.uniform(key_root, (), minval=-jnp.pi, maxval=jnp.pi)
-    qpos = jnp.concatenate([jnp.zeros(2), root[None], legs])
-    qvel = jnp.zeros(9)
+    qpos, qvel = jnp.concatenate([jnp.zeros(2), root[None], legs]), jnp.zeros(9)
     return EnvState(self.physics.init(qpos, qvel), jnp.int32(0)), observe(qpos, qvel)
 
   def step(self, model: Model, state: EnvState, action: jax.Array) -> tuple[EnvState, Step]:
@@ -194,11 +194,10 @@ class Walker:
     inner, out = self.physics.step(
       model.mj, state.physics, jnp.clip(action, -1.0, 1.0), force=model.force
     )
-    obs = observe(out["qpos"], out["qvel"])
-    step = state.step + 1
+    obs, step = observe(out["qpos"], out["qvel"]), state.step + 1
     mass = model.mj["body_mass"][1:] if "body_mass" in model.mj else self._mass
     earned = reward(
       out["qpos"], out["qvel"], mass, model.task["reward_weights"], model.task["command_range"][0]
     )
-    result = Step(obs, earned, jnp.bool_(False), step >= self.spec.episode_steps, obs)
-    return EnvState(inner, step), result
+    truncated = step >= self.spec.episode_steps
+    return EnvState(inner, step), Step(obs, earned, jnp.bool_(False), truncated, obs)

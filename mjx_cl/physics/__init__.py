@@ -16,20 +16,19 @@ the actuators get, at every physics step. `xp` is numpy (native, the whole batch
 written with `xp` alone and with `...` indices. `task` holds the leaves of types.Model.task.
 """
 
-from __future__ import annotations
+import types
+from collections.abc import Callable
+from typing import Any
 
-from typing import TYPE_CHECKING, Any
+import jax.numpy as jnp
+import mujoco
 
 from mjx_cl.errors import UserError
 from mjx_cl.io import runtime
+from mjx_cl.physics.native import Native
 
-if TYPE_CHECKING:
-  from collections.abc import Callable
-
-  import mujoco
-
-  from mjx_cl.physics.mjx import Mjx
-  from mjx_cl.physics.native import Native
+# in the place of a backend where there is none: no time is spent outside the compiled program
+PURE_JAX = types.SimpleNamespace(name="jax", seconds=0.0)
 
 
 def make(
@@ -38,16 +37,14 @@ def make(
   substeps: int,
   outputs: tuple[str, ...] = ("qpos", "qvel"),
   law: Callable[..., Any] | None = None,
-) -> Mjx | Native:
-  """Builds a backend. `auto` is `runtime.default_physics()`."""
+) -> Any:
+  """Builds a backend, a Native or an Mjx. `auto` is `runtime.default_physics()`."""
   if name == "auto":
     name = runtime.default_physics()
   if name == "native":
-    from mjx_cl.physics.native import Native
-
     return Native(mj_model, substeps, outputs, law)
   if name == "mjx":
-    from mjx_cl.physics.mjx import Mjx
+    from mjx_cl.physics.mjx import Mjx  # a costly import
 
     return Mjx(mj_model, substeps, outputs, law)
   raise UserError(f"unknown physics {name!r}; choose from: auto, native, mjx")
@@ -58,8 +55,10 @@ def leaves(mj_model: mujoco.MjModel, *names: str, backend: Any = None) -> dict:
 
   Fields that `backend` names as `inert`, because they do nothing there, are left out.
   """
-  import jax.numpy as jnp
-
-  value = lambda name: mj_model.opt.gravity if name == "gravity" else getattr(mj_model, name)
   inert = getattr(backend, "inert", ())
-  return {name: jnp.asarray(value(name), jnp.float32) for name in names if name not in inert}
+  values = {
+    name: getattr(mj_model.opt if name == "gravity" else mj_model, name)
+    for name in names
+    if name not in inert
+  }
+  return {name: jnp.asarray(value, jnp.float32) for name, value in values.items()}

@@ -13,74 +13,48 @@ nothing is registered, and `call` is a jax.pure_callback: the same numbers, but 
 compiled anew in every process.
 """
 
-from __future__ import annotations
-
 import ctypes
 import functools
+import math
 import threading
 import traceback
 import weakref
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jaxlib
 import numpy as np
 
-if TYPE_CHECKING:
-  from collections.abc import Callable
-
 TARGET = "mjx_cl_host"
 TESTED = "0.9.2"  # the jaxlib whose struct layouts these are
-_METADATA, _EXECUTE, _INTERNAL = (
-  1,
-  3,
-  13,
-)  # XLA_FFI_Extension_Metadata, XLA_FFI_ExecutionStage_EXECUTE, XLA_FFI_Error_Code_INTERNAL
-_P, _N = ctypes.c_void_p, ctypes.c_size_t
+# XLA_FFI_Extension_Metadata, XLA_FFI_ExecutionStage_EXECUTE, XLA_FFI_Error_Code_INTERNAL
+_METADATA, _EXECUTE, _INTERNAL = 1, 3, 13
+_BETWEEN = "|"  # in an attribute: between name and word
+_P, _N, _INT, _INT64 = ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int, ctypes.c_int64
+
+
+def _plain(*fields: tuple[str, Any]) -> Any:
+  return type("Struct", (ctypes.Structure,), {"_fields_": list(fields)})
 
 
 def _struct(*fields: tuple[str, Any]) -> Any:
   """A struct of the interface: its size, its extensions, then `fields`."""
-  return type(
-    "Struct", (ctypes.Structure,), {"_fields_": [("struct_size", _N), ("extension", _P), *fields]}
-  )
+  return _plain(("struct_size", _N), ("extension", _P), *fields)
 
 
-_Version = _struct(("major", ctypes.c_int), ("minor", ctypes.c_int))
-_Metadata = type(
-  "Metadata",
-  (ctypes.Structure,),
-  {"_fields_": [("struct_size", _N), ("version", _Version), ("traits", ctypes.c_uint32)]},
+_Version = _struct(("major", _INT), ("minor", _INT))
+_Metadata = _plain(("struct_size", _N), ("version", _Version), ("traits", ctypes.c_uint32))
+_Extension = _plain(
+  ("struct_size", _N), ("type", _INT), ("next", _P), ("metadata", ctypes.POINTER(_Metadata))
 )
-_Extension: Any = type(
-  "Extension",
-  (ctypes.Structure,),
-  {
-    "_fields_": [
-      ("struct_size", _N),
-      ("type", ctypes.c_int),
-      ("next", _P),
-      ("metadata", ctypes.POINTER(_Metadata)),
-    ]
-  },
-)
-_Span = type("Span", (ctypes.Structure,), {"_fields_": [("data", _P), ("size", _N)]})
-_Buffer = _struct(
-  ("dtype", ctypes.c_int),
-  ("data", _P),
-  ("rank", ctypes.c_int64),
-  ("dims", ctypes.POINTER(ctypes.c_int64)),
-)
-_Buffers = _struct(
-  ("size", ctypes.c_int64), ("types", _P), ("at", ctypes.POINTER(ctypes.POINTER(_Buffer)))
-)
+_Span = _plain(("data", _P), ("size", _N))
+_Buffer = _struct(("dtype", _INT), ("data", _P), ("rank", _INT64), ("dims", ctypes.POINTER(_INT64)))
+_Buffers = _struct(("size", _INT64), ("types", _P), ("at", ctypes.POINTER(ctypes.POINTER(_Buffer))))
 _Attributes = _struct(
-  ("size", ctypes.c_int64),
-  ("types", _P),
-  ("names", _P),
-  ("at", ctypes.POINTER(ctypes.POINTER(_Span))),
+  ("size", _INT64), ("types", _P), ("names", _P), ("at", ctypes.POINTER(ctypes.POINTER(_Span)))
 )
-_ErrorArgs = _struct(("message", ctypes.c_char_p), ("code", ctypes.c_int))
+_ErrorArgs = _struct(("message", ctypes.c_char_p), ("code", _INT))
 _Api = _struct(
   ("version", _Version),
   ("internal", _P),
@@ -89,7 +63,7 @@ _Api = _struct(
 _Frame = _struct(
   ("api", ctypes.POINTER(_Api)),
   ("context", _P),
-  ("stage", ctypes.c_int),
+  ("stage", _INT),
   ("args", _Buffers),
   ("results", _Buffers),
   ("attributes", _Attributes),
@@ -97,18 +71,14 @@ _Frame = _struct(
 
 _functions: weakref.WeakValueDictionary = weakref.WeakValueDictionary()
 _lock = threading.Lock()
-_BETWEEN = "|"  # in an attribute: between name and word
 
 
 def _array(buffer: Any) -> np.ndarray:
   """The buffer's numbers, uint32, without a copy."""
   shape = buffer.dims[: buffer.rank]
-  size = 4 * int(np.prod(shape, dtype=np.int64))
-  return (
-    np.frombuffer((ctypes.c_char * size).from_address(buffer.data), np.uint32).reshape(shape)  # type: ignore[call-overload]
-    if size
-    else np.zeros(shape, np.uint32)
-  )
+  size = math.prod(shape)
+  memory = (ctypes.c_uint32 * size).from_address(buffer.data) if size else ()
+  return np.asarray(memory, np.uint32).reshape(shape)
 
 
 def _look_up(name: str, word: str) -> Callable[[np.ndarray], np.ndarray]:
@@ -136,8 +106,8 @@ def _handler(pointer: Any) -> int | None:
   if frame.extension:
     extension = _Extension.from_address(frame.extension)
     if extension.type == _METADATA:
-      version = extension.metadata.contents.version
-      version.major, version.minor = 0, 3
+      extension.metadata.contents.version.major = 0
+      extension.metadata.contents.version.minor = 3
       return None
   if frame.stage != _EXECUTE:
     return None

@@ -1,10 +1,9 @@
 """The same MuJoCo model in pure JAX."""
 
-from __future__ import annotations
-
 import contextlib
 import io
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,12 +13,8 @@ import numpy as np
 from mjx_cl.errors import UserError
 from mjx_cl.physics.fields import DERIVING
 
-if TYPE_CHECKING:
-  from collections.abc import Callable
-
-with contextlib.redirect_stdout(
-  io.StringIO()
-):  # the import prints a line on standard output when warp is absent
+# the import prints a line on standard output when warp is absent
+with contextlib.redirect_stdout(io.StringIO()):
   from mujoco import mjx
 
 
@@ -84,27 +79,24 @@ class Mjx:
     data = mjx.com_pos(m, mjx.kinematics(m, self._data.replace(qpos=m.qpos0)))
     mass = mjx.full_m(m, mjx.crb(m, data))
     inverse = jnp.linalg.inv(mass)
-    children = jnp.asarray(
-      [[_below(host, b, root) for b in range(host.nbody)] for root in range(host.nbody)],
-      jnp.float32,
-    )
+    below = np.eye(host.nbody, dtype=np.float32)  # [b, c]: c is b or hangs on it
+    for b in range(1, host.nbody):
+      below[:, b] += below[:, host.body_parentid[b]]
     dof = jnp.diag(inverse)
     for j in range(host.njnt):
       at = host.jnt_dofadr[j]
-      for begin in {
-        mujoco.mjtJoint.mjJNT_FREE: (at, at + 3),
-        mujoco.mjtJoint.mjJNT_BALL: (at,),
-      }.get(host.jnt_type[j], ()):
+      starts = {mujoco.mjtJoint.mjJNT_FREE: (at, at + 3), mujoco.mjtJoint.mjJNT_BALL: (at,)}
+      for begin in starts.get(host.jnt_type[j], ()):
         dof = dof.at[begin : begin + 3].set(jnp.mean(dof[begin : begin + 3]))
-    weights = [jnp.zeros(2)]
-    for b in range(1, host.nbody):
+    weights = []
+    for b in range(host.nbody):
       if host.body_weldid[b] == 0:
         weights.append(jnp.zeros(2))
-        continue
-      jacobians = mjx.jac(m, data, data.xipos[b], b)  # (nv, 3) each
-      weights.append(jnp.stack([jnp.trace(j.T @ inverse @ j) / 3 for j in jacobians]))
+      else:
+        jacobians = mjx.jac(m, data, data.xipos[b], b)  # (nv, 3) each
+        weights.append(jnp.stack([jnp.trace(j.T @ inverse @ j) / 3 for j in jacobians]))
     return {
-      "body_subtreemass": children @ m.body_mass,
+      "body_subtreemass": jnp.asarray(below) @ m.body_mass,
       "dof_invweight0": dof,
       "body_invweight0": jnp.stack(weights),
     }
@@ -121,19 +113,17 @@ class Mjx:
     model = self.model(fields)
     if force is not None:
       state = state.replace(qfrc_applied=jnp.asarray(force, state.qfrc_applied.dtype))
-    extra = {}
-    if self.law is None:
+    extra, law = {}, self.law
+    if law is None:
       state = state.replace(ctrl=jnp.asarray(ctrl, state.ctrl.dtype))
       state, _ = jax.lax.scan(
         lambda d, _: (mjx.step(model, d), None), state, None, length=self.substeps
       )
     else:
 
-      def one(
-        carry: tuple[mjx.Data, jax.Array, jax.Array], _: None
-      ) -> tuple[tuple[mjx.Data, jax.Array, jax.Array], None]:
+      def one(carry: tuple[mjx.Data, jax.Array, jax.Array], _: None) -> tuple[Any, None]:
         d = carry[0]
-        actuators = jnp.asarray(self.law(jnp, task, ctrl, d.qpos, d.qvel), d.ctrl.dtype)  # type: ignore[misc]
+        actuators = jnp.asarray(law(jnp, task, ctrl, d.qpos, d.qvel), d.ctrl.dtype)
         return (mjx.step(model, d.replace(ctrl=actuators)), actuators, d.qvel), None
 
       (state, actuators, before), _ = jax.lax.scan(
@@ -151,10 +141,3 @@ def _anywhere(tree: Any) -> Any:
   and robots could not be sharded.
   """
   return jax.tree.map(lambda x: jnp.asarray(np.asarray(x)), tree)
-
-
-def _below(model: mujoco.MjModel, body: int, root: int) -> bool:
-  """Whether `body` is `root` or hangs on it."""
-  while body != root and body:
-    body = model.body_parentid[body]
-  return body == root

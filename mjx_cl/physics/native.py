@@ -6,17 +6,17 @@ every overridden model field before it steps, so no result depends on what the b
 before: XLA may repeat or reorder callbacks, and instances of one model share a host.
 """
 
-from __future__ import annotations
-
 import copy
 import functools
 import hashlib
 import json
+import math
 import threading
 import time
 import types
 import uuid
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -27,9 +27,6 @@ from mjx_cl.errors import UserError
 from mjx_cl.physics import host_call
 from mjx_cl.physics.fields import DERIVING
 
-if TYPE_CHECKING:
-  from collections.abc import Callable
-
 
 def float64_bits(x: jax.Array) -> jax.Array:
   """Float32 (n,) -> uint32 (2n,), the little-endian bits of the same numbers as float64.
@@ -39,10 +36,8 @@ def float64_bits(x: jax.Array) -> jax.Array:
   """
   bits = jax.lax.bitcast_convert_type(jnp.asarray(x, jnp.float32), jnp.uint32)
   sign, exponent, mantissa = bits & jnp.uint32(0x80000000), (bits >> 23) & 0xFF, bits & 0x7FFFFF
-  normal = exponent > 0
-  high = jnp.where(
-    normal, sign | ((exponent + 896) << 20) | (mantissa >> 3), sign
-  )  # 1023 - 127 = 896
+  normal, shift = exponent > 0, 1023 - 127  # what the two formats add to an exponent
+  high = jnp.where(normal, sign | ((exponent + shift) << 20) | (mantissa >> 3), sign)
   low = jnp.where(normal, (mantissa & 7) << 29, jnp.uint32(0))
   return jnp.stack([low, high], -1).reshape(-1)
 
@@ -119,14 +114,11 @@ class Native:
         "physics 'native' needs the package mjbatch (pip install mjbatch==0.1.4; Linux and macOS)"
       ) from None
     self.mj_model, self.substeps, self.outputs, self.law = mj_model, substeps, tuple(outputs), law
-    make, name = (
-      lambda: Host(copy.copy(mj_model), substeps, self.outputs, law),
-      identity(mj_model, substeps, self.outputs, law),
-    )
+    make = lambda: Host(copy.copy(mj_model), substeps, self.outputs, law)
+    name = identity(mj_model, substeps, self.outputs, law)
     self.host = host_call.shared(name, make)
-    if getattr(self.host.law, "__globals__", None) is not getattr(
-      law, "__globals__", None
-    ):  # the same words in another module of the same name
+    of = lambda function: getattr(function, "__globals__", None)
+    if of(self.host.law) is not of(law):  # the same words in another module of the same name
       name = uuid.uuid4().hex
       self.host = host_call.shared(name, make)
     self._name = name
@@ -142,14 +134,8 @@ class Native:
     callback.
     """
     at = 2 * self._qpos_at
-    nq, nv = 2 * self.mj_model.nq, 2 * self.mj_model.nv
-    row = jnp.asarray(self.host.template)
-    return (
-      row.at[at : at + nq]
-      .set(float64_bits(qpos))
-      .at[at + nq : at + nq + nv]
-      .set(float64_bits(qvel))
-    )
+    bits = jnp.concatenate([float64_bits(qpos), float64_bits(qvel)])
+    return jnp.asarray(self.host.template).at[at : at + bits.shape[0]].set(bits)
 
   def step(
     self,
@@ -164,31 +150,29 @@ class Native:
     Everything crosses to the host and back as one array of bits each way: one operand, whatever the
     fields.
     """
-    given = (
-      {"ctrl": ctrl}
-      | ({} if force is None else {"force": force})
-      | {f"field {k}": v for k, v in fields.items()}
-    )
+    given = {"ctrl": ctrl} | ({} if force is None else {"force": force})
+    given |= {f"field {k}": v for k, v in fields.items()}
     given |= {f"task {k}": v for k, v in (task or {}).items()} if self.law is not None else {}
     given = {k: jnp.asarray(v, jnp.float32) for k, v in given.items()}
     layout = json.dumps([(k, v.shape) for k, v in given.items()])
-    bits = lambda x: jax.lax.bitcast_convert_type(x, jnp.uint32).reshape(-1)
-    width = state.shape[0] + sum(int(np.prod(s)) for s in self.host.shapes.values())
-    out = host_call.call(
-      self._name, layout, width, jnp.concatenate([state] + [bits(v) for v in given.values()])
-    )
-    values, at = {}, state.shape[0]
-    for name, shape in self.host.shapes.items():
-      size = int(np.prod(shape))
-      values[name] = jax.lax.bitcast_convert_type(out[at : at + size], jnp.float32).reshape(shape)
-      at += size
-    return out[: state.shape[0]], values
+    bits = [jax.lax.bitcast_convert_type(v, jnp.uint32).reshape(-1) for v in given.values()]
+    shapes = self.host.shapes
+    *ends, width = np.cumsum([state.shape[0], *(math.prod(s) for s in shapes.values())]).tolist()
+    out = host_call.call(self._name, layout, width, jnp.concatenate([state, *bits]))
+    row, *parts = jnp.split(out, ends)
+    return row, {
+      name: jax.lax.bitcast_convert_type(part, jnp.float32).reshape(shape)
+      for (name, shape), part in zip(shapes.items(), parts)
+    }
 
 
 @functools.cache
-def _read(layout: str) -> tuple:
-  """(name, shape, size) of every array behind the state, as `Native.step` wrote them."""
-  return tuple((name, tuple(shape), int(np.prod(shape))) for name, shape in json.loads(layout))
+def _read(layout: str) -> tuple[dict[str, tuple[int, ...]], np.ndarray]:
+  """{name: shape} of every array behind the state, as `Native.step` wrote them, and where each
+  begins.
+  """
+  shapes = {name: tuple(shape) for name, shape in json.loads(layout)}
+  return shapes, np.cumsum([0, *map(math.prod, shapes.values())])[:-1]
 
 
 class Host:
@@ -207,9 +191,6 @@ class Host:
     outputs: tuple[str, ...],
     law: Callable[..., Any] | None,
   ) -> None:
-    import mjbatch
-
-    self._mjbatch = mjbatch
     self.mj_model, self.substeps, self.outputs, self.law = mj_model, substeps, outputs, law
     self._forward = any(o not in ("qpos", "qvel") for o in outputs)
     data = mujoco.MjData(mj_model)
@@ -228,23 +209,17 @@ class Host:
     """`step` on one array of bits, (..., state + everything in `layout`) -> (..., state
     + outputs).
     """
-    lead, at, given = packed.shape[:-1], self.template.shape[0], {}
-    for name, shape, size in _read(layout):
-      given[name] = packed[..., at : at + size].view(np.float32).reshape(lead + shape)
-      at += size
-    part = lambda kind: {
-      k[len(kind) + 1 :]: v for k, v in given.items() if k.startswith(kind + " ")
+    shapes, begins = _read(layout)
+    state, *parts = np.split(packed, len(self.template) + begins, -1)
+    lead = packed.shape[:-1]
+    given = {
+      name: part.view(np.float32).reshape(lead + shape)
+      for (name, shape), part in zip(shapes.items(), parts)
     }
-    rows, out = self.step(
-      part("field"),
-      packed[..., : self.template.shape[0]],
-      given["ctrl"],
-      part("task"),
-      given.get("force"),
-    )
-    return np.concatenate(
-      [rows] + [out[o].reshape(lead + (-1,)).view(np.uint32) for o in self.shapes], -1
-    )
+    named = lambda kind: {k.removeprefix(kind): v for k, v in given.items() if k.startswith(kind)}
+    rows, out = self.step(named("field "), state, given["ctrl"], named("task "), given.get("force"))
+    flat = [out[o].reshape(lead + (-1,)).view(np.uint32) for o in self.shapes]
+    return np.concatenate([rows, *flat], -1)
 
   def step(
     self,
@@ -258,7 +233,7 @@ class Host:
     begin = time.perf_counter()
     state = np.asarray(state)
     lead, width = state.shape[:-1], state.shape[-1]
-    num = int(np.prod(lead, dtype=np.int64))
+    num = math.prod(lead)
     flat = lambda x: np.asarray(x).reshape((num,) + np.shape(x)[len(lead) :])
     with self._lock:
       batch, views = self._batch(num, tuple(sorted(fields)), force is not None)
@@ -272,23 +247,15 @@ class Host:
         batch.step(nstep=self.substeps)
       else:
         task, ctrl = {k: flat(v) for k, v in (task or {}).items()}, flat(ctrl)
-        qpos, qvel = views["qpos"], views["qvel"]
-        for k in range(self.substeps):
-          views["ctrl"][...] = self.law(np, task, ctrl, qpos, qvel)
-          if k == self.substeps - 1:
-            extra = {
-              "ctrl": np.array(views["ctrl"], np.float32),
-              "qvel_before": np.array(qvel, np.float32),
-            }
+        for _ in range(self.substeps):
+          views["ctrl"][...] = self.law(np, task, ctrl, views["qpos"], views["qvel"])
+          extra = {"ctrl": views["ctrl"].copy(), "qvel_before": views["qvel"].copy()}
           batch.step(nstep=1)
-        extra = {k: v.reshape(lead + v.shape[1:]) for k, v in extra.items()}
-      out = {
-        o: np.array(views["out " + o], np.float32).reshape(lead + self.shapes[o])
-        for o in self.outputs
-      }
+      out = {o: views["out " + o] for o in self.outputs} | extra
+      out = {k: np.array(v, np.float32).reshape(lead + v.shape[1:]) for k, v in out.items()}
       rows = np.array(views["state"]).view(np.uint32).reshape(lead + (width,))
       self.seconds += time.perf_counter() - begin
-      return rows, out | extra
+      return rows, out
 
   def _write_fields(
     self, batch: Any, views: dict[str, np.ndarray], fields: dict[str, np.ndarray], num: int
@@ -300,14 +267,12 @@ class Host:
     for name, value in fields.items():
       view, own, held = views["field " + name], views["nominal " + name], views["held " + name]
       value = np.asarray(value).reshape(view.shape)
-      if np.array_equal(
-        value, held
-      ):  # what a field holds is a function of the last value written alone, so it is there already
+      # what a field holds follows from the last value written alone, so it is there already
+      if np.array_equal(value, held):
         continue
       held[...] = value
-      value = np.where(
-        value == own.astype(np.float32), own, value
-      )  # float32 cannot hold every nominal value: severity 0 is the model itself
+      # float32 cannot hold every nominal value: severity 0 is the model itself
+      value = np.where(value == own.astype(np.float32), own, value)
       if name in DERIVING:
         stale |= (view != value).reshape(num, -1).any(1)
       view[...] = value
@@ -317,22 +282,18 @@ class Host:
   def _batch(
     self, num: int, fields: tuple[str, ...], force: bool
   ) -> tuple[Any, dict[str, np.ndarray]]:
+    import mjbatch
+
     key = (num, fields, force)
     if key not in self._batches:
-      batch = self._mjbatch.Batch(self.mj_model, num, forward=self._forward)
-      views = {
-        "state": batch.bind("state"),
-        "ctrl": batch.bind("ctrl"),
-        "qpos": batch.bind("qpos"),
-        "qvel": batch.bind("qvel"),
-      }
+      batch = mjbatch.Batch(self.mj_model, num, forward=self._forward)
+      views = {name: batch.bind(name) for name in ("state", "ctrl", "qpos", "qvel")}
       if force:
         views["force"] = batch.bind("qfrc_applied")
-      views |= {"field " + f: batch.expand(f) for f in fields}
-      views |= {
-        "held " + f: np.full(views["field " + f].shape, np.nan, np.float32) for f in fields
-      }  # equal to nothing yet
-      views |= {"nominal " + f: np.array(views["field " + f][0]) for f in fields}
+      for f in fields:
+        view = batch.expand(f)
+        held = np.full(view.shape, np.nan, np.float32)  # equal to nothing yet
+        views |= {"field " + f: view, "held " + f: held, "nominal " + f: np.array(view[0])}
       views |= {"out " + o: batch.bind(o) for o in self.outputs}
       self._batches[key] = (batch, views)
     return self._batches[key]

@@ -1,17 +1,19 @@
-"""figure.png of a run: the paper's two panels, mean and standard deviation over the streams of arm
-`detector`, arm `none` in grey, one aborted run dotted.
+"""The figures of results: a run's two panels, a suite's shares not yet recovered and its train
+ratios.
 """
-
-from __future__ import annotations
 
 import os
 import pathlib
 import warnings
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from mjx_cl.errors import FileError
 from mjx_cl.io import folders, tables
+from mjx_cl.scoring import survival as estimate
 
 UPPER = (("reward", "reward per step"), ("opr", "OPR"), ("rpr", "RPR"))
 LOWER = (
@@ -20,6 +22,12 @@ LOWER = (
   ("value_loss", "value loss [nats]"),
 )
 COLORS = ("#1f5fa8", "#c4472b", "#3b8a4a")
+DASHES = ("--", ":", "-.")  # of arm `none`
+MARKS = (
+  (("start",), "v", "k", "alarm, finetuning starts"),
+  (("stop", "abort"), "^", "w", "finetuning ends"),
+)
+FEW = 3  # seeds that give no interval, see report.few
 
 
 def smooth(values: np.ndarray, width: int) -> np.ndarray:
@@ -33,150 +41,113 @@ def smooth(values: np.ndarray, width: int) -> np.ndarray:
 
 
 def figure(folder: os.PathLike | str, width: int = 500) -> pathlib.Path:
-  """Draws FOLDER/figure.png from its trace, events and config.
+  """Draws FOLDER/figure.png from its trace, events and config: the paper's two panels, mean and
+  standard deviation over the streams of arm `detector` (or the first arm but `none`), arm `none` in
+  grey, one aborted run dotted.
 
   Args:
+    folder: of the run.
     width: steps of the trailing mean that every curve is drawn with.
 
   Raises:
     FileError where these are missing, broken or not a run's.
   """
+  folder = pathlib.Path(folder)
   try:
-    return _figure(folder, width)
+    drawn = _figure(
+      tables.read_table(folder / "trace.parquet"),
+      tables.read_table(folder / "events.parquet"),
+      tables.read_json(folder / "config.json"),
+      width,
+    )
   except (KeyError, ValueError, TypeError) as e:
     raise FileError(
       f"{folder} holds no run that can be drawn: {type(e).__name__}: "
       f"{str(e).splitlines()[0] if str(e) else ''}"
     ) from None
+  return _saved(drawn, folder / "figure.png", 130)
 
 
-def _figure(folder: os.PathLike | str, width: int) -> pathlib.Path:
-  import matplotlib
+def _saved(drawn: Figure, path: pathlib.Path, dpi: int = 110) -> pathlib.Path:
+  folders.atomic(path, lambda file: drawn.savefig(file, format="png", dpi=dpi))
+  return path
 
-  matplotlib.use("Agg")
-  import matplotlib.pyplot as plt
 
-  folder = pathlib.Path(folder)
-  trace, events = (
-    tables.read_table(folder / "trace.parquet"),
-    tables.read_table(folder / "events.parquet"),
-  )
-  config = tables.read_json(folder / "config.json")
-  steps = int(trace["step"].max()) + 1
-  control_s = config["control_s"]
-  panels = {}
+def _figure(trace: dict, events: dict, config: dict, width: int) -> Figure:
+  steps, control_s = int(trace["step"].max()) + 1, config["control_s"]
   arms = list(dict.fromkeys(trace["arm"]))
   main = "detector" if "detector" in arms else next((arm for arm in arms if arm != "none"), "none")
-  for arm in arms:
-    if arm in (main, "none"):
-      mask = trace["arm"] == arm
-      panels[arm] = {
-        c: np.asarray(trace[c][mask], float).reshape(-1, steps) for c, _ in UPPER + LOWER
-      }
-  failed = next(
-    (
-      g
-      for g, k, a in zip(events["stream"], events["kind"], events["arm"])
-      if k == "abort" and a == main
-    ),
-    None,
-  )
-  fig, axes = plt.subplots(2, 1, figsize=(10, 7.2), sharex=True, constrained_layout=True)
-  x = np.arange(steps)
-  every = max(1, steps // 2000)
+  own = [
+    (int(s), k, g)
+    for s, k, a, g in zip(*(events[c] for c in ("step", "kind", "arm", "stream")))
+    if a == main
+  ]
+  aborted = next((stream for _, kind, stream in own if kind == "abort"), None)
+  drawn = Figure(figsize=(10, 7.2), layout="constrained")
+  axes = drawn.subplots(2, 1, sharex=True)
   for axis, columns in zip(axes, (UPPER, LOWER)):
     hosts = [axis, axis.twinx(), axis.twinx()]
     hosts[2].spines["right"].set_position(("axes", 1.09))
-    for host, (column, label), color in zip(hosts, columns, COLORS):
-      top = 0.0
-      for arm, data in panels.items():
-        curves = smooth(data[column], width)
-        with warnings.catch_warnings():  # the first rows of a run have no residual yet
-          warnings.simplefilter("ignore", RuntimeWarning)
-          mean, std = np.nanmean(curves, 0), np.nanstd(curves, 0)
-        shade = color if arm == main else "0.6"
-        host.plot(
-          x[::every],
-          mean[::every],
-          color=shade,
-          lw=1.6 if arm == main else 1.0,
-          zorder=3 if arm == main else 1,
-          ls="-" if arm == main else ("--", ":", "-.")[columns.index((column, label))],
-        )
-        if arm == main:
-          host.fill_between(
-            x[::every], (mean - std)[::every], (mean + std)[::every], color=color, alpha=0.14, lw=0
-          )
-        top = max(top, np.nanmax((mean + std)[min(width, steps - 1) :], initial=0.0))
-      if failed is not None:  # one run that was given up, on its own
-        curve = smooth(np.asarray(trace[column][trace["stream"] == failed], float)[None], width)[0]
-        host.plot(
-          x[::every],
-          curve[::every],
-          color=color,
-          lw=0.7,
-          ls=":",
-          zorder=2,
-          label=f"stream {int(failed)}, aborted" if column == "reward" else None,
-        )
-      host.set_ylim(0, 1.1 * top if top else 1)
+    for host, (column, label), color, dash in zip(hosts, columns, COLORS, DASHES):
+      values = {
+        arm: np.asarray(trace[column][trace["arm"] == arm], float).reshape(-1, steps)
+        for arm in arms
+        if arm in (main, "none")
+      }
+      _curves(host, values, main, width, color, dash)
+      if aborted is not None:  # one run that was given up, on its own
+        curve = smooth(np.asarray(trace[column][trace["stream"] == aborted], float)[None], width)[0]
+        name = f"stream {int(aborted)}, aborted" if column == "reward" else None
+        host.plot(*_thin(curve), color=color, lw=0.7, ls=":", zorder=2, label=name)
       host.set_ylabel(label, color=color)
       host.tick_params(axis="y", colors=color)
-    onset = [int(s) for s, k in zip(events["step"], events["kind"]) if k == "onset"]
-    starts = [
-      int(s)
-      for s, k, a in zip(events["step"], events["kind"], events["arm"])
-      if k == "start" and a == main
-    ]
-    stops = [
-      int(s)
-      for s, k, a in zip(events["step"], events["kind"], events["arm"])
-      if k in ("stop", "abort") and a == main
-    ]
-    for s in sorted(set(onset)):
+    for s in sorted({int(s) for s, k in zip(events["step"], events["kind"]) if k == "onset"}):
       axis.axvline(s, color="k", lw=1.3)
-    low, high = axis.get_ylim()
-    # in_layout: an empty line that is not clipped has no extent, and the layout would collapse
-    axis.plot(
-      starts,
-      [high * 0.985] * len(starts),
-      "v",
-      color="k",
-      ms=5,
-      clip_on=False,
-      in_layout=False,
-      label="alarm, finetuning starts",
-    )
-    axis.plot(
-      stops,
-      [high * 0.985] * len(stops),
-      "^",
-      mfc="w",
-      mec="k",
-      ms=5,
-      clip_on=False,
-      in_layout=False,
-      label="finetuning ends",
-    )
+    for kinds, marker, face, label in MARKS:
+      at = [s for s, kind, _ in own if kind in kinds]
+      high = [axis.get_ylim()[1] * 0.985] * len(at)
+      # in_layout: an empty line that is not clipped has no extent, and the layout would collapse
+      axis.plot(
+        at, high, marker, color="k", mfc=face, ms=5, clip_on=False, in_layout=False, label=label
+      )
+  # a preset has a severity for each of its faults
+  severity = "" if config["severity"] is None else f" {config['severity']:g}"
   axes[0].legend(loc="lower right", fontsize=8, framealpha=0.9)
-  severity = (
-    "" if config["severity"] is None else f" {config['severity']:g}"
-  )  # a preset has one for each of its faults
   axes[0].set_title(
     f"{config['env']}: {config['fault']}{severity} at step {config['onset']:,}; "
-    f"{panels[main]['opr'].shape[0]} streams, mean and "
+    f"{(trace['arm'] == main).sum() // steps} streams, mean and "
     f"standard deviation\narm {main} in colour"
-    + (", arm none in grey" if "none" in panels and main != "none" else "")
+    + (", arm none in grey" if "none" in arms and main != "none" else "")
     + f"; curves are trailing means of {width} steps",
     fontsize=10,
   )
   axes[1].set_xlabel(f"control step ({control_s:g} s)")
-  folders.atomic(folder / "figure.png", lambda file: fig.savefig(file, format="png", dpi=130))
-  plt.close(fig)
-  return folder / "figure.png"
+  return drawn
 
 
-FEW = 3  # seeds that give no interval, see report.few
+def _thin(*curves: np.ndarray) -> list[np.ndarray]:
+  """Steps and curves, of some 2,000 points each."""
+  steps = np.arange(len(curves[0]))
+  return [y[:: max(1, len(steps) // 2000)] for y in (steps, *curves)]
+
+
+def _curves(
+  host: Axes, values: dict[str, np.ndarray], main: str, width: int, color: str, dash: str
+) -> None:
+  """Trailing means of one signal, {arm: (streams, steps)}, and the axis from 0 to above them."""
+  top = 0.0
+  for arm, curves in values.items():
+    curves = smooth(curves, width)
+    with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # no residual yet
+      mean, std = np.nanmean(curves, 0), np.nanstd(curves, 0)
+    if arm == main:
+      host.plot(*_thin(mean), color=color, lw=1.6, zorder=3, ls="-")
+      x, low, high = _thin(mean - std, mean + std)
+      host.fill_between(x, low, high, color=color, alpha=0.14, lw=0)
+    else:
+      host.plot(*_thin(mean), color="0.6", lw=1.0, zorder=1, ls=dash)
+    top = max(top, np.nanmax((mean + std)[min(width, len(mean) - 1) :], initial=0.0))
+  host.set_ylim(0, 1.1 * top if top else 1)
 
 
 def survival(out: os.PathLike | str, parts: list[str], columns: int = 3) -> pathlib.Path | None:
@@ -187,74 +158,45 @@ def survival(out: os.PathLike | str, parts: list[str], columns: int = 3) -> path
   Returns:
     The file; None where no part has an affected stream.
   """
-  import matplotlib
-
-  matplotlib.use("Agg")
-  import matplotlib.pyplot as plt
-
-  from mjx_cl.scoring import survival as estimate
-
-  out, drawn = pathlib.Path(out), []
+  out, shown = pathlib.Path(out), []
   for part in parts:
-    rows, config = (
-      tables.read_rows(out / part / "runs.parquet"),
-      tables.read_json(out / part / "config.json"),
-    )
+    rows = tables.read_rows(out / part / "runs.parquet")
+    config = tables.read_json(out / part / "config.json")
     if any(r["affected"] for r in rows if not r["change"]):
-      drawn.append((part, rows, config))
-  if not drawn:
+      shown.append((part, rows, config))
+  if not shown:
     return None
-  lines = -(-len(drawn) // columns)
-  fig, axes = plt.subplots(
-    lines,
-    min(columns, len(drawn)),
-    figsize=(4.2 * min(columns, len(drawn)), 3.3 * lines),
-    squeeze=False,
-    constrained_layout=True,
-  )
-  for axis in axes.flat[len(drawn) :]:
+  lines, wide = -(-len(shown) // columns), min(columns, len(shown))
+  drawn = Figure(figsize=(4.2 * wide, 3.3 * lines), layout="constrained")
+  axes = drawn.subplots(lines, wide, squeeze=False)
+  for axis in axes.flat[len(shown) :]:
     axis.set_axis_off()
-  for axis, (part, rows, config) in zip(axes.flat, drawn):
+  for axis, (part, rows, config) in zip(axes.flat, shown):
     for k, arm in enumerate(config["arms"]):
       own = [
         dict(r, affected=bool(r["affected"]) and not r["change"]) for r in rows if r["arm"] == arm
       ]
-      if not any(r["affected"] for r in own):
-        continue
-      time, seen = estimate.of_runs(own, config["steps"])
-      curve = estimate.kaplan_meier(time, seen)
-      x, level = [0.0, *curve.time, curve.last], [1.0, *curve.survival]
-      axis.step(
-        x,
-        level + level[-1:],
-        where="post",
-        color=f"C{k}",
-        lw=1.6,
-        label=f"{arm}, {int(seen.sum())} of {len(seen)}",
-      )
-      bounds = [[1.0, *side, *side[-1:]] for side in (curve.low, curve.high)]
-      axis.fill_between(
-        x,
-        *(side if len(side) == len(x) else [1.0] * len(x) for side in bounds),
-        step="post",
-        color=f"C{k}",
-        alpha=0.12,
-        lw=0,
-      )
-      axis.plot(
-        time[~seen],
-        [level[int(np.searchsorted(curve.time, t, "right"))] for t in time[~seen]],
-        "|",
-        color=f"C{k}",
-        ms=7,
-      )
+      if any(r["affected"] for r in own):
+        _share(axis, *estimate.of_runs(own, config["steps"]), arm, f"C{k}")
     axis.set(title=part, xlabel="control steps since onset", ylim=(-0.03, 1.05))
     axis.locator_params(axis="x", nbins=5)
     axis.legend(fontsize=7, title="recovered", title_fontsize=7)
   axes[0, 0].set_ylabel("share not yet recovered")
-  folders.atomic(out / "recovery.png", lambda file: fig.savefig(file, format="png", dpi=110))
-  plt.close(fig)
-  return out / "recovery.png"
+  return _saved(drawn, out / "recovery.png")
+
+
+def _share(axis: Axes, time: np.ndarray, seen: np.ndarray, arm: str, color: str) -> None:
+  """Share not yet recovered by the times of recovery, or of censoring where none was seen."""
+  curve = estimate.kaplan_meier(time, seen)
+  x, level = [0.0, *curve.time, curve.last], [1.0, *curve.survival]
+  label = f"{arm}, {int(seen.sum())} of {len(seen)}"
+  axis.step(x, level + level[-1:], where="post", color=color, lw=1.6, label=label)
+  bounds = [[1.0, *side, *side[-1:]] for side in (curve.low, curve.high)]
+  low, high = (side if len(side) == len(x) else [1.0] * len(x) for side in bounds)
+  axis.fill_between(x, low, high, step="post", color=color, alpha=0.12, lw=0)
+  lost = time[~seen]
+  heights = [level[int(np.searchsorted(curve.time, t, "right"))] for t in lost]
+  axis.plot(lost, heights, "|", color=color, ms=7)
 
 
 def ratios(out: os.PathLike | str, points: list[dict]) -> pathlib.Path | None:
@@ -263,52 +205,21 @@ def ratios(out: os.PathLike | str, points: list[dict]) -> pathlib.Path | None:
   interval, and no line joins them to others, which are of other seeds too.
 
   Args:
+    out: folder.
     points: {line, ratio, mean, ci (low, high) or None, n, recovered} of parts with affected
       streams.
 
   Returns:
     The file; None where no line has two ratios.
   """
-  import matplotlib
-
-  matplotlib.use("Agg")
-  import matplotlib.pyplot as plt
-
-  out = pathlib.Path(out)
-  lines = {
-    p["line"]: sorted((q for q in points if q["line"] == p["line"]), key=lambda q: q["ratio"])
-    for p in points
-  }
+  by_ratio = sorted(points, key=lambda p: p["ratio"])
+  lines = {p["line"]: [q for q in by_ratio if q["line"] == p["line"]] for p in points}
   if not any(len({p["ratio"] for p in own}) > 1 for own in lines.values()):
     return None
-  fig, axis = plt.subplots(figsize=(6, 4), constrained_layout=True)
+  drawn = Figure(figsize=(6, 4), layout="constrained")
+  axis = drawn.subplots()
   for k, (line, own) in enumerate(lines.items()):
-    x, mean = (
-      np.array([p["ratio"] for p in own]) * 1.04 ** (k - (len(lines) - 1) / 2),
-      np.array([p["mean"] for p in own]),
-    )
-    ends = np.array([p["ci"] or (p["mean"], p["mean"]) for p in own], float).T
-    many = np.array([p["n"] > FEW for p in own])
-    if many.any():
-      axis.errorbar(
-        x[many],
-        mean[many],
-        np.maximum(0.0, [mean - ends[0], ends[1] - mean])[:, many],
-        fmt="o-",
-        capsize=3,
-        color=f"C{k}",
-      )
-    axis.plot(x[~many], mean[~many], "o:", color=f"C{k}", mfc="white")
-    axis.plot([], [], "o-", color=f"C{k}", label=line, mfc=f"C{k}" if many.any() else "white")
-    for a, b, p in zip(x, mean, own):
-      axis.annotate(
-        f"{p['recovered']}/{p['n']}",
-        (a, b),
-        textcoords="offset points",
-        xytext=(5, 4),
-        fontsize=7,
-        color=f"C{k}",
-      )
+    _line(axis, line, own, 1.04 ** (k - (len(lines) - 1) / 2), f"C{k}")
   axis.set_title(f"recovered / affected at each point; hollow: {FEW} seeds or fewer", fontsize=9)
   axis.set(
     xscale="log",
@@ -316,11 +227,29 @@ def ratios(out: os.PathLike | str, points: list[dict]) -> pathlib.Path | None:
     ylabel="control steps to recovery, restricted mean",
     ylim=(0, 1.1 * max(p["ci"][1] if p["ci"] and p["ci"][1] else p["mean"] for p in points)),
   )
-  axis.set_xticks(
-    sorted({p["ratio"] for p in points}), [f"{r:g}" for r in sorted({p["ratio"] for p in points})]
-  )
+  ticks = sorted({p["ratio"] for p in points})
+  axis.set_xticks(ticks, [f"{r:g}" for r in ticks])
   axis.minorticks_off()
   axis.legend(fontsize=8)
-  folders.atomic(out / "ratio.png", lambda file: fig.savefig(file, format="png", dpi=110))
-  plt.close(fig)
-  return out / "ratio.png"
+  return _saved(drawn, pathlib.Path(out) / "ratio.png")
+
+
+def _line(axis: Axes, line: str, own: list[dict[str, Any]], aside: float, color: str) -> None:
+  """The points of one line, drawn `aside` times their ratio, so that lines stay apart."""
+  x, mean = np.array([p["ratio"] for p in own]) * aside, np.array([p["mean"] for p in own])
+  ends = np.array([p["ci"] or (p["mean"], p["mean"]) for p in own], float).T
+  many = np.array([p["n"] > FEW for p in own])
+  if many.any():
+    bars = np.maximum(0.0, [mean - ends[0], ends[1] - mean])[:, many]
+    axis.errorbar(x[many], mean[many], bars, fmt="o-", capsize=3, color=color)
+  axis.plot(x[~many], mean[~many], "o:", color=color, mfc="white")
+  axis.plot([], [], "o-", color=color, label=line, mfc=color if many.any() else "white")
+  for a, b, p in zip(x, mean, own):
+    axis.annotate(
+      f"{p['recovered']}/{p['n']}",
+      (a, b),
+      textcoords="offset points",
+      xytext=(5, 4),
+      fontsize=7,
+      color=color,
+    )

@@ -1,8 +1,7 @@
 """Pictures with their caption, and the files that hold them: GIF, and MP4 by ffmpeg."""
 
-from __future__ import annotations
-
 import contextlib
+import itertools
 import pathlib
 import shutil
 import subprocess
@@ -41,8 +40,7 @@ def framed(image: np.ndarray, caption: str, badge: str | None = None) -> np.ndar
 
 def ffmpeg() -> str:
   """Path of ffmpeg: the system's, or that of the package imageio-ffmpeg."""
-  found = shutil.which("ffmpeg")
-  if found:
+  if found := shutil.which("ffmpeg"):
     return found
   try:
     import imageio_ffmpeg
@@ -70,36 +68,16 @@ def write_mp4(path: pathlib.Path, images: Iterable[np.ndarray], fps: float) -> N
   """H.264 by ffmpeg; an odd width or height is padded to the next even one."""
   images = iter(images)
   first = next(images)
-  command = [
-    ffmpeg(),
-    "-y",
-    "-loglevel",
-    "error",
-    "-f",
-    "rawvideo",
-    "-pix_fmt",
-    "rgb24",
-    "-s",
-    f"{first.shape[1]}x{first.shape[0]}",
-    "-r",
-    f"{fps:.6g}",
-    "-i",
-    "-",
-    "-vf",
-    "pad=ceil(iw/2)*2:ceil(ih/2)*2",
-    "-c:v",
-    "libx264",
-    "-pix_fmt",
-    "yuv420p",
-    "-f",
-    "mp4",
-    str(path),
-  ]
+  options = (
+    f"-y -loglevel error -f rawvideo -pix_fmt rgb24 -s {first.shape[1]}x{first.shape[0]} "
+    f"-r {fps:.6g} -i - -vf pad=ceil(iw/2)*2:ceil(ih/2)*2 -c:v libx264 -pix_fmt yuv420p -f mp4"
+  )
+  command = [ffmpeg(), *options.split(), str(path)]
   with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+    assert process.stdin  # a pipe, as asked for
     with contextlib.suppress(BrokenPipeError):
-      process.stdin.write(first.tobytes())  # type: ignore[union-attr]
-      for image in images:
-        process.stdin.write(image.tobytes())  # type: ignore[union-attr]
+      for image in itertools.chain([first], images):
+        process.stdin.write(image.tobytes())
     _, words = process.communicate()
   if process.returncode:
     raise FileError(

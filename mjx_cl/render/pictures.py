@@ -7,9 +7,9 @@ robot that MuJoCo does not know, see `Plan`. Every picture is then framed: capti
 while a fault acts.
 """
 
-from __future__ import annotations
-
+import contextlib
 import functools
+import itertools
 import os
 import pathlib
 from collections.abc import Callable, Iterator
@@ -69,9 +69,8 @@ def act(
 
 def bare(x: jax.Array) -> np.ndarray:
   """The one robot of a leaf (1, 1, ...), in NumPy; a key as its bits."""
-  return np.asarray(
-    (jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x)[0, 0]
-  )
+  x = jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x
+  return np.asarray(x[0, 0])
 
 
 VIEWS = ("auto", "robot", "top")
@@ -102,8 +101,7 @@ def painter(
     raise UserError(
       f"environment {env.spec.name!r} has no MuJoCo model to look at; choose from: auto, top"
     )
-  library = gl_library()
-  if library:
+  if library := gl_library():
     return Offscreen(env, width, height, library), f"MuJoCo ({library})"
   say(
     "no GL library for MuJoCo's renderer (Debian: apt install libegl1, or libosmesa6); drawing "
@@ -119,16 +117,15 @@ def check(
   out = pathlib.Path(out)
   if out.suffix.lower() not in SUFFIXES:
     raise UserError(f"--out must end in {' or '.join(SUFFIXES)}; got {str(out)!r}")
-  if not 1 <= steps <= MOST_STEPS:
-    raise UserError(
-      f"steps must lie in 1..{MOST_STEPS:,}, whose pictures are kept in memory; got {steps}"
-    )
+  for name, value, low, high, words in (
+    ("steps", steps, 1, MOST_STEPS, f"1..{MOST_STEPS:,}, whose pictures are kept in memory"),
+    ("width", width, 64, 4096, "64..4096"),
+    ("height", height, 64, 4096, "64..4096"),
+    ("fps", fps, 1, 50, "1..50"),
+  ):
+    if not low <= value <= high:
+      raise UserError(f"{name} must lie in {words}; got {value}")
   check_seeds(seed)
-  for name, value in (("width", width), ("height", height)):
-    if not 64 <= value <= 4096:
-      raise UserError(f"{name} must lie in 64..4096; got {value}")
-  if not 1 <= fps <= 50:
-    raise UserError(f"fps must lie in 1..50; got {fps}")
   if out.suffix.lower() == ".mp4":
     ffmpeg()
   if out.is_dir():
@@ -150,13 +147,21 @@ def render(
   say: Callable[[str], object] = lambda text: None,
   **acting: Any,
 ) -> dict[str, Any]:
-  """Acts and writes the picture, at the robot's own pace; every n-th decision is drawn so that
-  `fps` is met.
+  """Acts and writes a picture, at the robot's own pace; every n-th decision is drawn, for `fps`.
 
   Args:
+    env: the robot.
     out: path that ends in .gif or .mp4; written under another name, then renamed.
-    width, height: pixels. view: one of VIEWS. acting: of `act`.
+    steps: control steps.
+    width: of a picture [pixels].
+    height: of a picture [pixels].
+    fps: pictures a second.
+    fault: as in `adapters.join`.
+    target: what breaks.
+    repeat: control steps of a decision.
+    view: one of VIEWS.
     say: takes lines for standard error.
+    **acting: of `act`.
 
   Returns:
     file, frames, steps, fps, drawn_by.
@@ -165,42 +170,38 @@ def render(
   decision_s = env.spec.control_s * repeat
   every = max(1, round(1.0 / (fps * decision_s)))
   fps = 1.0 / (every * decision_s)
-  frames = act(env, steps, repeat=repeat, fault=fault, target=target, **acting)
+  acted = act(env, steps, repeat=repeat, fault=fault, target=target, **acting)
   label = " ".join(["FAULT", fault] + ([target] if target not in (None, "random") else []))
-  count = 0
   tmp = out.with_name(f".{out.stem}.tmp{out.suffix.lower()}")
   try:
     tmp.touch()  # an unwritable place is found before anything is computed
   except OSError as e:
     raise FileError(f"cannot write {out}: {e.strerror or e}") from None
-  scene = None
   try:
     scene, drawn_by = painter(env, width, height, view, say)
-
-    def images() -> Iterator[np.ndarray]:
-      nonlocal count
-      for i, frame in enumerate(frames):
-        if i % every == 0:
-          count += 1
-          caption = (
-            f"{env.spec.name}   step {frame.step}   {frame.step * env.spec.control_s:.1f} s   "
-            f"reward {frame.reward:.2f}"
-          )
-          acts = fault != "none" and frame.severity > 0
-          yield framed(
-            scene.picture(frame), caption, f"{label} {frame.severity:.2f}" if acts else None
-          )
-
-    (write_gif if out.suffix.lower() == ".gif" else write_mp4)(tmp, images(), fps)
+    with contextlib.closing(scene):
+      drawn = itertools.islice(acted, 0, None, every)
+      images = (pictured(env, scene, frame, label if fault != "none" else "") for frame in drawn)
+      (write_gif if out.suffix.lower() == ".gif" else write_mp4)(tmp, images, fps)
     os.replace(tmp, out)
   finally:
     tmp.unlink(missing_ok=True)
-    if scene:
-      scene.close()
   return {
     "file": str(out),
-    "frames": count,
+    "frames": len(range(0, steps, repeat * every)),
     "steps": steps,
     "fps": round(fps, 3),
     "drawn_by": drawn_by,
   }
+
+
+def pictured(env: Any, scene: Plan | Offscreen | Sketch, frame: Frame, label: str) -> np.ndarray:
+  """A frame as it is shown, uint8 (height, width, 3): with its caption, and with the label and the
+  severity of a fault that acts.
+  """
+  caption = (
+    f"{env.spec.name}   step {frame.step}   {frame.step * env.spec.control_s:.1f} s   "
+    f"reward {frame.reward:.2f}"
+  )
+  badge = f"{label} {frame.severity:.2f}" if label and frame.severity > 0 else None
+  return framed(scene.picture(frame), caption, badge)

@@ -1,7 +1,5 @@
 """What every way of drawing a robot needs: one decision of it, where it stands, sky and floor."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import mujoco
@@ -9,10 +7,7 @@ import numpy as np
 
 from mjx_cl.types import EnvState
 
-SKY = (
-  np.array([0.80, 0.88, 0.95]),
-  np.array([0.97, 0.98, 1.0]),
-)  # at the top and at the bottom of the picture
+SKY = np.array([[0.80, 0.88, 0.95], [0.97, 0.98, 1.0]])  # at the picture's top and bottom
 GROUND = (0.72, 0.74, 0.74)
 
 
@@ -56,11 +51,8 @@ def reach(model: mujoco.MjModel) -> float:
   data = mujoco.MjData(model)
   mujoco.mj_kinematics(model, data)
   moving = model.geom_bodyid > 0
-  return float(
-    np.max(
-      np.linalg.norm(data.geom_xpos[moving] - data.xpos[1], axis=-1) + model.geom_rbound[moving]
-    )
-  )
+  away = np.linalg.norm(data.geom_xpos[moving] - data.xpos[1], axis=-1)
+  return float(np.max(away + model.geom_rbound[moving]))
 
 
 def planar(model: mujoco.MjModel) -> bool:
@@ -70,7 +62,8 @@ def planar(model: mujoco.MjModel) -> bool:
 
 def sky(height: int) -> np.ndarray:
   """Colours of the rows of an empty picture, uint8 (height, 3)."""
-  return (255 * (SKY[0] + (SKY[1] - SKY[0]) * np.linspace(0, 1, height)[:, None])).astype(np.uint8)
+  top, bottom = SKY
+  return (255 * (top + (bottom - top) * np.linspace(0, 1, height)[:, None])).astype(np.uint8)
 
 
 def floor_of(model: mujoco.MjModel, data: mujoco.MjData) -> float:

@@ -177,7 +177,7 @@ def test_equals_a_hand_stepped_environment(short_walker, life):
 
 
 def test_robots_that_end_apart_are_reset_apart(vector):
-  """The middle robot's episode is made ten steps older: it ends first, and no other robot notices."""
+  """The middle robot's episode is ten steps older: it ends first, and no other robot notices."""
   vector.reset(seed=SEED)
   streams = vector.robots.streams
   vector.robots.streams = streams._replace(env=streams.env._replace(step=jnp.array([[0, 10, 0]])))

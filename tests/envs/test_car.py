@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from mjx_cl.envs import car as lib
+from mjx_cl.envs import racing
 from mjx_cl.envs.car import Car, Motion
 from mjx_cl.errors import UserError
 from mjx_cl.types import Model
@@ -217,19 +218,19 @@ def test_any_backend_is_the_same_car_and_a_wrong_name_is_refused(env, same):
   ],
 )
 def test_command_by_hand(action, want):
-  assert [float(v) for v in lib.command(jnp.asarray(action, jnp.float32))] == pytest.approx(
+  assert [float(v) for v in racing.command(jnp.asarray(action, jnp.float32))] == pytest.approx(
     want, abs=1e-6
   )
 
 
 def test_observation_scales_clips_and_adds_noise(env):
   ranges = jnp.tile(jnp.asarray([0.004, 2.0, 9.996, 10.0]), 16)
-  obs = lib.observe(env.course, ranges, 3.0, -1.5, 0.2, 0.0, jax.random.key(0))
+  obs = racing.observe(env.course, ranges, 3.0, -1.5, 0.2, 0.0, jax.random.key(0))
   np.testing.assert_allclose(
     obs, [*np.tile([0.0004, 0.2, 0.9996, 1.0], 16), 3.0, -1.5, 0.2], rtol=1e-6
   )
   noisy = np.asarray(
-    jax.jit(jax.vmap(lambda key: lib.observe(env.course, ranges, 3.0, -1.5, 0.2, 0.01, key)))(
+    jax.jit(jax.vmap(lambda key: racing.observe(env.course, ranges, 3.0, -1.5, 0.2, 0.01, key)))(
       jax.random.split(jax.random.key(1), 400)
     )
   )
@@ -248,7 +249,9 @@ def test_observation_scales_clips_and_adds_noise(env):
   [(5.0, False, 1.0), (0.0, False, 0.0), (-2.5, False, -0.5), (5.0, True, -4.0), (0.0, True, -5.0)],
 )
 def test_reward_by_hand(along, crashed, want):
-  assert float(lib.reward(jnp.float32(along), jnp.bool_(crashed))) == pytest.approx(want, abs=1e-6)
+  assert float(racing.reward(jnp.float32(along), jnp.bool_(crashed))) == pytest.approx(
+    want, abs=1e-6
+  )
 
 
 def test_progress_is_the_speed_along_the_track(env):
@@ -257,7 +260,7 @@ def test_progress_is_the_speed_along_the_track(env):
   heading = t.heading[10]
   angle = np.float32([0.0, 0.5, np.pi / 2, np.pi])
   got = jax.jit(
-    jax.vmap(lambda vx, vy: lib.progress(env.course, 2, jnp.float32(x), jnp.float32(y), vx, vy))
+    jax.vmap(lambda vx, vy: racing.progress(env.course, 2, jnp.float32(x), jnp.float32(y), vx, vy))
   )(2 * np.cos(heading + angle), 2 * np.sin(heading + angle))
   np.testing.assert_allclose(got, 2 * np.cos(angle), atol=1e-3)
 
@@ -554,7 +557,7 @@ def test_reference_driver_laps_every_track_and_a_sock_throws_it_off(env, init):
   @jax.jit
   def drive(model):
     def one(state, _):
-      action = jax.vmap(lambda s: lib.pure_pursuit(env, s))(state)
+      action = jax.vmap(lambda s: racing.pure_pursuit(env, s))(state)
       state, out = jax.vmap(env.step, (None, 0, 0))(model, state, action)
       return state, (out.reward, out.terminated, action, jnp.isfinite(out.obs).all())
 

@@ -597,7 +597,7 @@ def crowd(env, pair):
 
 
 def errors(a, b):
-  """Largest error of each car's chassis, sorted: place and attitude [m, 1], velocity [m/s, rad/s]."""
+  """Largest error of each car's chassis, sorted: place, attitude [m, 1], velocity [m/s, rad/s]."""
   return tuple(
     np.sort(np.abs(np.asarray(a[k])[:, :n] - np.asarray(b[k])[:, :n]).max(-1))
     for k, n in (("qpos", 7), ("qvel", 6))

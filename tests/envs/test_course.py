@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from mjx_cl.envs import course as lib
+from mjx_cl.envs import tracks
 from mjx_cl.errors import FileError, UserError
 
 SEEDS = (0, 1)  # drawn tracks
@@ -17,7 +18,7 @@ SEEDS = (0, 1)  # drawn tracks
 def course():
   """All shapes and two drawn tracks in one program."""
   return lib.Course(
-    [lib.generate(name) for name in lib.SHAPES] + [lib.generate(seed) for seed in SEEDS]
+    [tracks.generate(name) for name in tracks.SHAPES] + [tracks.generate(seed) for seed in SEEDS]
   )
 
 
@@ -102,14 +103,14 @@ def brute_contact(track, x, y, yaw):
 # ---- tracks --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("shape", [*lib.SHAPES, *SEEDS, 2])
+@pytest.mark.parametrize("shape", [*tracks.SHAPES, *SEEDS, 2])
 def test_generated_track_is_closed_even_wide_and_gentle(shape):
-  track = lib.generate(shape)
+  track = tracks.generate(shape)
   step = np.roll(track.centre, -1, 0) - track.centre
   spacing = np.linalg.norm(step, axis=1)
   assert 25 <= track.length <= 61 and track.name == str(shape)
   assert (
-    spacing.max() / spacing.min() < 1.01 and spacing.max() <= lib.SPACING
+    spacing.max() / spacing.min() < 1.01 and spacing.max() <= tracks.SPACING
   )  # the last point to the first included; chords are shorter in curves
   assert abs(spacing.sum() / track.length - 1) < 0.003  # (0.4 m / 1.6 m)^2 / 24
   np.testing.assert_allclose(np.linalg.norm(track.left - track.right, axis=1), 2.2, rtol=1e-12)
@@ -129,16 +130,16 @@ def test_generated_track_is_closed_even_wide_and_gentle(shape):
   assert (
     np.abs(turn / (track.length / len(turn)) - middle).max() < 0.05
   )  # [1/m]; both ends of a cell against its mean, 1.6 m radius or more
-  assert lib.check(track) is None
+  assert tracks.check(track) is None
 
 
 def test_tracks_turn_both_ways_and_a_seed_gives_one_track():
-  ways = [np.sign(lib.generate(name).curvature.sum()) for name in lib.SHAPES]
+  ways = [np.sign(tracks.generate(name).curvature.sum()) for name in tracks.SHAPES]
   assert ways.count(1) == ways.count(-1) == 3
-  np.testing.assert_array_equal(lib.generate(5).centre, lib.generate(5).centre)
-  assert lib.generate(5).length != lib.generate(6).length
+  np.testing.assert_array_equal(tracks.generate(5).centre, tracks.generate(5).centre)
+  assert tracks.generate(5).length != tracks.generate(6).length
   with pytest.raises(UserError, match="unknown track 'square'.*chicane.*oval"):
-    lib.generate("square")
+    tracks.generate("square")
 
 
 def circle(radius, num=40):
@@ -159,12 +160,12 @@ def test_check_finds_what_is_wrong():
   flat = np.stack(
     [10 * np.cos(angle), 0.9 * np.sin(angle)], 1
   )  # its two long sides are less than a width apart
-  assert lib.check(lib.build("circle", circle(3), 1.1, 1.1)) is None
-  assert "crosses itself" in lib.check(lib.build("eight", eight, 1.1, 1.1))
-  assert "folds" in lib.check(lib.build("tight", circle(1.0), 1.1, 1.1))
-  assert lib.check(lib.build("flat", flat, 1.1, 1.1)) is not None
-  assert "too close" in lib.check(lib.build("waist", waist(), 1.1, 1.1))
-  assert lib.check(lib.build("waist", waist(), 0.5, 0.5)) is None
+  assert tracks.check(tracks.build("circle", circle(3), 1.1, 1.1)) is None
+  assert "crosses itself" in tracks.check(tracks.build("eight", eight, 1.1, 1.1))
+  assert "folds" in tracks.check(tracks.build("tight", circle(1.0), 1.1, 1.1))
+  assert tracks.check(tracks.build("flat", flat, 1.1, 1.1)) is not None
+  assert "too close" in tracks.check(tracks.build("waist", waist(), 1.1, 1.1))
+  assert tracks.check(tracks.build("waist", waist(), 0.5, 0.5)) is None
 
 
 # ---- files ---------------------------------------------------------------------------------------
@@ -175,14 +176,14 @@ def rows(points, right=1.1, left=1.1):
 
 
 def test_csv_gives_the_track_it_was_written_from(tmp_path):
-  want = lib.generate("hook")
+  want = tracks.generate("hook")
   path = tmp_path / "hook.csv"
   lines = rows(want.centre, 0.8, 1.0)
   path.write_text(
     "\n".join(["# x_m, y_m, w_tr_right_m, w_tr_left_m", *lines[:-1], "", lines[-1], lines[0]])
     + "  # the first point again\n"
   )
-  track = lib.load_csv(path)
+  track = tracks.load_csv(path)
   assert track.name == "hook" and track.length == pytest.approx(want.length, rel=1e-4)
   np.testing.assert_allclose(
     track.centre, want.centre, atol=1e-3
@@ -227,7 +228,7 @@ def test_broken_files_are_refused_in_one_line(tmp_path, lines, want):
   elif lines is not None:
     path.write_text("\n".join(lines))
   with pytest.raises(FileError, match=want) as error:
-    lib.load_csv(path)
+    tracks.load_csv(path)
   assert "\n" not in str(error.value) and str(path) in str(error.value)
 
 
@@ -273,7 +274,7 @@ def test_reach_holds_every_cell_that_is_seen_and_few_others(course):
 
 
 def test_lidar_on_a_ring_by_hand():
-  ring = lib.build("ring", circle(4.0, 80), 1.1, 1.1)
+  ring = tracks.build("ring", circle(4.0, 80), 1.1, 1.1)
   course = lib.Course([ring], beams=7)
   np.testing.assert_allclose(np.degrees(course.angles), [-135, -90, -45, 0, 45, 90, 135], atol=1e-4)
   x, y = ring.centre[5]
@@ -383,6 +384,6 @@ def test_spawn_is_spread_and_free(course, same):
 
 
 def test_narrow_tracks_spawn_clear_of_the_walls():
-  course = lib.Course([lib.build("lane", circle(6), 0.4, 0.4)])
+  course = lib.Course([tracks.build("lane", circle(6), 0.4, 0.4)])
   at = jax.jit(jax.vmap(course.spawn))(jax.random.split(jax.random.key(0), 300))
   assert not jax.jit(jax.vmap(course.collides))(*at).any()

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from mjx_cl import envs
+from mjx_cl.envs import anymal
 from mjx_cl.envs import quadruped as task
 from mjx_cl.errors import UserError
 
@@ -36,7 +37,7 @@ WEIGHTS = {
 @pytest.fixture(scope="module")
 def robot():
   """mujoco.MjModel of the quadruped."""
-  return task.load_model()
+  return anymal.load_model()
 
 
 @pytest.fixture(scope="module")
@@ -188,7 +189,7 @@ def test_joints_motors_and_contacts(robot):
   assert (
     robot.opt.timestep == 0.005 and not robot.dof_damping.any() and not robot.dof_frictionloss.any()
   )
-  np.testing.assert_array_equal(robot.dof_armature, [0] * 6 + [task.ARMATURE] * 12)
+  np.testing.assert_array_equal(robot.dof_armature, [0] * 6 + [anymal.ARMATURE] * 12)
   meet = [robot.geom(g).name for g in range(robot.ngeom) if robot.geom_conaffinity[g]]
   assert sorted(meet) == sorted(
     [f"{leg}_{part}" for leg in LEGS for part in ("foot", "knee")]
@@ -213,7 +214,7 @@ def test_stance_height_and_feet(robot):
   np.testing.assert_allclose(
     feet[:, :2], [(0.453, 0.301), (0.453, -0.301), (-0.453, 0.301), (-0.453, -0.301)], atol=5e-4
   )  # three decimals
-  np.testing.assert_allclose(task.DEFAULT, STANCE, atol=1e-7)
+  np.testing.assert_allclose(anymal.DEFAULT, STANCE, atol=1e-7)
 
 
 def test_spec(native, robot):
@@ -284,10 +285,10 @@ def test_motor_limits_by_hand(speed, limit, want):
   for xp in (np, jnp):
     for strength in (1.0, 0.25):
       values = {"strength": xp.full(12, strength), "velocity_limit": xp.full(12, limit)}
-      up = task.motor_law(
+      up = anymal.motor_law(
         xp, values, xp.full(12, 100.0), xp.asarray(qpos), xp.asarray(qvel)
       )  # asks for thousands of N m
-      down = task.motor_law(xp, values, xp.full(12, -100.0), xp.asarray(qpos), xp.asarray(-qvel))
+      down = anymal.motor_law(xp, values, xp.full(12, -100.0), xp.asarray(qpos), xp.asarray(-qvel))
       np.testing.assert_allclose(
         up, strength * want, atol=5e-5
       )  # float32 of a limit with a recurring fraction
@@ -301,13 +302,13 @@ def test_motor_law_inside_its_limits_and_on_both_array_libraries():
     "strength": rng.uniform(0, 1, (200, 12)).astype(np.float32),
     "velocity_limit": rng.uniform(0.4, 7.5, (200, 12)).astype(np.float32),
   }
-  batch = task.motor_law(np, values, ctrl, qpos.astype(float), qvel.astype(float))
+  batch = anymal.motor_law(np, values, ctrl, qpos.astype(float), qvel.astype(float))
   np.testing.assert_allclose(
-    jax.vmap(lambda v, *x: task.motor_law(jnp, v, *x))(values, ctrl, qpos, qvel), batch, atol=1e-3
+    jax.vmap(lambda v, *x: anymal.motor_law(jnp, v, *x))(values, ctrl, qpos, qvel), batch, atol=1e-3
   )  # 300 N m s/rad, float32
   nominal = {"strength": np.ones(12), "velocity_limit": np.full(12, 7.5)}
   np.testing.assert_allclose(
-    task.motor_law(np, nominal, qpos[:, 7:] + 0.1, qpos, np.full((200, 18), 0.5)),
+    anymal.motor_law(np, nominal, qpos[:, 7:] + 0.1, qpos, np.full((200, 18), 0.5)),
     80 * 0.1 - 5 * 0.5,
     atol=1e-3,
   )
@@ -344,7 +345,7 @@ def test_native_equals_a_plain_mujoco_loop_bit_for_bit(native, robot):
   contacts = 0
   for i in range(0, NUM, 16):
     for row, (data, _) in zip(
-      rows, oracle(robot, qpos[i], np.zeros(18), task.DEFAULT + actions[:, i])
+      rows, oracle(robot, qpos[i], np.zeros(18), anymal.DEFAULT + actions[:, i])
     ):
       want = np.empty(row.shape[1])
       mujoco.mj_getState(robot, data, want, mujoco.mjtState.mjSTATE_INTEGRATION)
@@ -471,7 +472,7 @@ def test_friction_of_one_foot_acts_through_its_priority(pair, robot, name, same)
   )
   for _ in range(25):
     state, _ = p.step(models, state, np.zeros((NUM, 12), np.float32))
-  feet = np.asarray(jax.vmap(task.leg_points)(state.physics.qpos)[0])
+  feet = np.asarray(jax.vmap(anymal.leg_points)(state.physics.qpos)[0])
   start = placed(robot, pose()[0])
   moved = np.linalg.norm(
     feet[..., :2] - [start.geom(f"{leg}_foot").xpos[:2] for leg in LEGS], axis=-1
@@ -487,8 +488,8 @@ def test_friction_of_one_foot_acts_through_its_priority(pair, robot, name, same)
 
 def test_kinematics_equal_mujoco(robot):
   qpos, _ = tumbling(300, np.random.default_rng(4))
-  foot, knee = jax.jit(jax.vmap(task.leg_points))(qpos)
-  height = jax.jit(jax.vmap(task.trunk_height))(qpos)
+  foot, knee = jax.jit(jax.vmap(anymal.leg_points))(qpos)
+  height = jax.jit(jax.vmap(anymal.trunk_height))(qpos)
   around = np.linspace(0, 2 * np.pi, 721)
   for i, q in enumerate(qpos):
     data, lowest = placed(robot, q), np.inf
@@ -600,7 +601,7 @@ def test_steps_equal_the_oracle(native, robot):
   for i in range(0, NUM, 5):
     air = np.zeros(4)
     for k, (data, last) in enumerate(
-      oracle(robot, qpos[i], np.zeros(18), task.DEFAULT + actions[:, i])
+      oracle(robot, qpos[i], np.zeros(18), anymal.DEFAULT + actions[:, i])
     ):
       old, new, out = history[k], history[k + 1], outs[k]
       before = types.SimpleNamespace(
@@ -653,7 +654,7 @@ def test_each_reward_weight_has_its_term(native):
 
 
 def test_gravity_turns_the_observed_direction(native):
-  """A slope is tilted gravity: what the robot senses as down, and what counts as tilt, follow it."""
+  """A slope is tilted gravity: what the robot senses as down and what counts as tilt follow it."""
   qpos, qvel = jnp.asarray(pose()[0]), jnp.zeros(18)
   tilted = jnp.asarray([9.81 * np.sin(0.3), 0, -9.81 * np.cos(0.3)])
   np.testing.assert_allclose(

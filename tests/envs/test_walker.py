@@ -1,4 +1,4 @@
-"""Walker-walk against an oracle in NumPy and C MuJoCo, written from the task's published formulas."""
+"""Walker-walk against an oracle in NumPy and C MuJoCo, written from the published formulas."""
 
 import jax
 import jax.numpy as jnp

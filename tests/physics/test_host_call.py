@@ -19,8 +19,10 @@ import quick
 from mjx_cl import physics
 from mjx_cl.physics import host_call, native
 
-XML = """<mujoco><option timestep="0.02"/><worldbody><body><joint name="hinge" type="hinge" axis="0 1 0" damping="0.1"/>
-<geom type="capsule" fromto="0 0 0 0 0 -0.5" size="0.03"/></body></worldbody><actuator><motor name="hinge" joint="hinge" gear="{gear}" ctrlrange="-1 1"/></actuator></mujoco>"""
+XML = """<mujoco><option timestep="0.02"/><worldbody><body>
+<joint name="hinge" type="hinge" axis="0 1 0" damping="0.1"/>
+<geom type="capsule" fromto="0 0 0 0 0 -0.5" size="0.03"/></body></worldbody>
+<actuator><motor name="hinge" joint="hinge" gear="{gear}" ctrlrange="-1 1"/></actuator></mujoco>"""
 
 
 def pendulum(gear=2.0):

@@ -1,7 +1,5 @@
 """Our environment as a `brax.envs.Env`; see `brax_env`. Importing this needs brax."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import jax
@@ -33,8 +31,7 @@ class BraxEnv(base.Env):
       state, obs = self.env.init(self.env.model, rng)
       return base.State(state, obs, zero, zero, {})
     stream = self._begin(rng)
-    info = {"stream": stream._replace(env=()), "severity": zero}  # type: ignore[arg-type]
-    return base.State(stream.env, stream.obs, zero, zero, {}, info)
+    return base.State(stream.env, stream.obs, zero, zero, {}, _info(stream, zero))
 
   def step(self, state: base.State, action: jax.Array) -> base.State:
     """One control step."""
@@ -63,8 +60,7 @@ class BraxEnv(base.Env):
       lambda new, old: jnp.where(first, new, old), renewed, stream.injection
     )  # brax's autoreset renews no memory
     stream, out, severity = rollout._control(stream._replace(injection=injection), action)
-    info = {"stream": stream._replace(env=()), "severity": worst(severity)}
-    return stream.env, out, state.info | info
+    return stream.env, out, state.info | _info(stream, worst(severity))
 
   @property
   def observation_size(self) -> int:
@@ -80,3 +76,8 @@ class BraxEnv(base.Env):
   def backend(self) -> str:
     """Name of the backend, which brax's wrappers ask for."""
     return "mjx_cl"
+
+
+def _info(stream: Any, severity: jax.Array) -> dict[str, Any]:
+  """What lives through brax's autoreset: fault and clock, without the robot."""
+  return {"stream": stream._replace(env=()), "severity": severity}

@@ -2,8 +2,6 @@
 adapter holds.
 """
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 import types
@@ -83,8 +81,9 @@ class FaultSettings:
       UserError for what `presets.resolve` refuses, and for a preset that turns the robot into
       another one.
     """
+    robot = env.spec.name
     changes = presets.resolve(
-      env.spec.name,
+      robot,
       self.fault,
       None if self.target == "random" else self.target,
       self.severity,
@@ -93,7 +92,6 @@ class FaultSettings:
       self.period,
       self.share,
     )
-    robot = env.spec.name
     if presets.named(self.fault) and (other := presets.find(self.fault, robot).becomes):
       raise UserError(
         f"preset {self.fault!r} turns the robot into {other!r}, which only `mjx-cl run` does; take "
@@ -138,8 +136,14 @@ class _Bits:
   data: np.ndarray
 
 
-def _is_key(x: jax.Array) -> bool:
-  return jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+def _packed(x: jax.Array) -> np.ndarray | _Bits:
+  if jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
+    return _Bits(np.asarray(jax.random.key_data(x)))
+  return np.asarray(x)
+
+
+def _unpacked(x: np.ndarray | _Bits) -> jax.Array:
+  return jax.random.wrap_key_data(jnp.asarray(x.data)) if isinstance(x, _Bits) else jnp.asarray(x)
 
 
 class Robots:
@@ -164,23 +168,21 @@ class Robots:
     self._reset, self._step = jax.jit(self._reset_where), jax.jit(self._step_where)
     self.streams, self.untouched = None, np.ones(num, bool)
 
-  def __deepcopy__(self, memo: dict) -> Robots:
+  def __deepcopy__(self, memo: dict) -> "Robots":
     """Robots whose lives part from here; environment and compiled programs are shared."""
     return copy.copy(self)  # arrays are replaced, never written
 
   def __getstate__(self) -> dict[str, Any]:
-    bits = lambda x: _Bits(np.asarray(jax.random.key_data(x))) if _is_key(x) else np.asarray(x)
     return {
       "made": self._made,
-      "streams": jax.tree.map(bits, self.streams),
+      "streams": jax.tree.map(_packed, self.streams),
       "untouched": self.untouched,
     }
 
   def __setstate__(self, state: dict[str, Any]) -> None:
     place, fault = state["made"]
-    self.__init__(*place, **fault)  # type: ignore[misc]
-    back = lambda x: jax.random.wrap_key_data(x.data) if isinstance(x, _Bits) else jnp.asarray(x)  # type: ignore[arg-type]
-    self.streams = jax.tree.map(back, state["streams"], is_leaf=lambda x: isinstance(x, _Bits))
+    Robots.__init__(self, *place, **fault)
+    self.streams = jax.tree.map(_unpacked, state["streams"], is_leaf=lambda x: isinstance(x, _Bits))
     self.untouched = state["untouched"]
 
   def begin(self, seeds: Sequence[int]) -> np.ndarray:

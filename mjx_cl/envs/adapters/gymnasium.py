@@ -2,8 +2,6 @@
 `gymnasium_env` and `gymnasium_vector`. Importing this needs gymnasium.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 
@@ -27,8 +25,6 @@ class GymnasiumEnv(gymnasium.Env):
     **fault: FaultSettings.
   """
 
-  action_space: Box
-
   def __init__(self, env: Any, seed: int = 0, physics: str = "auto", **fault: Any) -> None:
     self.robots, self._seed = Robots(env, physics, 1, **fault), seed
     spec = self.robots.env.spec
@@ -46,9 +42,9 @@ class GymnasiumEnv(gymnasium.Env):
 
   def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
     """One control step."""
-    _check_begun(self.robots)
+    actions = _checked(self.robots, action, self.action_space)[None]
     obs, reward, terminated, truncated, now, clock = (
-      x[0] for x in self.robots.step(_shaped(action, self.action_space)[None], [False])
+      x[0] for x in self.robots.step(actions, [False])
     )
     return obs, float(reward), bool(terminated), bool(truncated), {"severity": now, "t": clock}
 
@@ -64,8 +60,6 @@ class GymnasiumVector(gymnasium.vector.VectorEnv):
     **fault: FaultSettings.
   """
 
-  action_space: Box
-
   def __init__(
     self, env: Any, num_envs: int = 1, seed: int = 0, physics: str = "auto", **fault: Any
   ) -> None:
@@ -79,8 +73,10 @@ class GymnasiumVector(gymnasium.vector.VectorEnv):
       "render_fps": 1.0 / spec.control_s,
     }
     self.single_observation_space, self.single_action_space = _box(spec.obs), _box(spec.act)
-    self.observation_space = batch_space(self.single_observation_space, num_envs)
-    self.action_space = batch_space(self.single_action_space, num_envs)  # type: ignore[assignment]
+    self.observation_space, self.action_space = (
+      batch_space(space, num_envs)
+      for space in (self.single_observation_space, self.single_action_space)
+    )
     self._pending = np.zeros(num_envs, bool)
 
   def reset(
@@ -92,24 +88,24 @@ class GymnasiumVector(gymnasium.vector.VectorEnv):
     self._pending = np.zeros(self.num_envs, bool)
     if seed is None:
       return self.robots.reset(), {}
-    one = isinstance(seed, (int, np.integer))
-    seeds = [seed + i for i in range(self.num_envs)] if one else list(seed)  # type: ignore[arg-type, operator]
+    seeds = (
+      [int(seed) + i for i in range(self.num_envs)]
+      if isinstance(seed, (int, np.integer))
+      else [int(s) for s in seed]
+    )
     if len(seeds) != self.num_envs:
       raise UserError(
         f"give one seed, or one for each of the {self.num_envs} robots; got {len(seeds)}"
       )
-    super().reset(seed=int(seeds[0]))
-    return self.robots.begin([int(s) for s in seeds]), {}
+    super().reset(seed=seeds[0])
+    return self.robots.begin(seeds), {}
 
   def step(
     self, actions: np.ndarray
   ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict]:
     """One control step of every robot but those whose episode ended in the last one."""
-    _check_begun(self.robots)
-    moved = ~self._pending
-    obs, reward, terminated, truncated, now, clock = self.robots.step(
-      _shaped(actions, self.action_space), self._pending
-    )
+    actions, moved = _checked(self.robots, actions, self.action_space), ~self._pending
+    obs, reward, terminated, truncated, now, clock = self.robots.step(actions, self._pending)
     self._pending = terminated | truncated
     infos = {
       "severity": now,
@@ -121,10 +117,11 @@ class GymnasiumVector(gymnasium.vector.VectorEnv):
 
 
 def _box(variables: Sequence[Var]) -> Box:
-  low, high = (
-    np.array([getattr(v, end) for v in variables], np.float32) for end in ("low", "high")
+  return Box(
+    np.array([v.low for v in variables], np.float32),
+    np.array([v.high for v in variables], np.float32),
+    dtype=np.float32,
   )
-  return Box(low, high, dtype=np.float32)
 
 
 def _check_options(options: dict | None) -> None:
@@ -132,12 +129,9 @@ def _check_options(options: dict | None) -> None:
     raise UserError(f"reset takes no options; got {', '.join(map(str, options))}")
 
 
-def _check_begun(robots: Robots) -> None:
+def _checked(robots: Robots, actions: np.ndarray, space: gymnasium.Space) -> np.ndarray:
   if robots.streams is None:
     raise gymnasium.error.ResetNeeded("call reset before the first step")
-
-
-def _shaped(actions: np.ndarray, space: Box) -> np.ndarray:
   actions = np.asarray(actions, np.float32)
   if actions.shape != space.shape:
     raise UserError(f"actions must have shape {space.shape}; got {actions.shape}")
