@@ -95,9 +95,9 @@ def test_every_detector_states_its_direction_and_blind_spots():
     text = " ".join(factory.__doc__.split())
     assert "Blind to: " in text, name
     if not getattr(factory, "reference", False):
-      assert re.search(
-        r"(?i)\b(one|two)[-_]sided\b|\ba (rise|fall) of\b|`up` or `down`", text
-      ), name
+      assert re.search(r"(?i)\b(one|two)[-_]sided\b|\ba (rise|fall) of\b|`up` or `down`", text), (
+        name
+      )
 
 
 def test_update_keeps_structure_shapes_and_dtypes(case):
