@@ -13,6 +13,8 @@ from mjx_cl.errors import UserError
 Flag = Bool[Array, ""]
 Count = Int[Array, ""]
 Number = Float[Array, ""]
+# whole numbers are legal where a float is
+Real = float | int
 # settings as a caller may write them: also whole, or traced in a calibration
 Setting = float | int | Array
 
@@ -83,7 +85,7 @@ def at_least(low: int, **values: int) -> dict[str, tuple[int, bool, str]]:
   return {setting: (value, value >= low, f"at least {low}") for setting, value in values.items()}
 
 
-def above(value: Setting, low: float) -> bool:
+def above(value: Setting, low: Real) -> bool:
   """Value > low; a traced value, which has no number yet, passes."""
   return isinstance(value, jax.core.Tracer) or bool(value > low)
 

@@ -28,7 +28,17 @@ import numpy as np
 from jaxtyping import Array, Float, Float32, Int32
 
 from mjx_cl.detectors import multivariate
-from mjx_cl.detectors.base import Alarm, Detector, Number, Setting, above, demand, judged, whole
+from mjx_cl.detectors.base import (
+  Alarm,
+  Detector,
+  Number,
+  Real,
+  Setting,
+  above,
+  demand,
+  judged,
+  whole,
+)
 from mjx_cl.rollout.monitor import Residual
 
 
@@ -93,8 +103,8 @@ def settled(
   references: Float[Array, "m bins"],
   drawn: Draws,
   horizons: tuple[int, ...],
-  alpha: float,
-  shrinkage: float,
+  alpha: Real,
+  shrinkage: Real,
 ) -> Healthy:
   """Weights, mean, deviation and level that the reference blocks give."""
   m, bins = references.shape
@@ -142,11 +152,11 @@ def bfar(
   bins: int = 1,
   horizons: tuple[int, ...] = (1, 5),
   threshold: Setting = 1.0,
-  alpha: float = 0.05,
+  alpha: Real = 0.05,
   blocks: int = 50,
   warmup: int = 1000,
   repetitions: int = 1000,
-  shrinkage: float = 0.5,
+  shrinkage: Real = 0.5,
 ) -> Detector:
   """Drop of the (weighted) mean reward over the last blocks; its level is the bootstrap's for a
   stated probability of a false alarm.

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_cl.detectors.base import Detector, Number, Setting, above, chart, demand, scalar
+from mjx_cl.detectors.base import Detector, Number, Real, Setting, above, chart, demand, scalar
 
 FAR = 1e3  # samples are cut here [warm-up std]
 LEAST = -1e4  # log-probability of what no run length stands for [nats]
@@ -58,7 +58,7 @@ class Cells(NamedTuple):
   gamma: np.ndarray
 
 
-def cells(max_run: int, kappa: float, alpha: float) -> Cells:
+def cells(max_run: int, kappa: Real, alpha: Real) -> Cells:
   """The table for the prior `kappa`, `alpha`."""
   run = np.arange(max_run)
   gamma = [math.exp(math.lgamma(alpha + r / 2 + 0.5) - math.lgamma(alpha + r / 2)) for r in run]
@@ -70,7 +70,7 @@ def cells(max_run: int, kappa: float, alpha: float) -> Cells:
   )
 
 
-def restarted(table: Cells, beta: float) -> Runs:
+def restarted(table: Cells, beta: Real) -> Runs:
   """All mass at r = 0."""
   size = len(table.run)
   return Runs(
@@ -90,7 +90,7 @@ def gamma_ratio(alpha: Number) -> Number:
   return jnp.sqrt(alpha) * jnp.exp(-1 / (8 * alpha) + 1 / (192 * alpha**3))
 
 
-def longer(state: Runs, z: Number, table: Cells, hazard: float, beta: float) -> Runs:
+def longer(state: Runs, z: Number, table: Cells, hazard: Real, beta: Real) -> Runs:
   """The posterior with one sample more; what enters the last cell is merged with what was in it."""
   last = len(table.run) - 1
   tail = table.run == last
@@ -147,12 +147,12 @@ def odds(state: Runs, recent: int) -> Number:
 @scalar
 def bocpd(
   threshold: Setting = 1.0,
-  hazard: float = 1e-3,
+  hazard: Real = 1e-3,
   recent: int = 50,
   max_run: int = 200,
-  kappa: float = 0.1,
-  alpha: float = 1.0,
-  beta: float = 1.0,
+  kappa: Real = 0.1,
+  alpha: Real = 1.0,
+  beta: Real = 1.0,
   warmup: int = 1000,
 ) -> Detector:
   """Posterior of the run length r, the samples since the mean and variance last changed, for

@@ -22,6 +22,7 @@ from mjx_cl.detectors.base import (
   Detector,
   Flag,
   Number,
+  Real,
   Setting,
   Warm,
   above,
@@ -89,7 +90,7 @@ def ranked(state: Ranks, a: Number, ready: Flag, freeze: int) -> tuple[Number, R
 @scalar
 def conformal(
   threshold: Setting = 9.2104,
-  bets: tuple[float, ...] = (0.1, 0.3, 0.5, 0.7, 0.9),
+  bets: tuple[Real, ...] = (0.1, 0.3, 0.5, 0.7, 0.9),
   form: str = "sum",
   two_sided: bool = False,
   bins: int = 33,

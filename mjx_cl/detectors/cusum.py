@@ -2,12 +2,22 @@
 
 import jax.numpy as jnp
 
-from mjx_cl.detectors.base import Detector, Number, Setting, Sides, above, chart, demand, scalar
+from mjx_cl.detectors.base import (
+  Detector,
+  Number,
+  Real,
+  Setting,
+  Sides,
+  above,
+  chart,
+  demand,
+  scalar,
+)
 
 
 @scalar
 def cusum(
-  slack: float = 0.5, threshold: Setting = 8.0, two_sided: bool = True, warmup: int = 1000
+  slack: Real = 0.5, threshold: Setting = 8.0, two_sided: bool = True, warmup: int = 1000
 ) -> Detector:
   """CUSUM on one stream, in units of the stream's own warm-up deviation.
 

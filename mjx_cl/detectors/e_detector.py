@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mjx_cl.detectors.base import Detector, Number, Setting, above, chart, demand, scalar
+from mjx_cl.detectors.base import Detector, Number, Real, Setting, above, chart, demand, scalar
 
 FORMS = ("sum", "max")
 Bets = Float[Array, "bets"]
@@ -48,9 +48,9 @@ def accumulate(evidence: Bets, growth: Bets, form: str) -> tuple[Bets, Number]:
 @scalar
 def e_detector(
   threshold: Setting = 9.2104,
-  bound: float = 0.1,
-  deviation: float = 1.0,
-  shifts: tuple[float, ...] = (0.25, 0.5, 1.0, 2.0, 4.0),
+  bound: Real = 0.1,
+  deviation: Real = 1.0,
+  shifts: tuple[Real, ...] = (0.25, 0.5, 1.0, 2.0, 4.0),
   form: str = "sum",
   two_sided: bool = False,
   warmup: int = 1000,

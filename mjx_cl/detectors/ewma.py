@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from mjx_cl.detectors.base import Detector, Number, Setting, above, chart, demand, scalar
+from mjx_cl.detectors.base import Detector, Number, Real, Setting, above, chart, demand, scalar
 
 
 class Average(NamedTuple):
@@ -21,7 +21,7 @@ class Average(NamedTuple):
 
 
 @scalar
-def ewma(rate: float = 0.1, threshold: Setting = 3.0, warmup: int = 1000) -> Detector:
+def ewma(rate: Real = 0.1, threshold: Setting = 3.0, warmup: int = 1000) -> Detector:
   """Two-sided EWMA chart on one stream, with the exact variance of the average at each sample.
 
     z = (x - mean) / max(std, 1e-6)                    mean, std frozen after `warmup` samples

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from mjx_cl.detectors.base import Alarm, Detector, Setting, above, demand, judged, whole
+from mjx_cl.detectors.base import Alarm, Detector, Real, Setting, above, demand, judged, whole
 from mjx_cl.detectors.multivariate import (
   Trail,
   Whitener,
@@ -37,7 +37,7 @@ def hotelling(
   smooth: int = 100,
   threshold: Setting = 36.0,
   warmup: int = 1000,
-  shrinkage: float = 0.1,
+  shrinkage: Real = 0.1,
   channels: str | tuple[str, ...] = "groups+opr+rpr+reward",
   log: bool = True,
 ) -> Detector:

@@ -9,7 +9,7 @@ import jax
 
 from mjx_cl.config import kinds
 from mjx_cl.detectors import combine
-from mjx_cl.detectors.base import Detector, Setting
+from mjx_cl.detectors.base import Detector, Real, Setting
 from mjx_cl.detectors.paper_rule import CALIBRATED, calibrated_rule, one_threshold, paper_rule
 from mjx_cl.detectors.rolling_sigma import rolling_sigma
 from mjx_cl.detectors.table import factory, split
@@ -71,7 +71,7 @@ def check_kinds(name: str, settings: dict, *builds: Callable[..., Any]) -> None:
   """Refuses a setting of another kind than its annotation in one of `builds` says, before a program
   is traced with it. Words are the factories' own to read, and numbers of JAX pass.
   """
-  number = {Setting: "float", Setting | None: "float | None"}
+  number = {Real: "float", Setting: "float", Setting | None: "float | None"}
   known = {
     p.name: number.get(p.annotation) or getattr(p.annotation, "__name__", str(p.annotation))
     for build in builds

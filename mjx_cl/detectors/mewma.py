@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from mjx_cl.detectors.base import Alarm, Detector, Setting, above, demand, judged, whole
+from mjx_cl.detectors.base import Alarm, Detector, Real, Setting, above, demand, judged, whole
 from mjx_cl.detectors.multivariate import Whitener, check_whitener, pick, split, whiten, whitener
 from mjx_cl.rollout.monitor import Residual
 
@@ -26,10 +26,10 @@ class MewmaState(NamedTuple):
 
 @whole
 def mewma(
-  rate: float = 0.02,
+  rate: Real = 0.02,
   threshold: Setting = 37.0,
   warmup: int = 1000,
-  shrinkage: float = 0.1,
+  shrinkage: Real = 0.1,
   exact: bool = False,
   channels: str | tuple[str, ...] = "groups+opr+rpr+reward",
   log: bool = True,

@@ -5,7 +5,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from mjx_cl.detectors.base import Alarm, Detector, Setting, above, demand, whole
+from mjx_cl.detectors.base import Alarm, Detector, Real, Setting, above, demand, whole
 from mjx_cl.detectors.combine import any_of
 from mjx_cl.detectors.thresholds import board
 from mjx_cl.errors import UserError
@@ -13,7 +13,7 @@ from mjx_cl.errors import UserError
 CHARTS = "cusum@surprise,ewma,e_detector"
 
 
-def in_units(detector: Detector, unit: float, threshold: Setting) -> Detector:
+def in_units(detector: Detector, unit: Real, threshold: Setting) -> Detector:
   """`detector`, built with the threshold `threshold * unit`, with its score in units of `unit`:
   fired if and only if score > threshold, rounding or not.
   """

@@ -15,6 +15,7 @@ from mjx_cl.detectors.base import (
   Detector,
   Flag,
   Number,
+  Real,
   Setting,
   Warm,
   above,
@@ -233,7 +234,7 @@ def whitener(p: int) -> Whitener:
   return Whitener(jnp.int32(0), jnp.zeros(p), jnp.zeros((p, p)), jnp.eye(p))
 
 
-def check_whitener(name: str, channels: tuple[str, ...], warmup: int, shrinkage: float) -> None:
+def check_whitener(name: str, channels: tuple[str, ...], warmup: int, shrinkage: Real) -> None:
   """Refuses a warm-up or a shrinkage of detector `name` that gives no reference."""
   least = len(channels) + 2
   rule = f"0, or at least {least}, the channels and two"
@@ -245,7 +246,7 @@ def check_whitener(name: str, channels: tuple[str, ...], warmup: int, shrinkage:
 
 
 def whiten(
-  state: Whitener, x: Rows, known: Flag, warmup: int, shrinkage: float
+  state: Whitener, x: Rows, known: Flag, warmup: int, shrinkage: Real
 ) -> tuple[Whitener, Rows, Flag]:
   """Y = M (x - mean) with M' M = S^-1: uncorrelated, of unit deviation, in the healthy stream.
 

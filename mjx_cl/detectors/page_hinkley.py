@@ -7,7 +7,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from mjx_cl.detectors.base import Detector, Number, Setting, above, chart, demand, scalar
+from mjx_cl.detectors.base import Detector, Number, Real, Setting, above, chart, demand, scalar
 
 MODES = ("both", "up", "down")
 
@@ -34,7 +34,7 @@ class Fading(NamedTuple):
   high: jax.Array
 
 
-def faded(state: Fading, z: Number, delta: float, alpha: float) -> Fading:
+def faded(state: Fading, z: Number, delta: Real, alpha: Real) -> Fading:
   """The sums with one sample more.
 
   The extremes do not fade while the sums do, so the differences are what is kept, with the term
@@ -54,9 +54,9 @@ def faded(state: Fading, z: Number, delta: float, alpha: float) -> Fading:
 
 @scalar
 def page_hinkley(
-  delta: float = 0.005,
+  delta: Real = 0.005,
   threshold: Setting = 50.0,
-  alpha: float = 0.9999,
+  alpha: Real = 0.9999,
   mode: str = "both",
   min_instances: int = 30,
   warmup: int = 1000,

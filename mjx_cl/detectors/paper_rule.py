@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from mjx_cl.detectors.base import Detector, Setting, whole
+from mjx_cl.detectors.base import Detector, Real, Setting, whole
 from mjx_cl.detectors.combine import any_of, on
 from mjx_cl.detectors.rolling_sigma import rolling_sigma
 
@@ -48,7 +48,7 @@ CALIBRATED: dict[str, dict[str, Any]] = {
 def paper_rule(
   threshold: Setting = 3.0,
   threshold_rpr: Setting | None = None,
-  unit_rpr: float = 1.0,
+  unit_rpr: Real = 1.0,
   **settings: Any,
 ) -> Detector:
   """The paper's rule as written: `rolling_sigma` on OPR and on RPR, beyond three deviations of the

@@ -15,7 +15,18 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from mjx_cl.detectors.base import Alarm, Count, Detector, Flag, Number, Setting, above, judged, keep
+from mjx_cl.detectors.base import (
+  Alarm,
+  Count,
+  Detector,
+  Flag,
+  Number,
+  Real,
+  Setting,
+  above,
+  judged,
+  keep,
+)
 from mjx_cl.errors import UserError
 
 Ring = Float[Array, "samples"]
@@ -169,7 +180,7 @@ def rolling_sigma(
   smooth: int = 1,
   lag: int = 0,
   log: bool = False,
-  unit: float = 1.0,
+  unit: Real = 1.0,
 ) -> Detector:
   """Rolling mean and standard deviation of the `window` samples before the present one.
 
@@ -222,7 +233,7 @@ def _ruled(
   warmup: int,
   smooth: int,
   log: bool,
-  unit: float,
+  unit: Real,
 ) -> Detector:
   """`rolling_sigma` once its settings are known to be good."""
   held = sums.length + sums.lag

@@ -6,7 +6,17 @@ import math
 
 import jax.numpy as jnp
 
-from mjx_cl.detectors.base import Detector, Number, Setting, Sides, above, chart, demand, scalar
+from mjx_cl.detectors.base import (
+  Detector,
+  Number,
+  Real,
+  Setting,
+  Sides,
+  above,
+  chart,
+  demand,
+  scalar,
+)
 
 
 def softplus(x: Number) -> Number:
@@ -16,7 +26,7 @@ def softplus(x: Number) -> Number:
 
 @scalar
 def shiryaev_roberts(
-  shift: float = 1.0, threshold: Setting = math.log(1e4), two_sided: bool = True, warmup: int = 1000
+  shift: Real = 1.0, threshold: Setting = math.log(1e4), two_sided: bool = True, warmup: int = 1000
 ) -> Detector:
   """Shiryaev-Roberts procedure for a Gaussian mean shift of known size, in logarithms.
 
