@@ -41,6 +41,9 @@ from mjx_cl.detectors.base import (
 )
 from mjx_cl.rollout.monitor import Residual
 
+Drawn = Int32[np.ndarray, "repetitions drawn"]
+Noise = Float32[np.ndarray, "repetitions drawn"]
+
 
 class Healthy(NamedTuple):
   """What the end of the warm-up fixes.
@@ -80,28 +83,19 @@ class BfarState(NamedTuple):
   blocks: jax.Array
 
 
-class Draws(NamedTuple):
-  """The numbers of the bootstrap, m reference blocks and then a run in each row.
-
-  Attributes:
-    chosen: int32 (repetitions, m + blocks), reference blocks.
-    noise: float32 (repetitions, m + blocks), standard Gaussian.
+def draws(m: int, blocks: int, repetitions: int) -> tuple[Drawn, Noise]:
+  """The numbers of the bootstrap, the same at every call: reference blocks, and standard Gaussian
+  noise; m for a reference and then a run in each row.
   """
-
-  chosen: Int32[np.ndarray, "repetitions drawn"]
-  noise: Float32[np.ndarray, "repetitions drawn"]
-
-
-def draws(m: int, blocks: int, repetitions: int) -> Draws:
-  """The same numbers at every call."""
   rng, shape = np.random.default_rng(0), (repetitions, m + blocks)
   chosen = rng.integers(0, m, shape).astype(np.int32)
-  return Draws(chosen, rng.standard_normal(shape).astype(np.float32))
+  return chosen, rng.standard_normal(shape).astype(np.float32)
 
 
 def settled(
   references: Float[Array, "m bins"],
-  drawn: Draws,
+  chosen: Drawn,
+  noise: Noise,
   horizons: tuple[int, ...],
   alpha: Real,
   shrinkage: Real,
@@ -118,9 +112,9 @@ def settled(
   b = references @ weights
   mean, std = b.mean(), jnp.maximum(b.std(ddof=1), 1e-6)
   width = 2.1 * m**-0.2
-  blocks = ((b - mean) / std)[drawn.chosen]
+  blocks = ((b - mean) / std)[chosen]
   # in deviations of the references
-  blocks = (blocks + width * drawn.noise) / np.sqrt(1 + width**2)
+  blocks = (blocks + width * noise) / np.sqrt(1 + width**2)
   own, run = blocks[:, :m], blocks[:, m:]
   own_mean = own.mean(1, keepdims=True)
   own_std = jnp.maximum(own.std(1, ddof=1, keepdims=True), 1e-6)
@@ -202,8 +196,8 @@ def bfar(
     warmup=(warmup, warmup >= 5 * block, "at least 5 blocks"),
   )
   m = warmup // block
-  drawn = draws(m, blocks, repetitions)
-  settle = lambda references: settled(references, drawn, horizons, alpha, shrinkage)
+  chosen, noise = draws(m, blocks, repetitions)
+  settle = lambda references: settled(references, chosen, noise, horizons, alpha, shrinkage)
   return _blocks(block, bins, horizons, threshold, m, settle)
 
 

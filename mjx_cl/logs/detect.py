@@ -93,16 +93,13 @@ def detect(
   Args:
     path: of the log that is judged.
     nominal_path: of the nominal log.
-    columns: default: all columns of numbers that both files have, less clocks and those that are
-      constant in the nominal log.
+    columns: default: all of numbers that both files have, less clocks and nominal constants.
     detectors: of `table()`, default all; or host detectors, module:Class or file.py:Class, which
       bring a threshold of their own and see samples in the file's own units.
-    arl0: wanted mean number of samples between false alarms, of all columns of one detector
-      together.
+    arl0: wanted mean number of samples between false alarms, all columns of a detector together.
     rate: samples per second, for times; default: from the column `time` or one of seconds,
       otherwise times are unknown. With a column `step`: steps per second.
-    logarithm: watch ln max(x, 1e-9); for residuals, which are positive and skewed. A sample of 0 or
-      less is refused.
+    logarithm: watch ln max(x, 1e-9), for positive and skewed residuals; x <= 0 is refused.
     settings: of the host detectors.
     tell: is told which detector comes next.
   """
@@ -110,23 +107,23 @@ def detect(
   hosts = _hosts(arl0, rate, names, settings)
   log, nominal = read(path), read(nominal_path)
   found, left = choose_columns(log, nominal, columns, path, nominal_path)
-  xs, past = (np.stack([one.columns[c] for c in found], 1) for one in (log, nominal))
-  if logarithm:
-    xs, past = _logarithm(xs, found, path), _logarithm(past, found, nominal_path)
+  xs, past = (
+    _samples(log, found, path, logarithm),
+    _samples(nominal, found, nominal_path, logarithm),
+  )
   now, healthy = _standardised(xs, past, found, nominal_path, logarithm)
   warmup = min(1000, len(past) // 3)
-  if not 2 <= len(found) <= warmup - 2:
-    names = _single(names, len(found), len(past), bool(detectors))
+  names = _able(names, len(found), len(past), warmup, bool(detectors))
   seconds, rate = _clock(log, rate, len(xs))
   rows, fired, scores, before = [], {}, {}, {}
   for k, name in enumerate(names):
     tell(f"{k + 1}/{len(names)} {name}")
     run = _host(hosts[name], xs, past) if name in hosts else None
     run = run or _registered(name, now, healthy, warmup, arl0)
-    threshold, calibrated, before[name], fired[name], scores[name] = run
-    early = before[name][warmup:]
-    rows.append(_row(name, threshold, calibrated, early, fired[name], found, seconds))
+    *_, before[name], fired[name], scores[name] = run
+    rows.append(_row(run, name, warmup, found, seconds))
   sizes = _sizes(xs, past, warmup)
+  notes = _notes(rows, sizes["counted"], arl0)
   summary = {
     "log": str(path),
     "nominal": str(nominal_path),
@@ -137,11 +134,7 @@ def detect(
     "rate_hz": rate,
     "logarithm": logarithm,
     "detectors": rows,
-    "notes": [
-      *dict.fromkeys(nominal.notes + log.notes),
-      *left,
-      *_notes(rows, sizes["counted"], arl0),
-    ],
+    "notes": [*dict.fromkeys(nominal.notes + log.notes), *left, *notes],
   }
   return Detection(summary, xs, past, fired, scores, before, seconds)
 
@@ -197,10 +190,13 @@ def _standardised(
   return cut(xs), cut(past)
 
 
-def _single(names: list[str], columns: int, rows: int, asked: bool) -> list[str]:
-  """`names` without those that watch all columns together; refused where one was asked for."""
-  able = table()
-  several = [name for name in names if name in able and joint(able[name])]
+def _able(names: list[str], columns: int, rows: int, warmup: int, asked: bool) -> list[str]:
+  """`names`, where the logs do not allow it without those that watch all columns together; refused
+  where one was asked for.
+  """
+  if 2 <= columns <= warmup - 2:
+    return names
+  several = [name for name in names if ":" not in name and joint(table()[name])]
   if several and asked:
     raise UserError(
       f"detector {several[0]!r} watches all columns together: it needs two columns or more, and a "
@@ -209,16 +205,18 @@ def _single(names: list[str], columns: int, rows: int, asked: bool) -> list[str]
   return [name for name in names if name not in several]
 
 
-def _logarithm(x: np.ndarray, names: list[str], path: pathlib.Path | str) -> np.ndarray:
-  """Ln max(x, 1e-9) of x (T, C); nan stays, anything else that is not positive is refused."""
-  for name, column in zip(names, x.T):
+def _samples(log: Log, names: list[str], path: pathlib.Path | str, logarithm: bool) -> np.ndarray:
+  """Columns (T, C) of a log, or ln max(x, 1e-9) of them; nan stays, anything else that is not
+  positive has no logarithm and is refused.
+  """
+  x = np.stack([log.columns[name] for name in names], 1)
+  for name, column in zip(names if logarithm else (), x.T):
     if (column <= 0).any():
       raise FileError(
         f"{path}: column {name} has samples without a logarithm, the smallest is "
-        f"{np.nanmin(column):g}; "
-        "name the others by --column, or leave out --logarithm"
+        f"{np.nanmin(column):g}; name the others by --column, or leave out --logarithm"
       )
-  return np.log(np.maximum(x, 1e-9))
+  return np.log(np.maximum(x, 1e-9)) if logarithm else x
 
 
 def _clock(log: Log, rate: float | None, samples: int) -> tuple[np.ndarray | None, float | None]:
@@ -270,15 +268,10 @@ def _host(one: python_class.HostDetector, xs: np.ndarray, past: np.ndarray) -> R
 
 
 def _row(
-  name: str,
-  threshold: float | None,
-  calibrated: bool | None,
-  before: np.ndarray,
-  fired: np.ndarray,
-  columns: list[str],
-  seconds: np.ndarray | None,
+  run: Run, name: str, warmup: int, columns: list[str], seconds: np.ndarray | None
 ) -> dict[str, Any]:
-  at, count = np.flatnonzero(fired.any(1)), int(before.sum())
+  threshold, calibrated, before, fired, _ = run
+  at, count = np.flatnonzero(fired.any(1)), int(before[warmup:].sum())
   first = int(at[0]) if len(at) else None
   return {
     "detector": name,
