@@ -117,10 +117,7 @@ def run_host(
   fired, scores = np.zeros(xs.shape, bool), np.full(xs.shape, np.nan)
   objects: list[Any] = []
   for s in range(xs.shape[1]):
-    detector = _fresh(
-      factory,
-      host_name or getattr(factory, "__name__", "of your own"),  # type: ignore[arg-type]
-    )
+    detector = _fresh(factory, host_name or str(getattr(factory, "__name__", "of your own")))
     if any(detector is other for other in objects):
       raise UserError(
         f"host detector {type(detector).__name__}: the factory gave the same object twice; "

@@ -69,4 +69,4 @@ def split(name: str) -> tuple[str, str | None]:
 
 def factory(name: str) -> Callable[..., Any]:
   """What builds detector `name`, its channel left aside."""
-  return choose("detector", split(name)[0], DETECTORS)  # type: ignore[return-value]
+  return choose("detector", split(name)[0], DETECTORS)
