@@ -22,7 +22,6 @@ that a Residual shows. A block should be longer than the memory of the reward.
 from collections.abc import Callable
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float32, Int32
@@ -55,10 +54,10 @@ class Healthy(NamedTuple):
     level: float32 (), the bootstrap's quantile.
   """
 
-  weights: jax.Array
-  mean: jax.Array
-  std: jax.Array
-  level: jax.Array
+  weights: Array
+  mean: Array
+  std: Array
+  level: Array
 
 
 class BfarState(NamedTuple):
@@ -74,13 +73,13 @@ class BfarState(NamedTuple):
     blocks: int32 (), blocks since the warm-up or the last alarm.
   """
 
-  seen: jax.Array
-  step: jax.Array
-  bins: jax.Array
-  references: jax.Array
+  seen: Array
+  step: Array
+  bins: Array
+  references: Array
   healthy: Healthy
-  recent: jax.Array
-  blocks: jax.Array
+  recent: Array
+  blocks: Array
 
 
 def draws(m: int, blocks: int, repetitions: int) -> tuple[Drawn, Noise]:

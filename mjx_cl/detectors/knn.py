@@ -2,7 +2,6 @@
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -34,9 +33,9 @@ class Healthy(NamedTuple):
     std: float32 (), of the same.
   """
 
-  weight: jax.Array
-  mean: jax.Array
-  std: jax.Array
+  weight: Array
+  mean: Array
+  std: Array
 
 
 class KnnState(NamedTuple):
@@ -50,7 +49,7 @@ class KnnState(NamedTuple):
   """
 
   warm: Warm
-  references: jax.Array
+  references: Array
   healthy: Healthy
   trail: Trail
 

@@ -2,11 +2,28 @@
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 
-from mjx_cl.detectors.base import Alarm, Detector, Real, Setting, above, demand, judged, whole
-from mjx_cl.detectors.multivariate import Whitener, check_whitener, pick, split, whiten, whitener
+from mjx_cl.detectors.base import (
+  Alarm,
+  Detector,
+  Number,
+  Real,
+  Setting,
+  above,
+  demand,
+  judged,
+  whole,
+)
+from mjx_cl.detectors.multivariate import (
+  Rows,
+  Whitener,
+  check_whitener,
+  pick,
+  split,
+  whiten,
+  whitener,
+)
 from mjx_cl.rollout.monitor import Residual
 
 
@@ -20,8 +37,8 @@ class MewmaState(NamedTuple):
   """
 
   whitener: Whitener
-  mean: jax.Array
-  left: jax.Array
+  mean: Rows
+  left: Number
 
 
 @whole

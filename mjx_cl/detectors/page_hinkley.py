@@ -4,7 +4,6 @@ extreme so far.
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 
 from mjx_cl.detectors.base import Detector, Number, Real, Setting, above, chart, demand, scalar
@@ -25,13 +24,13 @@ class Fading(NamedTuple):
     high: float32 (), largest `down`.
   """
 
-  seen: jax.Array
-  origin: jax.Array
-  mean: jax.Array
-  rise: jax.Array
-  low: jax.Array
-  fall: jax.Array
-  high: jax.Array
+  seen: Number
+  origin: Number
+  mean: Number
+  rise: Number
+  low: Number
+  fall: Number
+  high: Number
 
 
 def faded(state: Fading, z: Number, delta: Real, alpha: Real) -> Fading:
