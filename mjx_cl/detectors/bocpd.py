@@ -15,6 +15,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from mjx_cl.detectors.base import Detector, Number, Real, Setting, above, chart, demand, scalar
 
@@ -83,7 +84,7 @@ def restarted(table: Cells, beta: Real) -> Runs:
   )
 
 
-def gamma_ratio(alpha: Number) -> Number:
+def gamma_ratio(alpha: Float[Array, "*rows"]) -> Float[Array, "*rows"]:
   """Gamma(alpha + 1/2) / Gamma(alpha) for alpha >= 8, by Stirling's series to 1e-7; a difference of
   two float32 lgamma would lose the digits.
   """

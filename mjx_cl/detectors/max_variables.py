@@ -2,12 +2,13 @@
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from mjx_cl.detectors.base import Detector, Number, Setting, whole
 from mjx_cl.detectors.multivariate import Rows, split, standing
 
 
-def corrected(z: Number, charts: int, two_sided: bool) -> Number:
+def corrected(z: Float[Array, "*rows"], charts: int, two_sided: bool) -> Float[Array, "*rows"]:
   """-ln of the Sidak-corrected Gaussian p-value of the largest of `charts` deviations z: -ln(1 - (1
   - p)^charts), p = 2 Phi(-z) or Phi(-z).
   """
