@@ -5,8 +5,22 @@ extreme so far.
 from typing import NamedTuple
 
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 
-from mjx_cl.detectors.base import Detector, Number, Real, Setting, above, chart, demand, scalar
+from mjx_cl.detectors.base import (
+  Alarm,
+  ChartState,
+  Detector,
+  Number,
+  Real,
+  Setting,
+  above,
+  cold,
+  demand,
+  judged,
+  scalar,
+  standardise,
+)
 
 MODES = ("both", "up", "down")
 
@@ -83,9 +97,6 @@ def page_hinkley(
     min_instances: samples after the warm-up, or after an alarm, before anything fires and a score
       is known [control steps].
     warmup: samples that fit centre and std; 0: x as it is [control steps].
-
-  Returns:
-    Detector of one number; the score is nan before min_instances.
   Blind to: a shift below delta; a change slow enough for the running mean to follow; a change of
   variance alone; with alpha < 1 also a shift below about threshold * (1 - alpha), whose faded sum
   never gets there.
@@ -102,9 +113,15 @@ def page_hinkley(
     warmup=(warmup, warmup == 0 or warmup >= 2, "0 or at least 2"),
   )
 
-  def step(state: Fading, z: Number) -> tuple[Fading, Number]:
-    new = faded(state, z, delta, alpha)
-    scores = {"both": jnp.maximum(new.rise, new.fall), "up": new.rise, "down": new.fall}
-    return new, jnp.where(new.seen >= min_instances, scores[mode], jnp.nan)
+  def init() -> ChartState:
+    return ChartState(cold(), Fading(*(jnp.float32(0) for _ in Fading._fields)))
 
-  return chart(lambda: Fading(*(jnp.float32(0) for _ in Fading._fields)), step, threshold, warmup)
+  def update(state: ChartState, x: ArrayLike) -> tuple[ChartState, Alarm]:
+    warm, z, ready = standardise(state.warm, jnp.asarray(x, jnp.float32), warmup)
+    new = faded(state.evidence, z, delta, alpha)
+    score = {"both": jnp.maximum(new.rise, new.fall), "up": new.rise, "down": new.fall}[mode]
+    alarm = judged(score, ready & (new.seen >= min_instances), threshold)
+    evidence = [jnp.where(ready & ~alarm.fired, value, 0.0) for value in new]
+    return ChartState(warm, Fading(*evidence)), alarm
+
+  return Detector(init, update)
