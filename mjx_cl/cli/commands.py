@@ -566,9 +566,9 @@ def do_render(args: Render) -> None:
 
 def do_detect(args: Detect) -> None:
   """Watches a log."""
-  from mjx_cl.logs import detect
+  from mjx_cl.logs import detect, results
 
-  out = None if args.out is None else detect.claim(args.out, args.overwrite)
+  out = None if args.out is None else results.claim(args.out, args.overwrite)
   tell = say if sys.stderr.isatty() else lambda text: None
   result = detect.detect(
     args.file,
@@ -582,7 +582,7 @@ def do_detect(args: Detect) -> None:
     tell,
   )
   if out:
-    detect.write(result, out)
+    results.write(result, out)
   for note in result.summary["notes"]:
     say(f"mjx-cl: {note}")
   if args.json:

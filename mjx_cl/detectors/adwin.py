@@ -1,13 +1,37 @@
-"""ADWIN on one residual: a window that is cut wherever its two parts differ in mean."""
+"""ADWIN on one residual: a window that is cut wherever its two parts differ in mean.
 
-from __future__ import annotations
+The bound is meant for samples in [0, 1]. In the form with variance, the variance carries the scale,
+and only the term 2/3 m L, the price of a bounded but skewed sample, has the unit of x: on samples
+much smaller than 1 it rules and the rule is deaf, on samples much larger it vanishes and what is
+left is a test of a normal mean. Warm-up deviations as unit set that scale; they are not bounded, so
+delta is then a level, not a guarantee.
+
+Only every `clock`-th sample is a check, and only beyond `grace_period` samples: an alarm comes up
+to clock - 1 samples later than the evidence for it, and between checks the score is that of the
+last one, of the window before anything was dropped.
+"""
 
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 
-from mjx_cl.detectors.base import Alarm, Detector, Warm, above, cold, demand, scalar, standardise
+from mjx_cl.detectors.base import (
+  Alarm,
+  Detector,
+  Flag,
+  Number,
+  Setting,
+  Warm,
+  above,
+  at_least,
+  cold,
+  demand,
+  scalar,
+  standardise,
+)
+from mjx_cl.detectors.base import keep as kept
 
 
 class Buckets(NamedTuple):
@@ -15,8 +39,8 @@ class Buckets(NamedTuple):
   place 0 of the highest row in use.
 
   Attributes:
-    mean: float32 (max_buckets, rows). squares: float32 (max_buckets, rows), sums of squared
-      deviations; both 0 where unused.
+    mean: float32 (max_buckets, rows), 0 where unused.
+    squares: float32 (max_buckets, rows), sums of squared deviations, 0 where unused.
     number: int32 (rows,), buckets in use.
   """
 
@@ -26,9 +50,13 @@ class Buckets(NamedTuple):
 
 
 class AdwinState(NamedTuple):
-  """Attributes:
-  warm: scale of the stream. window: see Buckets. tick: int32 (), samples since the window began.
-  score: float32 (), of the last check.
+  """What the detector remembers.
+
+  Attributes:
+    warm: scale of the stream.
+    window: see Buckets.
+    tick: int32 (), samples since the window began.
+    score: float32 (), of the last check.
   """
 
   warm: Warm
@@ -44,7 +72,7 @@ def empty(max_buckets: int, rows: int) -> Buckets:
   )
 
 
-def insert(window: Buckets, x: jax.Array) -> Buckets:
+def insert(window: Buckets, x: Number) -> Buckets:
   """Adds a sample as a bucket of row 0. A full row first merges its two oldest buckets into one of
   the next row, so a carry runs up the full rows; beyond the last row it is lost, and the window
   slides.
@@ -79,7 +107,7 @@ def drop_oldest(window: Buckets) -> Buckets:
   return Buckets(left(window.mean), left(window.squares), window.number - oldest)
 
 
-def strongest_cut(window: Buckets, shortest: int) -> jax.Array:
+def strongest_cut(window: Buckets, shortest: int) -> Number:
   """The largest -ln(delta) at which some cut of the window is just significant, float32 (); -inf
   where none is allowed yet.
   """
@@ -98,20 +126,42 @@ def strongest_cut(window: Buckets, shortest: int) -> jax.Array:
   n0, u0 = jnp.cumsum(n), jnp.cumsum(n * (mean - centre))
   n1 = width - n0
   allowed = (n0 >= shortest) & (n1 >= shortest)
-  difference = jnp.abs(
-    u0 / jnp.maximum(n0, 1) + u0 / jnp.maximum(n1, 1)
-  )  # the parts' sums about the centre are u0 and -u0
+  # the parts' sums about the centre are u0 and -u0
+  difference = jnp.abs(u0 / jnp.maximum(n0, 1) + u0 / jnp.maximum(n1, 1))
   m = 1 / jnp.maximum(n0 - shortest + 1, 1) + 1 / jnp.maximum(n1 - shortest + 1, 1)
   linear, root = 2 / 3 * m, jnp.sqrt(2 * m * variance)
-  y = (
-    2 * difference / (root + jnp.sqrt(root * root + 4 * linear * difference))
-  )  # linear y^2 + root y = difference, without cancellation
+  # linear y^2 + root y = difference, without cancellation
+  y = 2 * difference / (root + jnp.sqrt(root * root + 4 * linear * difference))
   return jnp.max(jnp.where(allowed, y * y, -jnp.inf)) - jnp.log(2 * jnp.log(width))
+
+
+def checked(
+  window: Buckets, due: Flag, last: Number, threshold: Setting, shortest: int
+) -> tuple[Buckets, Number]:
+  """(window after the cuts, score before them): a loop of no turn where nothing is due, so that
+  under vmap the test costs only where some stream is due; the score is `last` there.
+  """
+
+  def turn(carry: tuple[Buckets, Flag, Number, Flag]) -> tuple[Buckets, Flag, Number, Flag]:
+    window, _, score, first = carry
+    now = strongest_cut(window, shortest)
+    cut = now > threshold
+    return (
+      kept(cut, drop_oldest(window), window),
+      cut,
+      jnp.where(first, now, score),
+      jnp.bool_(False),
+    )
+
+  window, _, score, _ = jax.lax.while_loop(
+    lambda carry: carry[1], turn, (window, due, last, jnp.bool_(True))
+  )
+  return window, jnp.where(jnp.isneginf(score), jnp.nan, score)
 
 
 @scalar
 def adwin(
-  threshold: float = 6.2146,
+  threshold: Setting = 6.2146,
   clock: int = 32,
   grace_period: int = 10,
   max_buckets: int = 5,
@@ -123,26 +173,15 @@ def adwin(
   """Two-sided ADWIN: a window as long as its samples agree, kept as O(log n) buckets, tested at
   every border between two of them.
 
-    parts of n0 older and n1 newer samples, W = n0 + n1, means u0, u1, variance s2 of the whole
-    window significant at delta where |u0 - u1| > sqrt(2 m s2 L) + 2/3 m L,
-      L = ln(2 ln(W) / delta),  m = 1 / (n0 - min_window_length + 1) + 1 / (n1 - min_window_length +
-      1)
-    score = largest -ln(delta) at which a border would just be significant;  fired = score >
-    threshold, at a check at an alarm the oldest buckets go, one by one, until no border is
-    significant; then, unless `keep`, the rest goes too
-
-  Only every `clock`-th sample is a check, and only beyond `grace_period` samples: an alarm comes up
-  to clock - 1 samples later than the evidence for it (15.5 on average), and between checks the
-  score is that of the last one. The score is that of the window before anything is dropped. The
-  bound is meant for samples in [0, 1]. In the form above the variance carries the scale, and only
-  the term 2/3 m L, the price of a bounded but skewed sample, has the unit of x: on samples much
-  smaller than 1 it rules and the rule is deaf, on samples much larger it vanishes and what is left
-  is a test of a normal mean. Warm-up deviations as unit set that scale; they are not bounded, so
-  delta is then a level, not a guarantee.
+    parts of n0 older and n1 newer samples, W = n0 + n1, means u0, u1, variance s2 of the window
+    significant at delta where |u0 - u1| > sqrt(2 m s2 L) + 2/3 m L,  L = ln(2 ln(W) / delta),
+      m = 1 / (n0 - min_window_length + 1) + 1 / (n1 - min_window_length + 1)
+    score = largest -ln(delta) at which a border would just be significant
+    fired = score > threshold, at a check; then the oldest buckets go, one by one, until no border
+      is significant; then, unless `keep`, the rest goes too
 
   Args:
-    threshold: -ln(delta), compared with the score; 6.2146 is delta = 0.002, with no alarm in
-      2,000,000 independent Gaussian samples. May be traced.
+    threshold: -ln(delta), compared with the score; 6.2146 is delta = 0.002. May be traced.
     clock: samples from check to check [control steps].
     grace_period: samples that a window must exceed to be checked [control steps].
     max_buckets: buckets of one size; more make finer borders.
@@ -151,23 +190,17 @@ def adwin(
       default, the oldest are forgotten.
     keep: after an alarm keep what lies after the cut, as in the paper; one change then often alarms
       at several checks. False starts from an empty window.
-    warmup: samples whose mean and deviation scale the stream and which enter no window [control
-      steps]; 0 takes the stream as it is.
-
-  Returns:
-    Detector whose update takes x, float32 (), and gives Alarm(fired: bool (), score: float32 ()).
+    warmup: samples that scale the stream and enter no window [control steps]; 0: x as it is.
   Blind to: a change of variance alone; a change that is undone within `clock` samples; a shift that
-  2/3 m L hides (warmup = 0, small unit). Source: Bifet and Gavalda 2007, SIAM International
-  Conference on Data Mining, 443-448, in the form with variance; warmup = 0 alarms where
-    river.drift.ADWIN does.   Example: _, out = jax.lax.scan(det.update, det.init(), xs)
+  2/3 m L hides (warmup = 0, small unit).
+  Source: Bifet and Gavalda 2007, SIAM International Conference on Data Mining, 443-448, in the form
+  with variance; warmup = 0 alarms where river.drift.ADWIN does.
   """
   demand(
     "adwin",
     threshold=(threshold, above(threshold, 0), "above 0"),
-    clock=(clock, clock >= 1, "at least 1"),
-    grace_period=(grace_period, grace_period >= 1, "at least 1"),
-    max_buckets=(max_buckets, max_buckets >= 2, "at least 2"),
-    min_window_length=(min_window_length, min_window_length >= 1, "at least 1"),
+    **at_least(1, clock=clock, grace_period=grace_period, min_window_length=min_window_length),
+    **at_least(2, max_buckets=max_buckets),
     rows=(rows, 1 <= rows <= 24, "from 1 to 24"),
     warmup=(warmup, warmup == 0 or warmup >= 2, "0, or at least 2"),
   )
@@ -175,36 +208,15 @@ def adwin(
   def init() -> AdwinState:
     return AdwinState(cold(), empty(max_buckets, rows), jnp.int32(0), jnp.float32(jnp.nan))
 
-  def check(window: Buckets, due: jax.Array, last: jax.Array) -> tuple[Buckets, jax.Array]:
-    """(window after the cuts, score): a loop of no turn where nothing is due, so that under vmap
-    the test costs only where some stream is due.
-    """
-
-    def turn(
-      carry: tuple[Buckets, jax.Array, jax.Array, jax.Array],
-    ) -> tuple[Buckets, jax.Array, jax.Array, jax.Array]:
-      window, _, score, first = carry
-      now = strongest_cut(window, min_window_length)
-      cut = now > threshold
-      window = jax.tree.map(lambda a, b: jnp.where(cut, a, b), drop_oldest(window), window)
-      return window, cut, jnp.where(first, now, score), jnp.bool_(False)
-
-    window, _, score, _ = jax.lax.while_loop(
-      lambda carry: carry[1], turn, (window, due, last, jnp.bool_(True))
-    )
-    return window, jnp.where(jnp.isneginf(score), jnp.nan, score)
-
-  def update(state: AdwinState, x: jax.Array) -> tuple[AdwinState, Alarm]:
+  def update(state: AdwinState, x: ArrayLike) -> tuple[AdwinState, Alarm]:
     warm, z, ready = standardise(state.warm, jnp.asarray(x, jnp.float32), warmup)
-    tick = state.tick + 1
-    window = insert(state.window, z)
+    tick, window = state.tick + 1, insert(state.window, z)
     width = jnp.sum(window.number * 2 ** jnp.arange(rows))
     due = ready & (tick % clock == 0) & (width > grace_period)
-    window, score = check(window, due, state.score)
+    window, score = checked(window, due, state.score, threshold, min_window_length)
     fired = due & (score > threshold)
     new = AdwinState(warm, window, tick, score)
     start = init()._replace(warm=warm)
-    new = jax.tree.map(lambda a, b: jnp.where(ready & ~(fired & (not keep)), a, b), new, start)
-    return new, Alarm(fired, score)
+    return kept(ready & ~(fired & (not keep)), new, start), Alarm(fired, score)
 
   return Detector(init, update)

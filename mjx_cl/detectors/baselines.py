@@ -1,18 +1,15 @@
 """Detectors that look at nothing: what every score is printed beside."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Key, UInt32
 
-from mjx_cl.detectors.base import Alarm, Detector, above, demand
-
-if TYPE_CHECKING:
-  from mjx_cl.rollout.monitor import Residual
+from mjx_cl.detectors.base import Alarm, Detector, Setting, above, demand, judged
+from mjx_cl.rollout.monitor import Residual
 
 
 def reference(factory: Callable[..., Detector]) -> Callable[..., Detector]:
@@ -25,9 +22,7 @@ def _constant(fires: bool) -> Detector:
   """Fires at every known row or at none; score 1 or 0."""
 
   def update(state: jax.Array, residual: Residual) -> tuple[jax.Array, Alarm]:
-    return state, Alarm(
-      residual.valid & fires, jnp.where(residual.valid, float(fires), jnp.nan).astype(jnp.float32)
-    )
+    return state, judged(jnp.float32(fires), residual.valid, 0.5)
 
   return Detector(lambda: jnp.int32(0), update)
 
@@ -40,7 +35,7 @@ def never() -> Detector:
   Printed beside every score because a score that `never` also reaches was not earned by detection:
   with few faults in a long stream, precision, false alarms per hour and return of an agent that
   needs no help all look fine. No threshold: it is not calibrated, its ARL0 is infinite. Blind to:
-  everything. Example: _, out = jax.lax.scan(det.update, det.init(), residuals)
+  everything.
   """
   return _constant(False)
 
@@ -51,17 +46,20 @@ def always() -> Detector:
 
   Printed beside every score because a delay without its false alarms is won by this detector. No
   threshold: it is not calibrated. Blind to: everything.
-  Example: _, out = jax.lax.scan(det.update, det.init(), residuals)
   """
   return _constant(True)
 
 
 class PeriodicState(NamedTuple):
-  """Attributes: count: uint32 (), known rows. phase: uint32 (), where on the clock the stream
-  began. begun: bool (), it has been drawn.
+  """What the clock remembers.
+
+  Attributes:
+    seen: uint32 (), known rows.
+    phase: uint32 (), where on the clock the stream began.
+    begun: bool (), it has been drawn.
   """
 
-  count: jax.Array  # type: ignore[assignment]
+  seen: jax.Array
   phase: jax.Array
   begun: jax.Array
 
@@ -70,7 +68,7 @@ GOLDEN = 2_654_435_769  # 2^32 over the golden ratio
 
 
 @reference
-def periodic(threshold: float = math.log(10_000)) -> Detector:
+def periodic(threshold: Setting = math.log(10_000)) -> Detector:
   """Fires every exp(threshold) known rows, whatever they hold, as regularly as a clock can that
   does not know its period.
 
@@ -90,51 +88,45 @@ def periodic(threshold: float = math.log(10_000)) -> Detector:
   Args:
     threshold: ln of the mean interval [ln control steps], at least 0.
   Blind to: everything.
-  Reference: Sos 1958, Ann. Univ. Sci. Budapest 1, 127-134 (three lengths).   Example: _, out =
-    jax.lax.scan(det.update, det.init(), residuals)
+  Reference: Sos 1958, Ann. Univ. Sci. Budapest 1, 127-134 (three lengths).
   """
-  demand(
-    "periodic",
-    threshold=(
-      threshold,
-      above(threshold, -1e-9),
-      "at least 0, the logarithm of an interval in steps",
-    ),
-  )
+  rule = "at least 0, the logarithm of an interval in steps"
+  demand("periodic", threshold=(threshold, above(threshold, -1e-9), rule))
 
   def update(state: PeriodicState, residual: Residual) -> tuple[PeriodicState, Alarm]:
     known = residual.valid
     drawn = jax.random.bits(_told_apart(jnp.zeros(2, jnp.uint32), residual))
     phase = jnp.where(known & ~state.begun, drawn, state.phase)
-    u = ((phase + jnp.uint32(GOLDEN) * state.count).astype(jnp.float32) + 0.5) * 2.0**-32
-    score = -jnp.log(
-      jnp.minimum(u, 1 - 2.0**-24)
-    )  # float32 would round the largest to 1, which fires at no threshold
-    new = PeriodicState(state.count + known.astype(jnp.uint32), phase, state.begun | known)
-    return new, Alarm(known & (score > threshold), jnp.where(known, score, jnp.nan))
+    u = ((phase + jnp.uint32(GOLDEN) * state.seen).astype(jnp.float32) + 0.5) * 2.0**-32
+    new = PeriodicState(state.seen + known.astype(jnp.uint32), phase, state.begun | known)
+    return new, judged(-jnp.log(u), known, threshold)
 
   return Detector(lambda: PeriodicState(jnp.uint32(0), jnp.uint32(0), jnp.bool_(False)), update)
 
 
-def _told_apart(seed: jax.Array, residual: Residual) -> jax.Array:
-  """A key of seed, uint32 (2,), and the bits of a row: streams start from one state, and would
-  otherwise all draw the same.
+def _told_apart(seed: UInt32[Array, "2"], residual: Residual) -> Key[Array, ""]:
+  """A key of seed and the bits of a row: streams start from one state, and would otherwise all draw
+  the same.
   """
   bits = jax.lax.bitcast_convert_type(jnp.stack([residual.opr, residual.reward]), jnp.uint32)
-  return jax.random.wrap_key_data(
-    seed + bits, impl="threefry2x32"
-  )  # modulo 2^32; the cipher spreads what is near
+  # modulo 2^32; the cipher spreads what is near
+  return jax.random.wrap_key_data(seed + bits, impl="threefry2x32")
 
 
 class RandomState(NamedTuple):
-  """Attributes: count: int32 (), known rows. seed: uint32 (2,), data of a key."""
+  """What the draws go by.
 
-  count: jax.Array  # type: ignore[assignment]
+  Attributes:
+    seen: int32 (), known rows.
+    seed: uint32 (2,), data of a key.
+  """
+
+  seen: jax.Array
   seed: jax.Array
 
 
 @reference
-def random(threshold: float = math.log(10_000), seed: int = 0) -> Detector:
+def random(threshold: Setting = math.log(10_000), seed: int = 0) -> Detector:
   """Fires at a known row with probability exp(-threshold), whatever it holds.
 
     u = uniform draw of (seed, number of the known row, bits of the row's OPR and reward);  score =
@@ -152,36 +144,24 @@ def random(threshold: float = math.log(10_000), seed: int = 0) -> Detector:
     threshold: ln of the mean interval [ln control steps], at least 0.
     seed: of the draws.
   Blind to: everything.
-  Example: _, out = jax.lax.scan(det.update, det.init(), residuals)
   """
-  demand(
-    "random",
-    threshold=(
-      threshold,
-      above(threshold, -1e-9),
-      "at least 0, the logarithm of a mean interval in steps",
-    ),
-  )
+  rule = "at least 0, the logarithm of a mean interval in steps"
+  demand("random", threshold=(threshold, above(threshold, -1e-9), rule))
 
   def init() -> RandomState:
     return RandomState(jnp.int32(0), jax.random.key_data(jax.random.key(seed, impl="threefry2x32")))
 
   def update(state: RandomState, residual: Residual) -> tuple[RandomState, Alarm]:
-    u = jax.random.uniform(
-      jax.random.fold_in(_told_apart(state.seed, residual), state.count),
-      minval=jnp.finfo(jnp.float32).tiny,
-    )
-    score = -jnp.log(u)
-    known = residual.valid
-    return RandomState(state.count + known, state.seed), Alarm(
-      known & (score > threshold), jnp.where(known, score, jnp.nan)
-    )
+    key = jax.random.fold_in(_told_apart(state.seed, residual), state.seen)
+    score = -jnp.log(jax.random.uniform(key, minval=jnp.finfo(jnp.float32).tiny))
+    alarm = judged(score, residual.valid, threshold)
+    return RandomState(state.seen + residual.valid, state.seed), alarm
 
   return Detector(init, update)
 
 
 @reference
-def oracle(onset: int | jax.Array = 0) -> Detector:
+def oracle(onset: Setting = 0) -> Detector:
   """Fires once, at the true onset: latency 0, no miss, no false alarm.
 
     t = rows before this one, known or not;  score = 1 if t >= onset, else 0;  fired = (t == onset)
@@ -194,7 +174,6 @@ def oracle(onset: int | jax.Array = 0) -> Detector:
 
   Args:
     onset: step of the change [control steps], may be traced.
-  Example: _, out = jax.lax.scan(det.update, det.init(), residuals)
   """
   demand("oracle", onset=(onset, above(onset, -1), "at least 0"))
 
@@ -204,10 +183,5 @@ def oracle(onset: int | jax.Array = 0) -> Detector:
   return Detector(lambda: jnp.int32(0), update)
 
 
-REFERENCES = {
-  "never": never,
-  "always": always,
-  "periodic": periodic,
-  "random": random,
-  "oracle": oracle,
-}
+# the oracle must be told the onset, so it is not in the table of detectors
+REFERENCES = {f.__name__: f for f in (never, always, periodic, random, oracle)}

@@ -2,16 +2,16 @@
 stream passes through first.
 """
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
 
-from mjx_cl.detectors.base import Alarm, Detector, demand
+from mjx_cl.detectors.base import Alarm, Count, Detector, Flag, demand, keep
 from mjx_cl.errors import UserError
 from mjx_cl.rollout.monitor import CHANNELS, Residual
 
@@ -23,7 +23,7 @@ def is_channel(name: str) -> bool:
   return name in CHANNELS or name.startswith("variable_") and name[9:].isdigit()
 
 
-def read(channel: str, residual: Residual) -> jax.Array:
+def read(channel: str, residual: Residual) -> Float[Array, "*rows"]:
   """One number of a monitor.Residual, or of rows of them with leading axes: `opr`, `rpr`, `reward`,
   `surprise`, `group_0` .. `group_7`, or `variable_0` and so on, the residual of a single
   observation variable. Unknown values are nan. UserError for a variable that the residual does not
@@ -55,11 +55,10 @@ def on(channel: str, detector: Detector, log: bool = False) -> Detector:
   def update(state: Any, residual: Residual) -> tuple[Any, Alarm]:
     x = read(channel, residual)
     valid = jnp.isfinite(x) & (residual.valid | (channel in ("reward", "surprise")))
-    skips = getattr(detector.update, "skips", False)
-    x = jnp.where(valid, x, jnp.nan if skips else 0.0)
+    x = jnp.where(valid, x, jnp.nan if detector.skips else 0.0)
     new, alarm = detector.update(state, jnp.log(jnp.maximum(x, 1e-9)) if log else x)
-    if not skips:
-      new = jax.tree.map(lambda a, b: jnp.where(valid, a, b), new, state)
+    if not detector.skips:
+      new = keep(valid, new, state)
     return new, Alarm(alarm.fired & valid, jnp.where(valid, alarm.score, jnp.nan))
 
   return Detector(detector.init, update)
@@ -77,15 +76,15 @@ def any_of(*detectors: Detector) -> Detector:
       fired, jnp.where(jnp.all(jnp.isnan(scores)), jnp.nan, known)
     )
 
-  update.members = (  # type: ignore[attr-defined]
-    detectors  # for passes.updates: the largest score hides what the other members do
-  )
-  return Detector(lambda: tuple(d.init() for d in detectors), update)
+  return Detector(lambda: tuple(d.init() for d in detectors), update, members=detectors)
 
 
 class RunState(NamedTuple):
-  """Attributes:
-  inner: state of the detector. run: int32 (), scores in a row above the threshold, at most k.
+  """What patience remembers.
+
+  Attributes:
+    inner: state of the detector.
+    run: int32 (), scores in a row above the threshold, at most k.
   """
 
   inner: Any
@@ -119,8 +118,11 @@ def patience(factory: Callable[..., Detector], k: int, **settings: Any) -> Detec
 
 
 class CoolState(NamedTuple):
-  """Attributes:
-  inner: state of the detector. left: int32 (), samples for which alarms are still dropped.
+  """What a cool-down remembers.
+
+  Attributes:
+    inner: state of the detector.
+    left: int32 (), samples for which alarms are still dropped.
   """
 
   inner: Any
@@ -143,49 +145,96 @@ def cool_down(detector: Detector, steps: int) -> Detector:
   return Detector(lambda: CoolState(detector.init(), jnp.int32(0)), update)
 
 
-def _handed_on(ready: jax.Array, detector: Detector, inner: Any, x: jax.Array) -> tuple[Any, Alarm]:
-  """The detector's update where `ready`; elsewhere its state stays and nothing is known."""
-  new, alarm = detector.update(inner, jnp.where(ready, x, 0.0))
-  return jax.tree.map(lambda a, b: jnp.where(ready, a, b), new, inner), Alarm(
-    alarm.fired & ready, jnp.where(ready, alarm.score, jnp.nan)
-  )
-
-
-class WhitenedState(NamedTuple):
-  """Sums run over the first `warmup` samples, of d = x - origin; arrays (order + 1,) are indexed by
-  lag.
+class Sums(NamedTuple):
+  """Sums over the first `warmup` samples d = x - origin of a stream, (order + 1,) by lag.
 
   Attributes:
-    count: int32 (), samples seen, at most warmup + order. origin: float32 (), the first sample.
-    recent: float32 (order,), the last d, newest first; 0 where there is none.
-    products: float32 (order + 1,), sum of d_t d_{t-k}. first, last: float32 (order + 1,), sum of
-      the first and of the last k samples' d.
+    products: float32 (order + 1,), sum of d_t d_{t-k}.
+    first: float32 (order + 1,), sum of the first k samples' d.
+    last: float32 (order + 1,), sum of the last k samples' d.
     total: float32 (), sum of d.
-    forward, backward: float32 (order + 1,), prediction error filters. error: float32 (), variance
-      of their output.
-    inner: state of the detector.
   """
 
-  count: jax.Array  # type: ignore[assignment]
-  origin: jax.Array
-  recent: jax.Array
   products: jax.Array
   first: jax.Array
   last: jax.Array
   total: jax.Array
+
+
+class Filters(NamedTuple):
+  """Prediction error filters of one order.
+
+  Attributes:
+    forward: float32 (order + 1,).
+    backward: float32 (order + 1,).
+    error: float32 (), variance of their output.
+  """
+
   forward: jax.Array
   backward: jax.Array
   error: jax.Array
+
+
+class WhitenedState(NamedTuple):
+  """What whitening remembers.
+
+  Attributes:
+    seen: int32 (), samples, at most warmup + order.
+    origin: float32 (), the first sample.
+    recent: float32 (order,), the last d, newest first; 0 where there is none.
+    sums: of the warm-up.
+    filters: fitted to it.
+    inner: state of the detector.
+  """
+
+  seen: jax.Array
+  origin: jax.Array
+  recent: jax.Array
+  sums: Sums
+  filters: Filters
   inner: Any
+
+
+def levinson(sums: Sums, filters: Filters, begins: Flag, warmup: int) -> Filters:
+  """Filters of one order more, by Levinson's recursion from the autocovariances that the sums give;
+  it begins with the variance of the stream.
+  """
+  lag = jnp.arange(len(sums.products))
+  mean = sums.total / warmup
+  c = (
+    sums.products
+    - mean * (2 * sums.total - sums.first - sums.last)
+    + (warmup - lag) * jnp.square(mean)
+  ) / warmup
+  error = jnp.where(begins, c[0], filters.error)
+  behind = jnp.concatenate([jnp.zeros(1), filters.backward[:-1]])
+  # the floor: a deviation of 1e-6, as in base.standardise
+  reflection = jnp.sum(behind * c) / jnp.maximum(error, 1e-12)
+  return Filters(
+    filters.forward - reflection * behind,
+    behind - reflection * filters.forward,
+    error * (1 - jnp.square(reflection)),
+  )
+
+
+def added(sums: Sums, window: Float[Array, " lags"], n: Count) -> Sums:
+  """The sums with one sample more, the first of `window`, behind `n` others."""
+  d = window[0]
+  return Sums(
+    sums.products + d * window,
+    sums.first + jnp.where(n < jnp.arange(len(window)), d, 0.0),
+    jnp.concatenate([jnp.zeros(1), sums.last[:-1] + d]),
+    sums.total + d,
+  )
 
 
 def whitened(detector: Detector, order: int = 8, warmup: int = 1000) -> Detector:
   """Hands a detector of one number the innovations of an autoregression that is fitted to the
   stream's own first samples.
 
-    c_k = 1/N sum_{t=k+1..N} (x_t - m)(x_{t-k} - m),  m = mean of x_1..x_N,  N = warmup,  k =
-    0..order sum_j a_j c_|i-j| = c_i, i = 1..order (Yule-Walker; its solution is stable),  e_t = x_t
-    - m - sum_j a_j (x_{t-j} - m)
+    c_k = 1/N sum_{t=k+1..N} (x_t - m)(x_{t-k} - m),  m = mean of x_1..x_N,  N = warmup
+    sum_j a_j c_|i-j| = c_i, i = 1..order (Yule-Walker; its solution is stable)
+    e_t = x_t - m - sum_j a_j (x_{t-j} - m)
 
   The equations are solved by Levinson's recursion, one order at each of the `order` samples after
   the warm-up, so that under vmap no step pays for the whole solution. The detector sees e_t from
@@ -194,14 +243,15 @@ def whitened(detector: Detector, order: int = 8, warmup: int = 1000) -> Detector
   cumulative sum, and a lasting shift of a strongly dependent stream is as small as it is.
 
   Args:
+    detector: of one number.
     order: samples that predict the next.
     warmup: samples that fit the autoregression [control steps].
 
   Returns:
     Detector of x, float32 (); Alarm.score is nan until the inner detector knows one.
   Blind to: whatever repeats with the dependence of the healthy stream. Innovations are
-  uncorrelated, not independent or Gaussian. Samples masked
-    out are skipped: their neighbours count as adjacent.
+  uncorrelated, not independent or Gaussian. Samples masked out are skipped: their neighbours count
+  as adjacent.
   Reference: Alwan and Roberts 1988, J. Bus. Econ. Stat. 6, 87-95; Durbin 1960, Rev. Int. Stat.
   Inst. 28, 233-244.
   """
@@ -210,57 +260,6 @@ def whitened(detector: Detector, order: int = 8, warmup: int = 1000) -> Detector
     order=(order, order >= 1, "at least 1"),
     warmup=(warmup, warmup > 2 * order, "more than twice the order"),
   )
-  lag = jnp.arange(order + 1)
-  unit = (lag == 0).astype(jnp.float32)
-
-  def fit(state: WhitenedState) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """One order more of the recursion, from the sums."""
-    mean = state.total / warmup
-    c = (
-      state.products
-      - mean * (2 * state.total - state.first - state.last)
-      + (warmup - lag) * jnp.square(mean)
-    ) / warmup
-    error = jnp.where(state.count == warmup, c[0], state.error)
-    behind = jnp.concatenate([jnp.zeros(1), state.backward[:-1]])
-    reflection = jnp.sum(behind * c) / jnp.maximum(
-      error, 1e-12
-    )  # a deviation of 1e-6, the floor of base.standardise
-    return (
-      state.forward - reflection * behind,
-      behind - reflection * state.forward,
-      error * (1 - jnp.square(reflection)),
-    )
-
-  def update(state: WhitenedState, x: jax.Array) -> tuple[WhitenedState, Alarm]:
-    x = jnp.asarray(x, jnp.float32)
-    n = state.count
-    origin = jnp.where(n == 0, x, state.origin)
-    d = x - origin
-    window = jnp.concatenate([d[None], state.recent])
-    fitting, solving, ready = n < warmup, (n >= warmup) & (n < warmup + order), n >= warmup + order
-    add: Callable[[jax.Array, jax.Array], jax.Array] = lambda old, new: jnp.where(fitting, new, old)
-    last = jnp.concatenate([jnp.zeros(1), state.last[:-1] + d])
-    filters = [
-      jnp.where(solving, new, old)
-      for new, old in zip(fit(state), (state.forward, state.backward, state.error))
-    ]
-    innovation = jnp.sum(filters[0] * (window - state.total / warmup))
-    inner, alarm = _handed_on(ready, detector, state.inner, innovation)
-    return (
-      WhitenedState(  # type: ignore[call-arg]
-        jnp.where(ready, n, n + 1),
-        origin,
-        window[:-1],
-        add(state.products, state.products + d * window),
-        add(state.first, state.first + jnp.where(n < lag, d, 0.0)),
-        add(state.last, last),
-        add(state.total, state.total + d),
-        *filters,
-        inner,
-      ),
-      alarm,
-    )
 
   def init() -> WhitenedState:
     zeros = lambda: jnp.zeros(order + 1)
@@ -268,14 +267,24 @@ def whitened(detector: Detector, order: int = 8, warmup: int = 1000) -> Detector
       jnp.int32(0),
       jnp.float32(0),
       jnp.zeros(order),
-      zeros(),
-      zeros(),
-      zeros(),
-      jnp.float32(0),
-      unit,
-      unit,
-      jnp.float32(0),
+      Sums(zeros(), zeros(), zeros(), jnp.float32(0)),
+      Filters(zeros().at[0].set(1.0), zeros().at[0].set(1.0), jnp.float32(0)),
       detector.init(),
     )
+
+  def update(state: WhitenedState, x: ArrayLike) -> tuple[WhitenedState, Alarm]:
+    x, n = jnp.asarray(x, jnp.float32), state.seen
+    origin = jnp.where(n == 0, x, state.origin)
+    window = jnp.concatenate([(x - origin)[None], state.recent])
+    ready = n >= warmup + order
+    solved = levinson(state.sums, state.filters, n == warmup, warmup)
+    filters = keep((n >= warmup) & ~ready, solved, state.filters)
+    sums = keep(n < warmup, added(state.sums, window, n), state.sums)
+    innovation = jnp.sum(filters.forward * (window - state.sums.total / warmup))
+    inner, alarm = detector.update(state.inner, jnp.where(ready, innovation, 0.0))
+    inner = keep(ready, inner, state.inner)
+    seen = jnp.where(ready, n, n + 1)
+    new = WhitenedState(seen, origin, window[:-1], sums, filters, inner)
+    return new, Alarm(alarm.fired & ready, jnp.where(ready, alarm.score, jnp.nan))
 
   return Detector(init, update)

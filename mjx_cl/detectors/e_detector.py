@@ -1,40 +1,39 @@
 """E-detector on one residual: evidence of a raised mean whose false alarms are bounded without a
 model of the stream.
+
+Where E[z_t | past] <= bound and z_t given the past is sub-Gaussian with `deviation` (E exp(lambda
+(z - E z)) <= exp(lambda^2 deviation^2 / 2)), the mean of exp(growth_k) given the past is at most 1.
+So E[mean_k M_k at T] <= E[T] for every stopping time T, and E[T] >= exp(threshold) from every
+restart, in finite samples, whatever else the stream does: changing variance, skew, dependence.
+
+The condition is on the CONDITIONAL mean. An autocorrelated stream breaks it, as its mean given the
+past wanders over the bound: there the alarms come far too often unless the stream is whitened
+first. Warm-up errors count too: `bound` leaves room for that of the mean (1 / sqrt(warmup) for
+independent samples), `deviation` for that of std and for tails heavier than a Gaussian's.
 """
 
-from __future__ import annotations
-
 import math
-from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
-from mjx_cl.detectors.base import Alarm, Detector, Warm, above, cold, demand, scalar, standardise
+from mjx_cl.detectors.base import Detector, Number, Real, Setting, above, chart, demand, scalar
 
 FORMS = ("sum", "max")
+Bets = Float[Array, "bets"]
 
 
-class EDetectorState(NamedTuple):
-  """Attributes:
-  warm: scale of the stream. evidence: float32 (bets,), ln(M + 1) of form `sum`, ln max(M, 1) of
-  form `max`; 0 is none.
-  """
-
-  warm: Warm
-  evidence: jax.Array
-
-
-def accumulate(evidence: jax.Array, growth: jax.Array, form: str) -> tuple[jax.Array, jax.Array]:
+def accumulate(evidence: Bets, growth: Bets, form: str) -> tuple[Bets, Number]:
   """One sample of an e-detector for each bet, and their mean.
 
     sum (Shiryaev-Roberts):  M' = (M + 1) exp(growth)         max (CUSUM):  M' = max(M, 1)
       exp(growth)
 
   Args:
-    evidence: float32 (bets,), see EDetectorState. growth: float32 (bets,), logarithms of factors
-      whose healthy mean is at most 1.
+    evidence: float32 (bets,), ln(M + 1) of form `sum`, ln max(M, 1) of form `max`; 0 is none.
+    growth: float32 (bets,), logarithms of factors whose healthy mean is at most 1.
+    form: one of FORMS.
 
   Returns:
     (evidence', ln of the mean of M' over the bets, float32 ()).
@@ -48,10 +47,10 @@ def accumulate(evidence: jax.Array, growth: jax.Array, form: str) -> tuple[jax.A
 
 @scalar
 def e_detector(
-  threshold: float = 9.2104,
-  bound: float = 0.1,
-  deviation: float = 1.0,
-  shifts: tuple[float, ...] = (0.25, 0.5, 1.0, 2.0, 4.0),
+  threshold: Setting = 9.2104,
+  bound: Real = 0.1,
+  deviation: Real = 1.0,
+  shifts: tuple[Real, ...] = (0.25, 0.5, 1.0, 2.0, 4.0),
   form: str = "sum",
   two_sided: bool = False,
   warmup: int = 1000,
@@ -66,15 +65,7 @@ def e_detector(
       mean_k M_k
     fired = score > threshold; then all M_k = 0, while mean and std are kept
 
-  Where E[z_t | past] <= bound and z_t given the past is sub-Gaussian with `deviation` (E exp(lambda
-  (z - E z)) <= exp(lambda^2 deviation^2 / 2)), the mean of exp(growth_k) given the past is at most
-  1. So E[mean_k M_k at T] <= E[T] for every stopping time T, and
-    E[T] >= exp(threshold) from every restart, in finite samples, whatever else the stream does:
-    changing variance, skew, dependence.
-  The condition is on the CONDITIONAL mean. An autocorrelated stream breaks it, as its mean given
-  the past wanders over the bound: there the alarms come far too often unless the stream is whitened
-  first. Warm-up errors count too: `bound` leaves room for that of the mean (1 / sqrt(warmup) for
-  independent samples), `deviation` for that of std and for tails heavier than a Gaussian's.
+  E[T] >= exp(threshold) from every restart, where the head of this file's condition holds.
 
   Args:
     threshold: ln(1 / rate) [nats]; 9.2104 is one false alarm in 10,000 samples at most. May be
@@ -89,12 +80,10 @@ def e_detector(
       stream is standardised already.
 
   Returns:
-    Detector whose update takes x, float32 (), and gives Alarm(fired: bool (), score: float32 ());
-    score nan during warm-up.
+    Detector of one number; the score is nan during warm-up.
   Blind to: a fall of the mean, unless two_sided (so for the reward); a shift below `bound`; a
   change of variance alone.
-  Source: Shin, Ramdas and Rinaldo 2022, arXiv 2203.03532.   Example: _, out =
-    jax.lax.scan(det.update, det.init(), xs)
+  Source: Shin, Ramdas and Rinaldo 2022, arXiv 2203.03532.
   """
   demand(
     "e_detector",
@@ -106,21 +95,11 @@ def e_detector(
     warmup=(warmup, warmup == 0 or warmup >= 2, "0, or at least 2"),
   )
   size = np.array(shifts, np.float32) / np.float32(deviation) ** 2
-  sign = np.repeat(
-    np.float32([1, -1]) if two_sided else np.float32([1]),  # type: ignore[arg-type]
-    len(size),
-  )
+  sign = np.repeat(np.array([1, -1] if two_sided else [1], np.float32), len(size))
   size = np.tile(size, len(sign) // len(size))
   price = size * np.float32(bound) + np.square(size * np.float32(deviation)) / 2
 
-  def start(warm: Warm) -> EDetectorState:
-    return EDetectorState(warm, jnp.zeros(len(size)))
+  def step(evidence: Bets, z: Number) -> tuple[Bets, Number]:
+    return accumulate(evidence, sign * size * z - price, form)
 
-  def update(state: EDetectorState, x: jax.Array) -> tuple[EDetectorState, Alarm]:
-    warm, z, ready = standardise(state.warm, jnp.asarray(x, jnp.float32), warmup)
-    evidence, score = accumulate(state.evidence, sign * size * z - price, form)
-    fired = ready & (score > threshold)
-    new = EDetectorState(warm, jnp.where(ready & ~fired, evidence, 0.0))
-    return new, Alarm(fired, jnp.where(ready, score, jnp.nan))
-
-  return Detector(lambda: start(cold()), update)
+  return chart(lambda: jnp.zeros(len(size)), step, threshold, warmup)

@@ -1,28 +1,27 @@
 """A chart of the exponentially weighted moving average."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from mjx_cl.detectors.base import Alarm, Detector, Warm, above, cold, demand, scalar, standardise
+from mjx_cl.detectors.base import Detector, Number, Real, Setting, above, chart, demand, scalar
 
 
-class EwmaState(NamedTuple):
-  """Attributes:
-  warm: reference. average: float32 (). forgotten: float32 (), (1 - rate)^(2 n) after n samples
-  since the start or the last alarm.
+class Average(NamedTuple):
+  """What the samples since the start or the last alarm come to.
+
+  Attributes:
+    average: float32 ().
+    forgotten: float32 (), (1 - rate)^(2 n) after n samples.
   """
 
-  warm: Warm
   average: jax.Array
   forgotten: jax.Array
 
 
 @scalar
-def ewma(rate: float = 0.1, threshold: float = 3.0, warmup: int = 1000) -> Detector:
+def ewma(rate: Real = 0.1, threshold: Setting = 3.0, warmup: int = 1000) -> Detector:
   """Two-sided EWMA chart on one stream, with the exact variance of the average at each sample.
 
     z = (x - mean) / max(std, 1e-6)                    mean, std frozen after `warmup` samples
@@ -40,12 +39,10 @@ def ewma(rate: float = 0.1, threshold: float = 3.0, warmup: int = 1000) -> Detec
       already [control steps].
 
   Returns:
-    Detector whose update takes x, float32 (), and gives Alarm(fired: bool (), score: float32 (),
-    nan during warm-up).
+    Detector of one number; the score is nan during warm-up.
   Blind to: a shift below about threshold * sqrt(rate / (2 - rate)) deviations; a change of variance
   below the threshold. Reference: Roberts 1959, Technometrics 1, 239-250; Lucas and Saccucci 1990,
   Technometrics 32, 1-12.
-  Example: _, out = jax.lax.scan(det.update, det.init(), xs)      # out.fired: bool (T,)
   """
   demand(
     "ewma",
@@ -54,18 +51,10 @@ def ewma(rate: float = 0.1, threshold: float = 3.0, warmup: int = 1000) -> Detec
     warmup=(warmup, warmup == 0 or warmup >= 2, "0 or at least 2"),
   )
 
-  def init() -> EwmaState:
-    return EwmaState(cold(), jnp.float32(0), jnp.float32(1))
-
-  def update(state: EwmaState, x: jax.Array) -> tuple[EwmaState, Alarm]:
-    warm, z, ready = standardise(state.warm, jnp.asarray(x, jnp.float32), warmup)
-    average = state.average + rate * (z - state.average)
-    forgotten = state.forgotten * (1 - rate) ** 2
+  def step(past: Average, z: Number) -> tuple[Average, Number]:
+    average = past.average + rate * (z - past.average)
+    forgotten = past.forgotten * (1 - rate) ** 2
     score = jnp.abs(average) * jax.lax.rsqrt(rate / (2 - rate) * (1 - forgotten))
-    fired = ready & (score > threshold)
-    keep = ready & ~fired
-    return EwmaState(warm, jnp.where(keep, average, 0.0), jnp.where(keep, forgotten, 1.0)), Alarm(
-      fired, jnp.where(ready, score, jnp.nan)
-    )
+    return Average(average, forgotten), score
 
-  return Detector(init, update)
+  return chart(lambda: Average(jnp.float32(0), jnp.float32(1)), step, threshold, warmup)

@@ -2,33 +2,28 @@
 the past.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from mjx_cl.detectors.base import Alarm, Detector, Warm, above, cold, demand, scalar, standardise
+from mjx_cl.detectors.base import Detector, Number, Setting, above, chart, demand, scalar
 
 
-class GlrState(NamedTuple):
-  """Attributes:
-  warm: reference.
-  length: float32 (2, capacity), samples since each candidate time, oldest first; row 0 for a rise,
-  row 1 for a fall. total: float32 (2, capacity), sum of z (row 1: of -z) since then; -inf: no
-  candidate. live: bool (), false at the start, during warm-up and just after an alarm: the
-  candidates do not count.
+class Candidates(NamedTuple):
+  """Times at which a shift may have begun, oldest first; row 0 for a rise, row 1 for a fall.
+
+  Attributes:
+    length: float32 (2, capacity), samples since each.
+    total: float32 (2, capacity), sum of z (row 1: of -z) since then; -inf: no candidate.
   """
 
-  warm: Warm
   length: jax.Array
   total: jax.Array
-  live: jax.Array
 
 
 @scalar
-def glr(threshold: float = 12.0, capacity: int = 32, warmup: int = 1000) -> Detector:
+def glr(threshold: Setting = 12.0, capacity: int = 32, warmup: int = 1000) -> Detector:
   """Two-sided generalised likelihood ratio, exact over every window and every size of the shift
   (FOCuS with a known mean before the change).
 
@@ -53,14 +48,12 @@ def glr(threshold: float = 12.0, capacity: int = 32, warmup: int = 1000) -> Dete
       already [control steps].
 
   Returns:
-    Detector whose update takes x, float32 (), and gives Alarm(fired: bool (), score: float32 (),
-    nan during warm-up).
+    Detector of one number; the score is nan during warm-up.
   Blind to: a change of variance alone. An error of the warm-up's mean is a shift like any other:
   given time it fires, sooner than for detectors
     with a slack.
   Reference: Lorden 1971, Ann. Math. Stat. 42, 1897-1908; Romano, Eckley, Fearnhead and Rigaill
   2023, J. Mach. Learn. Res. 24(81).
-  Example: _, out = jax.lax.scan(det.update, det.init(), xs)      # out.fired: bool (T,)
   """
   demand(
     "glr",
@@ -70,18 +63,15 @@ def glr(threshold: float = 12.0, capacity: int = 32, warmup: int = 1000) -> Dete
   )
   slot = jnp.arange(capacity)
 
-  def init() -> GlrState:
-    return GlrState(
-      cold(), jnp.ones((2, capacity)), jnp.full((2, capacity), -jnp.inf), jnp.bool_(False)
-    )
+  def start() -> Candidates:
+    return Candidates(jnp.ones((2, capacity)), jnp.full((2, capacity), -jnp.inf))
 
-  def update(state: GlrState, x: jax.Array) -> tuple[GlrState, Alarm]:
-    warm, z, ready = standardise(state.warm, jnp.asarray(x, jnp.float32), warmup)
+  def step(state: Candidates, z: Number) -> tuple[Candidates, Number]:
     mean = state.total / state.length
     # the means rise up to the tangent from the present and fall behind it: the last that rises is
     # the last that is kept
     rises = mean > jnp.concatenate([jnp.zeros((2, 1)), mean[:, :-1]], 1)
-    kept = jnp.where(state.live, jnp.max(jnp.where(rises, slot + 1, 0), 1, keepdims=True), 0)
+    kept = jnp.max(jnp.where(rises, slot + 1, 0), 1, keepdims=True)
     new = jnp.minimum(kept, capacity - 1)
     length = jnp.where(slot == new, 0.0, state.length) + 1.0
     total = (
@@ -89,9 +79,6 @@ def glr(threshold: float = 12.0, capacity: int = 32, warmup: int = 1000) -> Dete
       + jnp.stack([z, -z])[:, None]
     )
     score = 0.5 * jnp.max(jnp.square(jnp.maximum(total, 0.0)) / length)
-    fired = ready & (score > threshold)
-    return GlrState(warm, length, total, ready & ~fired), Alarm(
-      fired, jnp.where(ready, score, jnp.nan)
-    )
+    return Candidates(length, total), score
 
-  return Detector(init, update)
+  return chart(start, step, threshold, warmup)

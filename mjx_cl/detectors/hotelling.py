@@ -1,30 +1,43 @@
 """Hotelling's T^2 chart on a trailing mean of several channels."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from mjx_cl.detectors import multivariate
-from mjx_cl.detectors.base import Alarm, Detector, above, demand
-
-if TYPE_CHECKING:
-  from mjx_cl.rollout.monitor import Residual
+from mjx_cl.detectors.base import Alarm, Detector, Real, Setting, above, demand, judged, whole
+from mjx_cl.detectors.multivariate import (
+  Trail,
+  Whitener,
+  check_whitener,
+  pick,
+  push,
+  restart,
+  split,
+  trail,
+  whiten,
+  whitener,
+)
+from mjx_cl.rollout.monitor import Residual
 
 
 class HotellingState(NamedTuple):
-  """Attributes: whitener: many.Whitener. trail: many.Trail of whitened samples (smooth, p)."""
+  """What the detector remembers.
 
-  whitener: multivariate.Whitener
-  trail: multivariate.Trail
+  Attributes:
+    whitener: the reference.
+    trail: of whitened samples (smooth, p).
+  """
+
+  whitener: Whitener
+  trail: Trail
 
 
+@whole
 def hotelling(
   smooth: int = 100,
-  threshold: float = 36.0,
+  threshold: Setting = 36.0,
   warmup: int = 1000,
-  shrinkage: float = 0.1,
+  shrinkage: Real = 0.1,
   channels: str | tuple[str, ...] = "groups+opr+rpr+reward",
   log: bool = True,
 ) -> Detector:
@@ -37,7 +50,6 @@ def hotelling(
     fired = T^2 > threshold; then the trailing mean starts from nothing, while mean and S are kept
 
   Two-sided: a quadratic form, so a rise and a fall of any channel count alike.
-
   For independent Gaussian samples of p channels, no shrinkage and m = warmup: T^2 / (1 + n / m) is
   p (m - 1) / (m - p) F(p, m - p), near chi-square with p degrees for m >> p, n. Samples of a robot
   are correlated in time, which makes T^2 larger: calibrate. The default threshold has an ARL0 of
@@ -55,43 +67,29 @@ def hotelling(
     log: take logarithms of all but the reward.
 
   Returns:
-    Detector whose update takes a monitor.Residual and gives Alarm(fired: bool (), score: float32
-    ()).
+    Detector over monitor.Residual.
   Blind to: a change of variance alone within the trailing mean; a change slower than the warm-up is
-  none if it lies inside it. A shift in one
-    channel of p counts as much as p - 1 channels of noise allow: max_variables is sharper there.
+  none if it lies inside it. A shift in one channel of p counts as much as p - 1 channels of noise
+  allow: max_variables is sharper there.
   Reference: Hotelling 1947, in Techniques of Statistical Analysis, 111-184; Montgomery,
-  Introduction to Statistical Quality Control, ch. 11. Example: _, out = jax.lax.scan(det.update,
-  det.init(), residuals)
+  Introduction to Statistical Quality Control, ch. 11.
   """
-  names = multivariate.split("hotelling", channels)
-  p = len(names)
+  names = split("hotelling", channels)
   demand(
     "hotelling",
     smooth=(smooth, smooth >= 1, "at least 1"),
     threshold=(threshold, above(threshold, 0), "above 0"),
-    warmup=(
-      warmup,
-      warmup == 0 or warmup >= p + 2,
-      f"0, or at least {p + 2}, the channels and two",
-    ),
-    shrinkage=(shrinkage, 0 <= shrinkage <= 1, "in [0, 1]"),
   )
+  check_whitener("hotelling", names, warmup, shrinkage)
 
   def init() -> HotellingState:
-    return HotellingState(multivariate.whitener(p), multivariate.trail(smooth, p))
+    return HotellingState(whitener(len(names)), trail(smooth, len(names)))
 
   def update(state: HotellingState, residual: Residual) -> tuple[HotellingState, Alarm]:
-    x, known = multivariate.pick(residual, names, log)
-    reference, y, ready = multivariate.whiten(state.whitener, x, known, warmup, shrinkage)
-    held = multivariate.push(state.trail, y, ready)
-    score = jnp.sum(jnp.square(held.total)) / jnp.maximum(1, jnp.minimum(held.count, smooth))
-    fired = ready & (score > threshold)
-    return HotellingState(reference, multivariate.restart(held, fired)), Alarm(
-      fired, jnp.where(ready, score, jnp.nan)
-    )
+    x, known = pick(residual, names, log)
+    reference, y, ready = whiten(state.whitener, x, known, warmup, shrinkage)
+    held = push(state.trail, y, ready)
+    alarm = judged(jnp.sum(jnp.square(held.total)) / held.size(), ready, threshold)
+    return HotellingState(reference, restart(held, alarm.fired)), alarm
 
   return Detector(init, update)
-
-
-hotelling.takes = "residual"  # type: ignore[attr-defined]

@@ -1,46 +1,62 @@
 """Distance of the latent to its nearest neighbours in the healthy robot's latents."""
 
-from __future__ import annotations
+from typing import NamedTuple
 
-from typing import TYPE_CHECKING, NamedTuple
-
-import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
-from mjx_cl.detectors import multivariate
-from mjx_cl.detectors.base import Alarm, Detector, Warm, above, demand, standardise
-from mjx_cl.rollout.monitor import LATENT
+from mjx_cl.detectors.base import (
+  Alarm,
+  Detector,
+  Setting,
+  Warm,
+  above,
+  cold,
+  demand,
+  judged,
+  keep,
+  standardise,
+  whole,
+)
+from mjx_cl.detectors.multivariate import Trail, once, push, restart, trail
+from mjx_cl.rollout.monitor import LATENT, Residual
 
-if TYPE_CHECKING:
-  from mjx_cl.rollout.monitor import Residual
+Latents = Float[Array, "references latent"]
 
 
 class Healthy(NamedTuple):
   """What the end of the warm-up fixes.
 
-  Attributes: weight: float32 (16,), 1 / variance of each latent dimension. mean, std: float32 (),
-    of the references' own distances.
+  Attributes:
+    weight: float32 (16,), 1 / variance of each latent dimension.
+    mean: float32 (), of the references' own distances.
+    std: float32 (), of the same.
   """
 
-  weight: jax.Array
-  mean: jax.Array
-  std: jax.Array
+  weight: Array
+  mean: Array
+  std: Array
 
 
 class KnnState(NamedTuple):
-  """Attributes: warm: base.Warm of the latent. references: float32 (references, 16). healthy:
-  Healthy. trail: many.Trail of distances (smooth, 1).
+  """What the detector remembers.
+
+  Attributes:
+    warm: of the latent.
+    references: float32 (references, 16).
+    healthy: how far they lie apart.
+    trail: of distances (smooth, 1).
   """
 
   warm: Warm
-  references: jax.Array
+  references: Array
   healthy: Healthy
-  trail: multivariate.Trail
+  trail: Trail
 
 
-def kth(squares: jax.Array, k: int) -> jax.Array:
-  """k-th smallest along the last axis, equal values counted each; k passes, which take a fifth of
-  the time of a sort for small k.
+def kth(squares: Float[Array, "*rows references"], k: int) -> Float[Array, "*rows"]:
+  """k-th smallest along the last axis, equal values counted each; k passes, faster than a sort for
+  small k.
   """
   least = jnp.min(squares, -1)
   for _ in range(k - 1):
@@ -51,8 +67,17 @@ def kth(squares: jax.Array, k: int) -> jax.Array:
   return least
 
 
+def settled(warm: Warm, stored: Latents, warmup: int, k: int) -> Healthy:
+  """How far the references of the warm-up lie apart, in its deviations."""
+  weight = 1 / jnp.square(jnp.maximum(jnp.sqrt(warm.squares / warmup), 1e-6))
+  squares = jnp.square(stored[:, None] - stored) @ weight
+  own = jnp.sqrt(kth(jnp.where(jnp.eye(len(stored), dtype=bool), jnp.inf, squares), k))
+  return Healthy(weight, jnp.mean(own), jnp.maximum(jnp.std(own), 1e-6))
+
+
+@whole
 def knn(
-  k: int = 5, references: int = 100, smooth: int = 100, threshold: float = 0.6, warmup: int = 1000
+  k: int = 5, references: int = 100, smooth: int = 100, threshold: Setting = 0.6, warmup: int = 1000
 ) -> Detector:
   """Trailing mean of the distance to the k-th nearest healthy latent.
 
@@ -60,8 +85,7 @@ def knn(
     1e-6), each dimension
     d_t = k-th smallest over i of |(x_t - r_i) / s|;  m, v = mean and deviation over i of the same
     distance from r_i to the other references
-    score = mean over the last n = min(smooth, samples since the warm-up or the last alarm) of (d_t
-    - m) / v
+    score = mean of the last n = min(smooth, samples since warm-up or alarm) values of (d_t - m) / v
     fired = score > threshold; then the trailing mean starts from nothing, while references, s, m
     and v are kept
 
@@ -77,12 +101,10 @@ def knn(
     warmup: samples that give the references; nothing fires before they end.
 
   Returns:
-    Detector whose update takes a monitor.Residual and gives Alarm(fired: bool (), score: float32
-    ()).
+    Detector over monitor.Residual.
   Blind to: a change within the cloud of healthy latents (another order of the same states); a fall
   of the distance; what the fixed projection loses. Reference: Sun, Ming, Zhu, Li 2022, ICML, arXiv
-  2204.06507; as a baseline in robots: Haider et al. 2023, AAMAS. Example: _, out =
-  jax.lax.scan(det.update, det.init(), residuals)
+  2204.06507; as a baseline in robots: Haider et al. 2023, AAMAS.
   """
   demand(
     "knn",
@@ -92,44 +114,25 @@ def knn(
     threshold=(threshold, above(threshold, 0), "above 0"),
   )
   stride = warmup // references
+  settle = lambda learnt: settled(learnt[0], learnt[1], warmup, k)
 
   def init() -> KnnState:
     healthy = Healthy(jnp.ones(LATENT), jnp.float32(0), jnp.float32(1))
-    return KnnState(
-      Warm(jnp.int32(0), jnp.zeros(LATENT), jnp.zeros(LATENT)),
-      jnp.zeros((references, LATENT)),
-      healthy,
-      multivariate.trail(smooth, 1),
-    )
-
-  def settle(learnt: tuple[Warm, jax.Array]) -> Healthy:
-    warm, stored = learnt
-    weight = 1 / jnp.square(jnp.maximum(jnp.sqrt(warm.squares / warmup), 1e-6))
-    squares = jnp.square(stored[:, None] - stored) @ weight
-    own = jnp.sqrt(kth(jnp.where(jnp.eye(references, dtype=bool), jnp.inf, squares), k))
-    return Healthy(weight, jnp.mean(own), jnp.maximum(jnp.std(own), 1e-6))
+    return KnnState(cold(LATENT), jnp.zeros((references, LATENT)), healthy, trail(smooth, 1))
 
   def update(state: KnnState, residual: Residual) -> tuple[KnnState, Alarm]:
     known = jnp.all(jnp.isfinite(residual.latent))
     x = jnp.where(known, residual.latent, 0.0)
     warm, _, ready = standardise(state.warm, x, warmup)
-    warm, ready = multivariate.keep(known, warm, state.warm), ready & known
-    at, learning = state.warm.count // stride, known & (state.warm.count < warmup)
-    store = learning & (state.warm.count % stride == 0) & (at < references)
+    warm, ready = keep(known, warm, state.warm), ready & known
+    at, learning = state.warm.seen // stride, known & (state.warm.seen < warmup)
+    store = learning & (state.warm.seen % stride == 0) & (at < references)
     at = jnp.minimum(at, references - 1)
     stored = state.references.at[at].set(jnp.where(store, x, state.references[at]))
-    healthy = multivariate.once(
-      learning & (warm.count == warmup), settle, (warm, stored), state.healthy
-    )
+    healthy = once(learning & (warm.seen == warmup), settle, (warm, stored), state.healthy)
     distance = jnp.sqrt(kth(jnp.square(x - stored) @ healthy.weight, k))
-    held = multivariate.push(state.trail, ((distance - healthy.mean) / healthy.std)[None], ready)
-    score = held.total[0] / jnp.maximum(1, jnp.minimum(held.count, smooth))
-    fired = ready & (score > threshold)
-    return KnnState(warm, stored, healthy, multivariate.restart(held, fired)), Alarm(
-      fired, jnp.where(ready, score, jnp.nan)
-    )
+    held = push(state.trail, ((distance - healthy.mean) / healthy.std)[None], ready)
+    alarm = judged(held.total[0] / held.size(), ready, threshold)
+    return KnnState(warm, stored, healthy, restart(held, alarm.fired)), alarm
 
   return Detector(init, update)
-
-
-knn.takes = "residual"  # type: ignore[attr-defined]

@@ -2,35 +2,58 @@
 the very fault.
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
-from mjx_cl.detectors.base import Alarm, Detector, above, demand
-from mjx_cl.detectors.combine import CHANNELS, read
+from mjx_cl.detectors.base import Alarm, Detector, Number, Setting, above, demand, judged, whole
+from mjx_cl.detectors.multivariate import Rows, pick
 from mjx_cl.errors import UserError
-
-if TYPE_CHECKING:
-  from mjx_cl.rollout.monitor import Residual
+from mjx_cl.rollout.monitor import CHANNELS, Residual
 
 
 class LikelihoodRatioState(NamedTuple):
-  """Attributes:
-  recent: float32 (order, C), the last samples, newest first. count: int32 (), samples seen, at most
-  `order`. evidence: float32 () [nats].
+  """What the detector remembers.
+
+  Attributes:
+    recent: float32 (order, C), the last samples, newest first.
+    seen: int32 (), samples, at most `order`.
+    evidence: float32 () [nats].
   """
 
   recent: jax.Array
-  count: jax.Array  # type: ignore[assignment]
+  seen: jax.Array
   evidence: jax.Array
 
 
+def misfit(model: Any, recent: Float[Array, "order channels"], x: Rows) -> Number:
+  """-2 ln p, without the constant that both models have."""
+  mean = model.intercept + jnp.einsum("kij,kj->i", model.lags, recent[: model.lags.shape[0]])
+  return jnp.sum(jnp.square(model.whitener @ (x - mean))) + model.log_det
+
+
+def fitted(parameters: Any, channels: tuple[str, ...]) -> tuple[Any, Any]:
+  """The two models, in float32; refused where they are not of these channels."""
+  for channel in channels:
+    if channel not in CHANNELS:
+      raise UserError(f"unknown channel {channel!r}; choose from: {', '.join(CHANNELS)}")
+  before, after = jax.tree.map(
+    lambda a: jnp.asarray(a, jnp.float32), (parameters.before, parameters.after)
+  )
+  if before.intercept.shape[-1] != len(channels):
+    raise UserError(
+      f"likelihood_ratio: parameters of {before.intercept.shape[-1]} channel(s) for "
+      f"{len(channels)}: {', '.join(channels)}"
+    )
+  return before, after
+
+
+@whole
 def likelihood_ratio(
   parameters: Any,
-  threshold: float = 6.0,
+  threshold: Setting = 6.0,
   channels: tuple[str, ...] = ("opr",),
   log: bool = True,
 ) -> Detector:
@@ -50,7 +73,7 @@ def likelihood_ratio(
     parameters: scoring.limits.Parameters of the same channels, in the same order and with the same
       logarithm; may be traced.
     threshold: decision level [nats]; may be traced.
-    channels: of combine.CHANNELS.
+    channels: of monitor.CHANNELS.
     log: ln max(x, 1e-9) in place of x, for all channels but the reward.
 
   Returns:
@@ -67,48 +90,20 @@ def likelihood_ratio(
     threshold=(threshold, above(threshold, 0), "above 0"),
     channels=(channels, len(channels) > 0, "one or more"),
   )
-  for channel in channels:
-    if channel not in CHANNELS:
-      raise UserError(f"unknown channel {channel!r}; choose from: {', '.join(CHANNELS)}")
-  before, after = (
-    jax.tree.map(lambda a: jnp.asarray(a, jnp.float32), model)
-    for model in (parameters.before, parameters.after)
-  )
-  if before.intercept.shape[-1] != len(channels):
-    raise UserError(
-      f"likelihood_ratio: parameters of {before.intercept.shape[-1]} channel(s) for "
-      f"{len(channels)}: {', '.join(channels)}"
-    )
-  orders = before.lags.shape[0], after.lags.shape[0]
-  order = max(orders)
-
-  def misfit(model: Any, recent: jax.Array, x: jax.Array) -> jax.Array:
-    """-2 ln p, without the constant that both have."""
-    mean = model.intercept + jnp.einsum("kij,kj->i", model.lags, recent[: model.lags.shape[0]])
-    return jnp.sum(jnp.square(model.whitener @ (x - mean))) + model.log_det
+  before, after = fitted(parameters, channels)
+  order = max(before.lags.shape[0], after.lags.shape[0])
 
   def init() -> LikelihoodRatioState:
     return LikelihoodRatioState(jnp.zeros((order, len(channels))), jnp.int32(0), jnp.float32(0))
 
   def update(state: LikelihoodRatioState, residual: Residual) -> tuple[LikelihoodRatioState, Alarm]:
-    x = jnp.stack([read(c, residual) for c in channels])
-    timed = all(c in ("reward", "surprise") for c in channels)  # known without a prediction window
-    valid = jnp.all(jnp.isfinite(x)) & (residual.valid | timed)
-    x = jnp.where(valid, x, 1.0)
-    if log:
-      x = jnp.where(jnp.array([c != "reward" for c in channels]), jnp.log(jnp.maximum(x, 1e-9)), x)
-    ready = valid & (state.count >= order)
+    x, valid = pick(residual, channels, log)
+    ready = valid & (state.seen >= order)
     ratio = 0.5 * (misfit(before, state.recent, x) - misfit(after, state.recent, x))
     score = jnp.where(ready, jnp.maximum(0.0, state.evidence + ratio), state.evidence)
-    fired = ready & (score > threshold)
+    alarm = judged(score, ready, threshold)
     recent = jnp.where(valid, jnp.concatenate([x[None], state.recent])[:order], state.recent)
-    new = LikelihoodRatioState(
-      recent, jnp.minimum(order, state.count + valid), jnp.where(fired, 0.0, score)
-    )
-    return new, Alarm(fired, jnp.where(ready, score, jnp.nan))
+    evidence = jnp.where(alarm.fired, 0.0, score)
+    return LikelihoodRatioState(recent, jnp.minimum(order, state.seen + valid), evidence), alarm
 
   return Detector(init, update)
-
-
-# and a fit first: it has no line in the table
-likelihood_ratio.takes = "residual"  # type: ignore[attr-defined]

@@ -1,76 +1,19 @@
 """Several charts at once, each in units of its own threshold on the robot."""
 
-from __future__ import annotations
-
+from collections.abc import Callable
 from typing import Any
 
 import jax.numpy as jnp
 
-from mjx_cl.detectors.base import Alarm, Detector, above, demand
+from mjx_cl.detectors.base import Alarm, Detector, Real, Setting, above, demand, whole
 from mjx_cl.detectors.combine import any_of
+from mjx_cl.detectors.thresholds import board
 from mjx_cl.errors import UserError
 
 CHARTS = "cusum@surprise,ewma,e_detector"
 
 
-def multichart(threshold: float = 1.0, charts: str = CHARTS, robot: str | None = None) -> Detector:
-  """Charts that look at different things, side by side; the alarm of any counts.
-
-    score = max_i s_i / h_i;  fired = score > threshold; the charts above it start afresh, as each
-    does at its own alarm s_i: score of chart i.  h_i: its threshold at which the robot, healthy,
-    gives it one alarm in 100,000 control steps (detectors.board)
-
-  No one chart is good on every robot: what a fault disturbs differs. In units of h_i all charts
-  share one threshold and, near 1, one rate of false alarms; k charts alarm at most k times as often
-  as one of them, so that at threshold 1 the ARL0 is 100,000 / k or longer. Calibrate. Each chart
-  looks in its own direction: of the default ones cusum and ewma are two-sided, e_detector is
-  one-sided, a rise alone.
-
-  Args:
-    threshold: decision level [thresholds h_i].
-    charts: names on the leaderboard, joined by commas; those whose h_i is known.
-    robot: whose h_i are taken; default, and for a robot without any: the walker's.
-
-  Returns:
-    Detector whose update takes a monitor.Residual and gives Alarm(fired: bool (), score: float32
-    (), nan while no chart knows one).
-  Blind to: what all of its charts are blind to.
-  Reference: Tartakovsky, Nikiforov, Basseville 2014, Sequential Analysis, Chapman and Hall, section
-  9.3 (multichart procedures). The charts and how
-    they were chosen: benchmarks/multichart.py.
-  Example: _, out = jax.lax.scan(det.update, det.init(), residuals)
-  """
-  from mjx_cl import detectors  # the table that names the charts holds this detector too
-
-  demand("multichart", threshold=(threshold, above(threshold, 0), "above 0"))
-  known = detectors.board().get(robot) or detectors.board()["walker"]
-  if not isinstance(charts, str):
-    raise UserError(f"detector 'multichart': charts are names, joined by commas; got {charts!r}")
-  names = [name.strip() for name in charts.split(",")]
-  for name in names:
-    if name not in known or known[name]["settings"]["use"] == "multichart":
-      raise UserError(
-        f"detector 'multichart': no chart {name!r}; choose from: "
-        f"{', '.join(n for n in known if known[n]['settings']['use'] != 'multichart')}"
-      )
-  if len(set(names)) < len(names):
-    raise UserError(f"detector 'multichart': a chart is named twice in {charts!r}")
-
-  def chart(name: str) -> Detector:
-    settings, unit = dict(known[name]["settings"]), known[name]["threshold"]
-    return in_units(
-      detectors.make(settings.pop("use"), threshold=threshold * unit, robot=robot, **settings),
-      unit,
-      threshold,
-    )
-
-  return any_of(*map(chart, names))
-
-
-multichart.takes = "residual"  # type: ignore[attr-defined]
-
-
-def in_units(detector: Detector, unit: float, threshold: float) -> Detector:
+def in_units(detector: Detector, unit: Real, threshold: Setting) -> Detector:
   """`detector`, built with the threshold `threshold * unit`, with its score in units of `unit`:
   fired if and only if score > threshold, rounding or not.
   """
@@ -84,3 +27,56 @@ def in_units(detector: Detector, unit: float, threshold: float) -> Detector:
     return new, Alarm(alarm.fired, jnp.where(jnp.isnan(alarm.score), jnp.nan, score))
 
   return Detector(detector.init, update)
+
+
+@whole
+def multichart(
+  make: Callable[..., Detector],
+  threshold: Setting = 1.0,
+  charts: str = CHARTS,
+  robot: str | None = None,
+) -> Detector:
+  """Charts that look at different things, side by side; the alarm of any counts.
+
+    score = max_i s_i / h_i;  fired = score > threshold; the charts above it start afresh, as each
+      does at its own alarm
+    s_i: score of chart i.  h_i: its threshold at which the robot, healthy, gives it one alarm in
+      100,000 control steps (detectors.board)
+
+  No one chart is good on every robot: what a fault disturbs differs. In units of h_i all charts
+  share one threshold and, near 1, one rate of false alarms; k charts alarm at most k times as often
+  as one of them, so that at threshold 1 the ARL0 is 100,000 / k or longer. Calibrate. Each chart
+  looks in its own direction: of the default ones cusum and ewma are two-sided, e_detector is
+  one-sided, a rise alone.
+
+  Args:
+    make: (name, **settings) -> Detector, `detectors.make`, which hands itself on.
+    threshold: decision level [thresholds h_i].
+    charts: names on the leaderboard, joined by commas; those whose h_i is known.
+    robot: whose h_i are taken; default, and for a robot without any: the walker's.
+
+  Returns:
+    Detector over monitor.Residual.
+  Blind to: what all of its charts are blind to.
+  Reference: Tartakovsky, Nikiforov, Basseville 2014, Sequential Analysis, Chapman and Hall, section
+  9.3 (multichart procedures). The charts and how they were chosen: benchmarks/multichart.py.
+  """
+  demand("multichart", threshold=(threshold, above(threshold, 0), "above 0"))
+  if not isinstance(charts, str):
+    raise UserError(f"detector 'multichart': charts are names, joined by commas; got {charts!r}")
+  rows = board().get(robot or "walker") or board()["walker"]
+  known = {name: row for name, row in rows.items() if row["settings"]["use"] != "multichart"}
+  names = [name.strip() for name in charts.split(",")]
+  for name in names:
+    if name not in known:
+      raise UserError(f"detector 'multichart': no chart {name!r}; choose from: {', '.join(known)}")
+  if len(set(names)) < len(names):
+    raise UserError(f"detector 'multichart': a chart is named twice in {charts!r}")
+
+  def chart(name: str) -> Detector:
+    settings, unit = dict(known[name]["settings"]), known[name]["threshold"]
+    use = settings.pop("use")
+    built = make(use, threshold=threshold * unit, robot=robot, **settings)
+    return in_units(built, unit, threshold)
+
+  return any_of(*map(chart, names))

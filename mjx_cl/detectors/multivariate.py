@@ -2,15 +2,29 @@
 whitened reference, work that is done once.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
-from mjx_cl.detectors.base import Warm, standardise
+from mjx_cl.detectors.base import (
+  Alarm,
+  Count,
+  Detector,
+  Flag,
+  Number,
+  Real,
+  Setting,
+  Warm,
+  above,
+  cold,
+  demand,
+  judged,
+  keep,
+  standardise,
+)
 from mjx_cl.detectors.combine import NAMES, is_channel, read
 from mjx_cl.errors import UserError
 from mjx_cl.rollout.monitor import CHANNELS, Residual
@@ -18,16 +32,16 @@ from mjx_cl.rollout.monitor import CHANNELS, Residual
 ALONE = ("reward", "surprise")  # known where the residuals are not
 
 
+Rows = Float[Array, "channels"]
+
+
 def split(name: str, channels: str | tuple[str, ...]) -> tuple[str, ...]:
   """Names of channels out of `a+b+c` or a sequence; `groups` is all eight. Unknown, repeated or no
   names are refused for detector `name`.
   """
-  channels = tuple(channels.split("+") if isinstance(channels, str) else channels)
-  channels = tuple(
-    c
-    for group in channels
-    for c in ([c for c in CHANNELS if c.startswith("group_")] if group == "groups" else [group])
-  )
+  groups = [c for c in CHANNELS if c.startswith("group_")]
+  named = channels.split("+") if isinstance(channels, str) else channels
+  channels = tuple(c for name in named for c in (groups if name == "groups" else [name]))
   if not channels or len(set(channels)) < len(channels) or not all(map(is_channel, channels)):
     raise UserError(
       f"detector {name!r}: channels must be one or several of groups, {NAMES}, each once; got "
@@ -36,39 +50,36 @@ def split(name: str, channels: str | tuple[str, ...]) -> tuple[str, ...]:
   return channels
 
 
-def pick(residual: Residual, channels: tuple[str, ...], log: bool) -> tuple[jax.Array, jax.Array]:
+def pick(residual: Residual, channels: tuple[str, ...], log: bool) -> tuple[Rows, Flag]:
   """(x, known): the channels of a monitor.Residual, float32 (len(channels),), and whether all of
   them are known; x is 0 where they are not.
 
   Args:
     log: ln max(x, 1e-9) of every channel but the reward, which may be negative.
   """
-  x = jnp.stack(
-    [
-      jnp.log(jnp.maximum(read(c, residual), 1e-9)) if log and c != "reward" else read(c, residual)
-      for c in channels
-    ]
-  )
+  look = lambda c: read(c, residual)
+  ln = lambda x: jnp.log(jnp.maximum(x, 1e-9))
+  x = jnp.stack([ln(look(c)) if log and c != "reward" else look(c) for c in channels])
   known = jnp.all(jnp.isfinite(x)) & (residual.valid | all(c in ALONE for c in channels))
   return jnp.where(known, x, 0.0), known
-
-
-def keep(known: jax.Array, new: Any, old: Any) -> Any:
-  """`new` where known, else `old`; for leaves small enough to be copied at each step."""
-  return jax.tree.map(lambda a, b: jnp.where(known, a, b), new, old)
 
 
 class Trail(NamedTuple):
   """The last samples and their sum.
 
   Attributes:
-    buffer: float32 (smooth, p), a ring. total: float32 (p,), sum of the samples held. count: int32
-      (), samples since the last restart.
+    buffer: float32 (smooth, p), a ring.
+    total: float32 (p,), sum of the samples held.
+    since: int32 (), samples since the last restart.
   """
 
   buffer: jax.Array
   total: jax.Array
-  count: jax.Array  # type: ignore[assignment]
+  since: jax.Array
+
+  def size(self) -> Count:
+    """How many samples, int32 (); 1 where there is none."""
+    return jnp.maximum(1, jnp.minimum(self.since, self.buffer.shape[0]))
 
 
 def trail(smooth: int, p: int) -> Trail:
@@ -76,71 +87,100 @@ def trail(smooth: int, p: int) -> Trail:
   return Trail(jnp.zeros((smooth, p)), jnp.zeros(p), jnp.int32(0))
 
 
-def push(state: Trail, x: jax.Array, known: jax.Array) -> Trail:
+def push(state: Trail, x: Rows, known: Flag) -> Trail:
   """Adds x where known. One row of the ring is written, never the whole ring: a masked copy of it
   would be the cost of a step.
   """
   smooth = state.buffer.shape[0]
-  at = state.count % smooth
+  at = state.since % smooth
   row = state.buffer[at]
-  leaving = jnp.where(state.count >= smooth, row, 0.0)
+  leaving = jnp.where(state.since >= smooth, row, 0.0)
   total = state.total + jnp.where(known, x - leaving, 0.0)
-  return Trail(state.buffer.at[at].set(jnp.where(known, x, row)), total, state.count + known)
+  return Trail(state.buffer.at[at].set(jnp.where(known, x, row)), total, state.since + known)
 
 
-def restart(state: Trail, fired: jax.Array) -> Trail:
+def restart(state: Trail, fired: Flag) -> Trail:
   """Forgets the samples where fired; the ring need not be cleared, since rows from before are not
   read again.
   """
-  return Trail(state.buffer, jnp.where(fired, 0.0, state.total), jnp.where(fired, 0, state.count))
+  return Trail(state.buffer, jnp.where(fired, 0.0, state.total), jnp.where(fired, 0, state.since))
 
 
 class Standing(NamedTuple):
-  """Attributes: trail: Trail. warm: base.Warm of the trailing mean, mean and squares
-  float32 (p,).
+  """Trailing means and their reference.
+
+  Attributes:
+    trail: of the samples.
+    warm: of the trailing means, mean and squares float32 (p,).
   """
 
   trail: Trail
   warm: Warm
 
 
-def standing(smooth: int, p: int) -> Standing:
-  """Nothing seen."""
-  return Standing(trail(smooth, p), Warm(jnp.int32(0), jnp.zeros(p), jnp.zeros(p)))
-
-
-def trailing_z(
-  state: Standing, x: jax.Array, known: jax.Array, smooth: int, warmup: int
-) -> tuple[Standing, jax.Array, jax.Array]:
-  """Trailing mean of `smooth` samples in units of its own deviation over the first `warmup`
-  samples.
+def standing(
+  name: str,
+  channels: tuple[str, ...],
+  log: bool,
+  smooth: int,
+  warmup: int,
+  threshold: Setting,
+  scored: Callable[[Rows], Number],
+) -> Detector:
+  """A detector of trailing means in units of their own deviation over the first `warmup` samples.
 
     y_t = mean of x_{t-smooth+1..t};  z = (y_t - mean) / max(std, 1e-6), mean and std over the
-    warmup - smooth + 1 trailing means of the warm-up
+      warmup - smooth + 1 trailing means of the warm-up;  score = scored(z)
+    fired = score > threshold; then the trailing means start from nothing
 
   The deviation of the mean, not that of a sample over sqrt(smooth): samples of a robot are no
   independent draws. warmup = 0: x is standardised and independent already, z = sqrt(smooth) y.
+  Nothing is known during warm-up and for smooth - 1 samples after a restart.
 
-  Returns:
-    (state', z (p,), ready): ready is false during warm-up and for smooth - 1 samples after a
-    restart.
+  Args:
+    name: of the detector, for what is refused.
+    channels: what it watches.
+    log: see `pick`.
+    smooth: samples of the trailing mean [control steps].
+    warmup: samples that fit mean and deviation [control steps].
+    threshold: decision level of the score.
+    scored: z, float32 (p,) -> score, float32 ().
   """
-  held = push(state.trail, x, known)
-  full = held.count >= smooth
-  if warmup == 0:
-    return Standing(held, state.warm), held.total / jnp.sqrt(jnp.float32(smooth)), full & known
-  warm, z, ready = standardise(state.warm, held.total / smooth, warmup - smooth + 1)
-  return Standing(held, keep(known & full, warm, state.warm)), z, ready & full & known
+  at_least = max(2, 2 * smooth)
+  demand(
+    name,
+    smooth=(smooth, smooth >= 1, "at least 1"),
+    threshold=(threshold, above(threshold, 0), "above 0"),
+    warmup=(warmup, warmup == 0 or warmup >= at_least, "0, or at least twice `smooth` and 2"),
+  )
+  p = len(channels)
+
+  def update(state: Standing, residual: Residual) -> tuple[Standing, Alarm]:
+    x, known = pick(residual, channels, log)
+    held = push(state.trail, x, known)
+    full = known & (held.since >= smooth)
+    if warmup == 0:
+      warm, z, ready = state.warm, held.total / jnp.sqrt(jnp.float32(smooth)), full
+    else:
+      warm, z, ready = standardise(state.warm, held.total / smooth, warmup - smooth + 1)
+      warm, ready = keep(full, warm, state.warm), ready & full
+    alarm = judged(scored(z), ready, threshold)
+    return Standing(restart(held, alarm.fired), warm), alarm
+
+  return Detector(lambda: Standing(trail(smooth, p), cold(p)), update)
 
 
-def once(due: jax.Array, compute: Callable[[Any], Any], operands: Any, old: Any) -> Any:
+def once(due: Flag, compute: Callable[[Any], Any], operands: Any, old: Any) -> Any:
   """`compute(operands)` where due, else `old`; computed only in the steps and streams in which it
   is due, also under vmap.
 
   `jax.lax.cond` under vmap computes both branches for every stream at every step.
 
   Args:
-    due: bool (). compute: pure, operands -> a pytree like `old`; must not close over traced values.
+    due: bool ().
+    compute: pure, operands -> a pytree like `old`; must not close over traced values.
+    operands: a pytree.
+    old: what is known already.
   """
   return _once(compute, 0)(due, operands, old)
 
@@ -173,13 +213,17 @@ def _once(compute: Callable[[Any], Any], rank: int) -> Callable[[Any, Any, Any],
 
 
 class Whitener(NamedTuple):
-  """Attributes:
-  count: int32 (), samples of the warm-up seen. mean: float32 (p,). moment: float32 (p, p), sum of
-  outer products of deviations. matrix: float32 (p, p), maps deviations from the mean to
-  uncorrelated units; set once, at the end of the warm-up.
+  """The reference of correlated channels.
+
+  Attributes:
+    seen: int32 (), samples of the warm-up.
+    mean: float32 (p,).
+    moment: float32 (p, p), sum of outer products of deviations.
+    matrix: float32 (p, p), maps deviations from the mean to uncorrelated units; set once, at the
+      end of the warm-up.
   """
 
-  count: jax.Array  # type: ignore[assignment]
+  seen: jax.Array
   mean: jax.Array
   moment: jax.Array
   matrix: jax.Array
@@ -190,9 +234,20 @@ def whitener(p: int) -> Whitener:
   return Whitener(jnp.int32(0), jnp.zeros(p), jnp.zeros((p, p)), jnp.eye(p))
 
 
+def check_whitener(name: str, channels: tuple[str, ...], warmup: int, shrinkage: Real) -> None:
+  """Refuses a warm-up or a shrinkage of detector `name` that gives no reference."""
+  least = len(channels) + 2
+  rule = f"0, or at least {least}, the channels and two"
+  demand(
+    name,
+    warmup=(warmup, warmup == 0 or warmup >= least, rule),
+    shrinkage=(shrinkage, 0 <= shrinkage <= 1, "in [0, 1]"),
+  )
+
+
 def whiten(
-  state: Whitener, x: jax.Array, known: jax.Array, warmup: int, shrinkage: float
-) -> tuple[Whitener, jax.Array, jax.Array]:
+  state: Whitener, x: Rows, known: Flag, warmup: int, shrinkage: Real
+) -> tuple[Whitener, Rows, Flag]:
   """Y = M (x - mean) with M' M = S^-1: uncorrelated, of unit deviation, in the healthy stream.
 
     S = D ((1 - shrinkage) R + shrinkage I) D;  D = max(std, 1e-6), R = correlations, both of the
@@ -205,21 +260,18 @@ def whiten(
   """
   if warmup == 0:
     return state, x, known
-  learning = state.count < warmup
-  count = state.count + 1
+  learning, seen = state.seen < warmup, state.seen + 1
   step = x - state.mean
-  mean = state.mean + step / count
+  mean = state.mean + step / seen
   moment = state.moment + jnp.outer(step, x - mean)
-  count, mean, moment = keep(learning & known, (count, mean, moment), state[:3])
+  seen, mean, moment = keep(learning & known, (seen, mean, moment), state[:3])
 
-  def factor(moment: jax.Array) -> jax.Array:
-    p = moment.shape[0]
+  def factor(moment: Float[Array, "channels channels"]) -> Float[Array, "channels channels"]:
     std = jnp.maximum(jnp.sqrt(jnp.diag(moment) / (warmup - 1)), 1e-6)
     r = moment / (warmup - 1) / std[:, None] / std
-    r = jnp.where(
-      jnp.eye(p, dtype=bool), 1.0, (1 - shrinkage) * r
-    )  # shrinkage leaves the diagonal as it is
+    # shrinkage leaves the diagonal as it is
+    r = jnp.where(jnp.eye(len(std), dtype=bool), 1.0, (1 - shrinkage) * r)
     return jax.scipy.linalg.solve_triangular(jnp.linalg.cholesky(r), jnp.diag(1 / std), lower=True)
 
-  matrix = once(learning & known & (count == warmup), factor, moment, state.matrix)
-  return Whitener(count, mean, moment, matrix), matrix @ (x - mean), known & ~learning
+  matrix = once(learning & known & (seen == warmup), factor, moment, state.matrix)
+  return Whitener(seen, mean, moment, matrix), matrix @ (x - mean), known & ~learning

@@ -2,41 +2,74 @@
 extreme so far.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 
-from mjx_cl.detectors.base import Alarm, Detector, Warm, above, cold, demand, scalar, standardise
+from mjx_cl.detectors.base import (
+  Alarm,
+  ChartState,
+  Detector,
+  Number,
+  Real,
+  Setting,
+  above,
+  cold,
+  demand,
+  judged,
+  scalar,
+  standardise,
+)
 
 MODES = ("both", "up", "down")
 
 
-class PageHinkleyState(NamedTuple):
-  """Attributes:
-  warm: reference. count: float32 (), samples since the start or the last alarm. origin: float32 (),
-  the first of them. mean: float32 (), their mean less the origin, so that a distant level does not
-  cost it digits. rise: float32 (), up - low. low: float32 (), smallest `up` so far. fall: float32
-  (), high - down. high: float32 (), largest `down`.
+class Fading(NamedTuple):
+  """Sums over the samples since the start or the last alarm.
+
+  Attributes:
+    seen: float32 (), samples.
+    origin: float32 (), the first of them.
+    mean: float32 (), their mean less the origin, so that a distant level does not cost it digits.
+    rise: float32 (), up - low.
+    low: float32 (), smallest `up` so far.
+    fall: float32 (), high - down.
+    high: float32 (), largest `down`.
   """
 
-  warm: Warm
-  count: jax.Array  # type: ignore[assignment]
-  origin: jax.Array
-  mean: jax.Array
-  rise: jax.Array
-  low: jax.Array
-  fall: jax.Array
-  high: jax.Array
+  seen: Number
+  origin: Number
+  mean: Number
+  rise: Number
+  low: Number
+  fall: Number
+  high: Number
+
+
+def faded(state: Fading, z: Number, delta: Real, alpha: Real) -> Fading:
+  """The sums with one sample more.
+
+  The extremes do not fade while the sums do, so the differences are what is kept, with the term
+  that this leaves: rise = max(0, alpha rise + dev - delta - (1 - alpha) low).
+  """
+  origin = jnp.where(state.seen == 0, z, state.origin)
+  z = z - origin
+  seen = state.seen + 1
+  mean = state.mean + (z - state.mean) / seen
+  dev = z - mean
+  rise = alpha * state.rise + (dev - delta) - (1 - alpha) * state.low
+  low = state.low + jnp.minimum(0.0, rise)
+  fall = alpha * state.fall - (dev + delta) + (1 - alpha) * state.high
+  high = state.high - jnp.minimum(0.0, fall)
+  return Fading(seen, origin, mean, jnp.maximum(0.0, rise), low, jnp.maximum(0.0, fall), high)
 
 
 @scalar
 def page_hinkley(
-  delta: float = 0.005,
-  threshold: float = 50.0,
-  alpha: float = 0.9999,
+  delta: Real = 0.005,
+  threshold: Setting = 50.0,
+  alpha: Real = 0.9999,
   mode: str = "both",
   min_instances: int = 30,
   warmup: int = 1000,
@@ -54,8 +87,7 @@ def page_hinkley(
 
   The mean is evidence here, not reference: after an alarm the test takes whatever it then sees as
   normal. With warmup = 0 it fires at the samples at which river's does, up to the digits of
-  float32. The extremes do not fade while the sums do, so the differences are what is kept, with the
-  term that this leaves: rise = max(0, alpha rise + dev - delta - (1 - alpha) low).
+  float32.
 
   Args:
     delta: deviation per sample that is tolerated [warm-up std].
@@ -65,16 +97,11 @@ def page_hinkley(
     min_instances: samples after the warm-up, or after an alarm, before anything fires and a score
       is known [control steps].
     warmup: samples that fit centre and std; 0: x as it is [control steps].
-
-  Returns:
-    Detector whose update takes x, float32 (), and gives Alarm(fired: bool (), score: float32 (),
-    nan before min_instances).
   Blind to: a shift below delta; a change slow enough for the running mean to follow; a change of
-  variance alone; with alpha < 1 also a shift
-    below about threshold * (1 - alpha), whose faded sum never gets there.
+  variance alone; with alpha < 1 also a shift below about threshold * (1 - alpha), whose faded sum
+  never gets there.
   Reference: Page 1954, Biometrika 41, 100-115; Hinkley 1971, Biometrika 58, 509-523;
   river.drift.PageHinkley.
-  Example: _, out = jax.lax.scan(det.update, det.init(), xs)      # out.fired: bool (T,)
   """
   demand(
     "page_hinkley",
@@ -86,28 +113,15 @@ def page_hinkley(
     warmup=(warmup, warmup == 0 or warmup >= 2, "0 or at least 2"),
   )
 
-  def init() -> PageHinkleyState:
-    return PageHinkleyState(cold(), *[jnp.float32(0)] * 7)
+  def init() -> ChartState:
+    return ChartState(cold(), Fading(*(jnp.float32(0) for _ in Fading._fields)))
 
-  def update(state: PageHinkleyState, x: jax.Array) -> tuple[PageHinkleyState, Alarm]:
+  def update(state: ChartState, x: ArrayLike) -> tuple[ChartState, Alarm]:
     warm, z, ready = standardise(state.warm, jnp.asarray(x, jnp.float32), warmup)
-    origin = jnp.where(state.count == 0, z, state.origin)
-    z = z - origin
-    count = state.count + 1
-    mean = state.mean + (z - state.mean) / count
-    dev = z - mean
-    rise = alpha * state.rise + (dev - delta) - (1 - alpha) * state.low
-    low = state.low + jnp.minimum(0.0, rise)
-    fall = alpha * state.fall - (dev + delta) + (1 - alpha) * state.high
-    high = state.high - jnp.minimum(0.0, fall)
-    rise, fall = jnp.maximum(0.0, rise), jnp.maximum(0.0, fall)
-    score = {"both": jnp.maximum(rise, fall), "up": rise, "down": fall}[mode]
-    known = ready & (count >= min_instances)
-    fired = known & (score > threshold)
-    keep = ready & ~fired
-    evidence = [
-      jnp.where(keep, value, 0.0) for value in (count, origin, mean, rise, low, fall, high)
-    ]
-    return PageHinkleyState(warm, *evidence), Alarm(fired, jnp.where(known, score, jnp.nan))
+    new = faded(state.evidence, z, delta, alpha)
+    score = {"both": jnp.maximum(new.rise, new.fall), "up": new.rise, "down": new.fall}[mode]
+    alarm = judged(score, ready & (new.seen >= min_instances), threshold)
+    evidence = [jnp.where(ready & ~alarm.fired, value, 0.0) for value in new]
+    return ChartState(warm, Fading(*evidence)), alarm
 
   return Detector(init, update)

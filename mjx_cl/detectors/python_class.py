@@ -2,10 +2,8 @@
 one object per stream.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,9 +13,7 @@ from mjx_cl.detectors.base import Alarm, Detector
 from mjx_cl.detectors.combine import NAMES, is_channel, on
 from mjx_cl.errors import UserError
 from mjx_cl.io.plugins import find, line
-
-if TYPE_CHECKING:
-  from mjx_cl.rollout.monitor import Residual
+from mjx_cl.rollout.monitor import Residual
 
 
 class HostDetector(NamedTuple):
@@ -49,7 +45,8 @@ def load(
     source: "module:Class" or "path/to/file.py:Class".
     settings: keyword arguments of the class.
     host_name: default: the name after the colon.
-    channel, log: as in `on`.
+    channel: as in `combine.on`.
+    log: as in `combine.on`.
 
   Raises:
     UserError, one line: no such module, file, class or channel, refused settings, an object without
@@ -120,10 +117,7 @@ def run_host(
   fired, scores = np.zeros(xs.shape, bool), np.full(xs.shape, np.nan)
   objects: list[Any] = []
   for s in range(xs.shape[1]):
-    detector = _fresh(
-      factory,
-      host_name or getattr(factory, "__name__", "of your own"),  # type: ignore[arg-type]
-    )
+    detector = _fresh(factory, host_name or str(getattr(factory, "__name__", "of your own")))
     if any(detector is other for other in objects):
       raise UserError(
         f"host detector {type(detector).__name__}: the factory gave the same object twice; "
@@ -156,8 +150,10 @@ def check_causal(
   an unseeded random number can.
 
   Args:
-    xs: (T, S). cuts: lengths of the beginnings; default: a quarter, a half, and the whole once
-      more.
+    factory: as in `run_host`.
+    xs: (T, S).
+    cuts: lengths of the beginnings; default: a quarter, a half, and the whole once more.
+    host_name: as in `run_host`.
 
   Raises:
     UserError that names class, step and stream of the first difference.

@@ -1,7 +1,5 @@
 """Many streams through one detector, shared among the cores."""
 
-from __future__ import annotations
-
 import concurrent.futures
 import functools
 from collections.abc import Callable

@@ -2,35 +2,31 @@
 happened.
 """
 
-from __future__ import annotations
-
 import math
-from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 
-from mjx_cl.detectors.base import Alarm, Detector, Warm, above, cold, demand, scalar, standardise
+from mjx_cl.detectors.base import (
+  Detector,
+  Number,
+  Real,
+  Setting,
+  Sides,
+  above,
+  chart,
+  demand,
+  scalar,
+)
 
 
-class ShiryaevRobertsState(NamedTuple):
-  """Attributes:
-  warm: reference. up, down: float32 (), ln R for a rise and for a fall; -inf is R = 0.
-  """
-
-  warm: Warm
-  up: jax.Array
-  down: jax.Array
-
-
-def softplus(x: jax.Array) -> jax.Array:
+def softplus(x: Number) -> Number:
   """ln(1 + e^x), -inf included."""
   return jnp.maximum(x, 0.0) + jnp.log1p(jnp.exp(-jnp.abs(x)))
 
 
 @scalar
 def shiryaev_roberts(
-  shift: float = 1.0, threshold: float = math.log(1e4), two_sided: bool = True, warmup: int = 1000
+  shift: Real = 1.0, threshold: Setting = math.log(1e4), two_sided: bool = True, warmup: int = 1000
 ) -> Detector:
   """Shiryaev-Roberts procedure for a Gaussian mean shift of known size, in logarithms.
 
@@ -54,12 +50,10 @@ def shiryaev_roberts(
       already [control steps].
 
   Returns:
-    Detector whose update takes x, float32 (), and gives Alarm(fired: bool (), score: float32 (),
-    nan during warm-up).
+    Detector of one number; the score is nan during warm-up.
   Blind to: a shift below shift / 2, against which the evidence falls; a change of variance alone.
   Reference: Shiryaev 1963, Theory Probab. Appl. 8, 22-46; Roberts 1966, Technometrics 8, 411-430;
   Pollak and Tartakovsky 2009, Stat. Sinica 19.
-  Example: _, out = jax.lax.scan(det.update, det.init(), xs)      # out.fired: bool (T,)
   """
   demand(
     "shiryaev_roberts",
@@ -68,21 +62,12 @@ def shiryaev_roberts(
     warmup=(warmup, warmup == 0 or warmup >= 2, "0 or at least 2"),
   )
 
-  def init() -> ShiryaevRobertsState:
-    return ShiryaevRobertsState(cold(), jnp.float32(-jnp.inf), jnp.float32(-jnp.inf))
+  def step(ln_r: Sides, z: Number) -> tuple[Sides, Number]:
+    up = softplus(ln_r.up) + (shift * z - 0.5 * shift**2)
+    if not two_sided:
+      return Sides(up, ln_r.down), up
+    down = softplus(ln_r.down) + (-shift * z - 0.5 * shift**2)
+    score = jnp.maximum(up, down) + jnp.log1p(jnp.exp(-jnp.abs(up - down))) - math.log(2)
+    return Sides(up, down), score
 
-  def update(state: ShiryaevRobertsState, x: jax.Array) -> tuple[ShiryaevRobertsState, Alarm]:
-    warm, z, ready = standardise(state.warm, jnp.asarray(x, jnp.float32), warmup)
-    up = softplus(state.up) + (shift * z - 0.5 * shift**2)
-    down = softplus(state.down) + (-shift * z - 0.5 * shift**2) if two_sided else state.down
-    score = (
-      jnp.maximum(up, down) + jnp.log1p(jnp.exp(-jnp.abs(up - down))) - math.log(2)
-      if two_sided
-      else up
-    )
-    fired = ready & (score > threshold)
-    keep = ready & ~fired
-    new = ShiryaevRobertsState(warm, jnp.where(keep, up, -jnp.inf), jnp.where(keep, down, -jnp.inf))
-    return new, Alarm(fired, jnp.where(ready, score, jnp.nan))
-
-  return Detector(init, update)
+  return chart(lambda: Sides(jnp.float32(-jnp.inf), jnp.float32(-jnp.inf)), step, threshold, warmup)

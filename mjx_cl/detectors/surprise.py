@@ -1,20 +1,14 @@
 """Surprise of the latent: how far the observation moves the model's belief."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import jax.numpy as jnp
 
-from mjx_cl.detectors import multivariate
-from mjx_cl.detectors.base import Alarm, Detector, above, demand
-
-if TYPE_CHECKING:
-  from mjx_cl.rollout.monitor import Residual
+from mjx_cl.detectors.base import Detector, Setting, whole
+from mjx_cl.detectors.multivariate import standing
 
 
+@whole
 def surprise(
-  smooth: int = 100, threshold: float = 4.0, warmup: int = 1000, two_sided: bool = False
+  smooth: int = 100, threshold: Setting = 4.0, warmup: int = 1000, two_sided: bool = False
 ) -> Detector:
   """Standardised trailing mean of ln KL(posterior || prior) of the latent.
 
@@ -38,38 +32,10 @@ def surprise(
     two_sided: also a fall counts, as of a frozen sensor that is foreseen too well.
 
   Returns:
-    Detector whose update takes a monitor.Residual and gives Alarm(fired: bool (), score: float32
-    ()).
+    Detector over monitor.Residual.
   Blind to: a change that the world model foresees, or that the decoder alone sees; a change of
   variance alone. Reference: Zollicoffer, Eaton, Balloch, Kim, Zhou, Wright, Riedl 2025, ICML, arXiv
-  2310.08731. Example: _, out = jax.lax.scan(det.update, det.init(), residuals)
+  2310.08731.
   """
-  demand(
-    "surprise",
-    smooth=(smooth, smooth >= 1, "at least 1"),
-    threshold=(threshold, above(threshold, 0), "above 0"),
-    warmup=(
-      warmup,
-      warmup == 0 or warmup >= max(2, 2 * smooth),
-      "0, or at least twice `smooth` and 2",
-    ),
-  )
-
-  def init() -> multivariate.Standing:
-    return multivariate.standing(smooth, 1)
-
-  def update(
-    state: multivariate.Standing, residual: Residual
-  ) -> tuple[multivariate.Standing, Alarm]:
-    x, known = multivariate.pick(residual, ("surprise",), warmup > 0)
-    state, z, ready = multivariate.trailing_z(state, x, known, smooth, warmup)
-    score = jnp.abs(z[0]) if two_sided else z[0]
-    fired = ready & (score > threshold)
-    return state._replace(trail=multivariate.restart(state.trail, fired)), Alarm(
-      fired, jnp.where(ready, score, jnp.nan)
-    )
-
-  return Detector(init, update)
-
-
-surprise.takes = "residual"  # type: ignore[attr-defined]
+  score = lambda z: jnp.abs(z[0]) if two_sided else z[0]
+  return standing("surprise", ("surprise",), warmup > 0, smooth, warmup, threshold, score)

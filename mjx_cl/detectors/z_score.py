@@ -1,30 +1,45 @@
 """A chart of single samples: so many deviations from the mean of the healthy stream."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 
-from mjx_cl.detectors.base import Alarm, Detector, Warm, above, cold, demand, scalar, standardise
+from mjx_cl.detectors.base import (
+  Alarm,
+  Detector,
+  Setting,
+  Warm,
+  above,
+  cold,
+  demand,
+  judged,
+  scalar,
+  standardise,
+)
 
 
 class ZScoreState(NamedTuple):
-  """Attributes:
-  warm: reference. recent: float32 (smooth,), the last samples, zero where none. count: int32 (),
-  samples seen. beyond: bool (), the last score was above the threshold.
+  """What the chart remembers.
+
+  Attributes:
+    warm: the reference.
+    recent: float32 (smooth,), the last samples, zero where none.
+    seen: int32 (), samples; it only says where in `recent` the next sample goes and how many there
+      are, and stays below 2 smooth, so that it never overflows.
+    beyond: bool (), the last score was above the threshold.
   """
 
   warm: Warm
   recent: jax.Array
-  count: jax.Array  # type: ignore[assignment]
+  seen: jax.Array
   beyond: jax.Array
 
 
 @scalar
 def z_score(
-  threshold: float = 4.0, two_sided: bool = True, smooth: int = 1, warmup: int = 1000
+  threshold: Setting = 4.0, two_sided: bool = True, smooth: int = 1, warmup: int = 1000
 ) -> Detector:
   """Shewhart's chart with a frozen reference, of samples or of their trailing mean.
 
@@ -45,12 +60,10 @@ def z_score(
       already [control steps].
 
   Returns:
-    Detector whose update takes x, float32 (), and gives Alarm(fired: bool (), score: float32 (),
-    nan during warm-up).
+    Detector of one number; the score is nan during warm-up.
   Blind to: a shift well below threshold deviations of y, for it does not add evidence up; a change
   of the spread below them. Reference: Shewhart 1931, Economic Control of Quality of Manufactured
   Product.
-  Example: _, out = jax.lax.scan(det.update, det.init(), xs)      # out.fired: bool (T,)
   """
   demand(
     "z_score",
@@ -62,20 +75,14 @@ def z_score(
   def init() -> ZScoreState:
     return ZScoreState(cold(), jnp.zeros(smooth), jnp.int32(0), jnp.bool_(False))
 
-  def update(state: ZScoreState, x: jax.Array) -> tuple[ZScoreState, Alarm]:
-    x = jnp.asarray(x, jnp.float32)
-    recent, y = state.recent, x
+  def update(state: ZScoreState, x: ArrayLike) -> tuple[ZScoreState, Alarm]:
+    recent, y = state.recent, jnp.asarray(x, jnp.float32)
     if smooth > 1:
-      recent = recent.at[state.count % smooth].set(x)
-      y = jnp.sum(recent) / jnp.minimum(state.count + 1, smooth)
+      recent = recent.at[state.seen % smooth].set(y)
+      y = jnp.sum(recent) / jnp.minimum(state.seen + 1, smooth)
     warm, z, ready = standardise(state.warm, y, warmup)
-    score = jnp.abs(z) if two_sided else z
-    beyond = ready & (score > threshold)
-    # the count only says where in `recent` the next sample goes and how many there are: bounded, so
-    # that it never overflows
-    count = jnp.where(state.count + 1 < 2 * smooth, state.count + 1, smooth)
-    return ZScoreState(warm, recent, count, beyond), Alarm(
-      beyond & ~state.beyond, jnp.where(ready, score, jnp.nan)
-    )
+    beyond, score = judged(jnp.abs(z) if two_sided else z, ready, threshold)
+    seen = jnp.where(state.seen + 1 < 2 * smooth, state.seen + 1, smooth)
+    return ZScoreState(warm, recent, seen, beyond), Alarm(beyond & ~state.beyond, score)
 
   return Detector(init, update)

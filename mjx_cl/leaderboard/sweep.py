@@ -159,7 +159,7 @@ def updates(
   """Update that gives (state, (fired (), scores (M,))): the score of each member of `any_of`, since
   each restarts by itself; else the one score.
   """
-  members = getattr(detector.update, "members", None)
+  members = detector.members
 
   def update(state: Any, x: Residual) -> tuple[Any, tuple[jax.Array, jax.Array]]:
     out = (

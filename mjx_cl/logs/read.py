@@ -1,8 +1,4 @@
-"""Logs of one's own as CSV files: what is read of them, and which of their columns can be watched.
-`detect` judges what they hold.
-"""
-
-from __future__ import annotations
+"""Logs of one's own as CSV files: what is read of them."""
 
 import csv
 import gzip
@@ -11,47 +7,26 @@ import pathlib
 import re
 import unicodedata
 import zlib
-from typing import TYPE_CHECKING, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from mjx_cl.errors import FileError, UserError
-
-if TYPE_CHECKING:
-  from typing import Any
-
-LEAST = 100  # finite nominal samples that a column needs
-SECONDS = frozenset(("s", "sec", "secs", "second", "seconds"))
-UNITS = SECONDS | {"ms", "msec", "us", "µs", "usec", "ns", "nsec", "min", "h"}
-CLOCKS = SECONDS - {"s"} | {  # words of a name; such a column is a clock if it also rises
-  "time",
-  "timestamp",
-  "stamp",
-  "clock",
-  "epoch",
-  "elapsed",
-  "uptime",
-  "millis",
-  "micros",
-  "sample",
-  "samples",
-  "step",
-  "steps",
-  "index",
-  "idx",
-  "frame",
-  "row",
-  "tick",
-  "seq",
-}
+from mjx_cl.errors import FileError
+from mjx_cl.logs.clocks import of_seconds, throughout, told_by_name
 
 
 class Log(NamedTuple):
-  """Attributes:
-  columns: name -> float64 (T,), nan = missing; clocks too, but for those of `clocks`. time: float64
-  (T,) [s], or None. step: float64 (T,), or None. ignored: name of a column that holds something
-  else than numbers -> its first such line and cell. clocks: names of the columns `time` and `step`.
-  labels: name -> name and unit. notes: what a reader must know of the file, one line each.
+  """What a file holds.
+
+  Attributes:
+    columns: name -> float64 (T,), nan = missing; clocks too, but for those of `clocks`.
+    time: float64 (T,) [s], or None.
+    step: float64 (T,), or None.
+    ignored: name of a column that holds something else than numbers -> its first such line and
+      cell.
+    clocks: names of the columns `time` and `step`.
+    labels: name -> name and unit.
+    notes: what a reader must know of the file, one line each.
   """
 
   columns: dict[str, np.ndarray]
@@ -61,9 +36,6 @@ class Log(NamedTuple):
   clocks: tuple[str, ...]
   labels: dict[str, str]
   notes: tuple[str, ...]
-
-
-# ---- files ---------------------------------------------------------------------------------------
 
 
 def read(path: pathlib.Path | str) -> Log:
@@ -110,17 +82,17 @@ def read(path: pathlib.Path | str) -> Log:
     else:
       values = np.array(values, np.float64)
       columns[name] = np.where(np.isfinite(values), values, np.nan)
-  clocks, told = tuple(name for name in columns if _told(name, labels[name])), {}
+  clocks, told = tuple(name for name in columns if told_by_name(name, labels[name])), {}
   for name in clocks:
-    told[_told(name, labels[name])] = at = columns.pop(name)
-    if len(at) and not _throughout(at):
+    told[told_by_name(name, labels[name])] = at = columns.pop(name)
+    if len(at) and not throughout(at):
       raise FileError(f"{path}: column {name} must rise from row to row and have no gap")
   seconds = (
-    {name: x for name, x in columns.items() if _of_seconds(labels[name])}
+    {name: x for name, x in columns.items() if of_seconds(labels[name])}
     if "time" not in told
     else {}
   )
-  told |= dict(zip(["time"], filter(_throughout, seconds.values())))
+  told |= dict(zip(["time"], filter(throughout, seconds.values())))
   if seconds and "time" not in told and cells:
     notes.append(
       f"{path}: column {next(iter(seconds))} tells no times, as it does not rise at every row"
@@ -240,196 +212,3 @@ def _units(cells: list[tuple[int, list[str]]], comma: bool) -> bool:
   return any(
     _number(row[k], comma) is not None and row[k].strip() for _, row in cells[1:] for k in texts
   )
-
-
-# ---- clocks --------------------------------------------------------------------------------------
-
-
-def _words(label: str) -> list[str]:
-  """Words of a name in small letters: "simTime [s]" -> sim, time, s."""
-  return [
-    word.lower()
-    for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-zµ]+|\d+", label.replace("μ", "µ"))
-  ]
-
-
-def _told(name: str, label: str) -> str | None:
-  """Says `time` where a column of that name has seconds or no unit, `step` where it is
-  called so.
-  """
-  role = "".join(_words(name)[:1])
-  return (
-    role
-    if role in ("time", "step")
-    and (_words(label) == [role] or _words(name) == [role] == ["time"] and _of_seconds(label))
-    else None
-  )
-
-
-def _of_seconds(label: str) -> bool:
-  """Whether a name tells a clock in seconds: `time_s`, `t [s]`, `seconds`; not `t` or `timestamp`,
-  whose unit nobody knows.
-  """
-  *rest, last = _words(label) or [""]
-  return last in SECONDS and set(rest) <= CLOCKS | {"t"} and (bool(rest) or last in CLOCKS)
-
-
-def _called_clock(label: str) -> bool:
-  """Whether a name has a word of CLOCKS, or is `t` with or without a unit."""
-  words = _words(label)
-  return not CLOCKS.isdisjoint(words) or words[:1] == ["t"] and UNITS.issuperset(words[1:])
-
-
-def _throughout(x: np.ndarray) -> bool:
-  """Whether x has no gap and rises at every row."""
-  return len(x) > 0 and bool(np.isfinite(x).all() and (np.diff(x) > 0).all())
-
-
-def _rises(x: np.ndarray, least: int = LEAST) -> bool:
-  """Whether the known samples, `least` or more, rise one after the other."""
-  known = x[np.isfinite(x)]
-  return len(known) >= least and bool((np.diff(known) > 0).all())
-
-
-def _evenly(x: np.ndarray) -> bool:
-  """Whether 95 % of the increments per row lie within half of their median; a clock that is written
-  with few digits has uneven ones.
-  """
-  at = np.flatnonzero(np.isfinite(x))
-  steps = np.diff(x[at]) / np.diff(at)
-  return (
-    not len(steps)
-    or float(np.mean(np.abs(steps - np.median(steps)) <= 0.501 * np.median(steps))) >= 0.95
-  )
-
-
-def _clocks(log: Log, nominal: Log) -> list[str]:
-  """Columns that tell when and not what: `time` and `step`, by their name if they rise in a log
-  that holds them, by what they hold if they rise evenly in both.
-  """
-  found = [*log.clocks, *nominal.clocks]
-  for name in {**log.columns, **nominal.columns}:
-    there = [one.columns[name] for one in (nominal, log) if name in one.columns]
-    called = any(_called_clock(one.labels[name]) for one in (log, nominal) if name in one.labels)
-    if (
-      called
-      and any(map(_rises, there))
-      or len(there) == 2
-      and _rises(there[0])
-      and _rises(there[1], 0)
-      and all(map(_evenly, there))
-    ):
-      found.append(name)
-  return list(dict.fromkeys(found))
-
-
-# ---- choice --------------------------------------------------------------------------------------
-
-
-def choose_columns(
-  log: Log,
-  nominal: Log,
-  names: tuple[str, ...],
-  path: pathlib.Path | str,
-  nominal_path: pathlib.Path | str,
-) -> tuple[list[str], list[str]]:
-  """Columns that are watched, and notes on those that are not: those named, or all that both files
-  hold as numbers, less clocks and what is unfit.
-
-  Raises:
-    FileError or UserError where a column that is named cannot be watched, or none is left.
-  """
-  files = (nominal, nominal_path), (log, path)
-  for one, at in files:
-    for name in names:
-      _there(one, at, name)
-    if not one.columns:
-      raise FileError(f"{at} has no column of numbers to watch{_because(one)}")
-  shared = list(dict.fromkeys(names)) or [name for name in log.columns if name in nominal.columns]
-  if not shared:
-    raise FileError(
-      (
-        f"{path} and {nominal_path} share no column of numbers: {', '.join(log.columns)} against "
-        f"{', '.join(nominal.columns)}"
-      )
-      + (_because(log) or _because(nominal))
-    )
-  clocks = [] if names else _clocks(log, nominal)
-  able = [name for name in shared if name not in clocks]
-  unfit = {name: why for name in able if (why := _unfit(name, log, nominal, path, nominal_path))}
-  found = [name for name in able if name not in unfit]
-  if unfit and (names or not found):
-    _, error = next(iter(unfit.values()))
-    raise FileError(error + (f"; name the others by --column: {', '.join(found)}" if found else ""))
-  if not found:
-    raise FileError(
-      f"{path} and {nominal_path} share no column but such as rise like a clock or counter: "
-      f"{', '.join(clocks)}; "
-      "--column watches one all the same"
-    )
-  return found, [] if names else _left_out(files, clocks, unfit)
-
-
-def _there(one: Log, at: pathlib.Path | str, name: str) -> None:
-  """Refuses a name that is no column of numbers of the file."""
-  if name in one.ignored:
-    line, cell = one.ignored[name]
-    raise FileError(f"{at}: column {name} holds {cell!r} in line {line}, which is no number")
-  choices = f"choose from: {', '.join(sorted(one.columns)) or 'none'}"
-  if name in one.clocks:
-    raise UserError(
-      f"{at}: column {name} tells when samples were taken and cannot be watched; {choices}"
-    )
-  if name not in one.columns:
-    raise UserError(f"{at} has no column {name!r}; {choices}")
-
-
-def _because(one: Log) -> str:
-  """The first cell that keeps a column from being one of numbers."""
-  return "".join(
-    f"; column {name}: line {line} holds {cell!r}"
-    for name, (line, cell) in list(one.ignored.items())[:1]
-  )
-
-
-def _unfit(
-  name: str, log: Log, nominal: Log, path: pathlib.Path | str, nominal_path: pathlib.Path | str
-) -> tuple[str, str] | None:
-  """Why a column cannot be watched, for a note and as an error; None if it can."""
-  known, now = (x[np.isfinite(x)] for x in (nominal.columns[name], log.columns[name]))
-  if len(known) < LEAST:
-    why = f"{len(known)} samples, at least {LEAST} are needed"
-    return f"{nominal_path} has {why}", f"{nominal_path} is too short: column {name} has {why}"
-  if np.ptp(known) == 0:
-    return (
-      f"constant in {nominal_path}" + (f", but not in {path}" if (now != known[0]).any() else ""),
-      f"{nominal_path}: column {name} is constant ({known[0]:g}), nothing can be calibrated on it",
-    )
-  return None if len(now) else (f"no sample in {path}", f"{path}: column {name} has no sample")
-
-
-def _left_out(
-  files: tuple[tuple[Log, pathlib.Path | str], ...],
-  clocks: list[str],
-  unfit: dict[str, tuple[str, str]],
-) -> list[str]:
-  """A note for each reason not to watch columns, with their names."""
-  reasons = {name: "rising like a clock or counter" for name in clocks}
-  for (one, at), (other, _) in zip(files, files[::-1]):
-    for name in other.labels:
-      if name not in one.labels:
-        reasons.setdefault(name, f"missing in {at}")
-  for one, at in files:
-    for name, (line, cell) in one.ignored.items():
-      reasons.setdefault(name, f"line {line} of {at} holds {cell!r}")
-  reasons |= {name: note for name, (note, _) in unfit.items()}
-  groups: dict[str, list[str]] = {}
-  for name, reason in reasons.items():
-    groups.setdefault(reason, []).append(name)
-  return [
-    (
-      f"{'column' if len(group) == 1 else 'columns'} {', '.join(group)} "
-      f"{'is' if len(group) == 1 else 'are'} not watched: {reason}"
-    )
-    for reason, group in groups.items()
-  ]

@@ -160,7 +160,7 @@ def test_whitened_hands_on_the_innovations_of_yule_walker(order, coefficients, l
   want = np.array([centred[t] - a @ centred[t - 1 :: -1][:order] for t in range(ready, len(xs))])
   assert np.isnan(score[:ready]).all() and int(state.inner) == len(xs) - ready
   # float32 sums of 400 products, and a solution whose condition is that of the stream
-  np.testing.assert_allclose(-np.asarray(state.forward)[1:], a, atol=2e-3)
+  np.testing.assert_allclose(-np.asarray(state.filters.forward)[1:], a, atol=2e-3)
   np.testing.assert_allclose(score[ready:], want, atol=5e-3)
   if coefficients:
     np.testing.assert_allclose(a[: len(coefficients)], coefficients, atol=0.15)  # 3 / sqrt(400)

@@ -166,7 +166,7 @@ def test_nothing_is_known_before_the_warm_up_ends_and_the_reference_stays(factor
     np.isnan(alarms.score[:100]).all() and not alarms.fired[:100].any() and alarms.fired[100:].any()
   )
   np.testing.assert_allclose(state.warm.mean, xs[:100].mean(), rtol=1e-5)
-  assert int(state.warm.count) == 100
+  assert int(state.warm.seen) == 100
 
 
 # ---- Page-Hinkley as river has it ----------------------------------------------------------------
@@ -318,7 +318,10 @@ def test_glr_has_room_for_its_candidates():
 
   def step(carry, key):
     state, _ = jax.vmap(detector.update)(carry[0], jax.random.normal(key, (200,)))
-    return (state, jnp.maximum(carry[1], jnp.max(jnp.sum(jnp.isfinite(state.total), -1)))), None
+    return (
+      state,
+      jnp.maximum(carry[1], jnp.max(jnp.sum(jnp.isfinite(state.evidence.total), -1))),
+    ), None
 
   most = quick.jit(lambda keys: jax.lax.scan(step, (start, 0), keys)[0][1])(
     jax.random.split(jax.random.key(0), 5000)
@@ -335,7 +338,10 @@ def test_a_full_glr_is_never_too_large_and_exact_over_small_shifts():
   zs = np.random.default_rng(5).normal(size=300).astype(np.float32)
   bound, short, tight = np.inf, 0, 0
   for t, z in enumerate(zs):
-    length, total = np.asarray(state.length, float)[0], np.asarray(state.total, float)[0]
+    length, total = (
+      np.asarray(state.evidence.length, float)[0],
+      np.asarray(state.evidence.total, float)[0],
+    )
     mean = total / length
     if np.isfinite(total[2]) and 0 < mean[0] < mean[1] < mean[2]:  # full, and all are wanted
       bound = min(bound, 2 * (total[1] - total[2]) / (length[1] - length[2]))
@@ -345,8 +351,8 @@ def test_a_full_glr_is_never_too_large_and_exact_over_small_shifts():
     m = np.clip(s / n, 0, bound)
     small = np.max(m * s - m**2 * n / 2)
     have = np.max(
-      np.maximum(np.asarray(state.total, float)[0], 0) ** 2
-      / (2 * np.asarray(state.length, float)[0])
+      np.maximum(np.asarray(state.evidence.total, float)[0], 0) ** 2
+      / (2 * np.asarray(state.evidence.length, float)[0])
     )
     assert small - 1e-3 <= have <= exact + 1e-3  # float32
     short, tight = short + (have < exact - 1e-2), tight + (small > 0.5 * exact)

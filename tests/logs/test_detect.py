@@ -22,7 +22,7 @@ from mjx_cl.cli import app
 from mjx_cl.detectors import Alarm, Detector, scalar
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.io import tables
-from mjx_cl.logs import detect
+from mjx_cl.logs import detect, programs, results
 from mjx_cl.logs.read import read
 
 
@@ -98,7 +98,7 @@ def test_the_log_of_the_example(tmp_path, monkeypatch, mjx):
   )
   assert code == 0, err
   assert "cusum" in out and {p.name for p in pathlib.Path("detected").iterdir()} == set(
-    detect.FILES
+    results.FILES
   )
   with open("detected/alarms.csv") as file:
     alarms = [
@@ -641,10 +641,10 @@ def test_a_missing_sample_changes_nothing(tmp_path, logs):
   whole = [detect.read(p).columns["x"] for p in logs]
   holes = [np.insert(x, np.arange(7, len(x), 13), np.nan) for x in whole]
   paths = [save(tmp_path / f"holes_{k}.csv", x=x) for k, x in enumerate(holes)]
-  program = detect.Program("cusum", 500, 1, 512)
+  program = programs.Program("cusum", 500, 1, 512)
   run = lambda xs, past: program(
-    np.full(detect.LEVELS, 4.0),
-    program(np.full(detect.LEVELS, 4.0), program.start, past[:, None])[0],
+    np.full(programs.LEVELS, 4.0),
+    program(np.full(programs.LEVELS, 4.0), program.start, past[:, None])[0],
     xs[:, None],
   )[2:]
   fired, scores = run(*whole)
@@ -661,12 +661,12 @@ def test_a_missing_sample_changes_nothing(tmp_path, logs):
 
 def test_parts_of_any_length_give_the_same():
   xs = np.stack([noise(700, 3), noise(700, 4)], 1)
-  out = [detect.Program("cusum", 100, 2, chunk) for chunk in (64, 700)]
-  levels = np.linspace(2.0, 4.5, detect.LEVELS)
+  out = [programs.Program("cusum", 100, 2, chunk) for chunk in (64, 700)]
+  levels = np.linspace(2.0, 4.5, programs.LEVELS)
   (_, any_a, fired_a, scores_a), (_, any_b, fired_b, scores_b) = (
     p(levels, p.start, xs) for p in out
   )
-  assert any_a.any(0).all() and any_a.shape == (700, detect.LEVELS)
+  assert any_a.any(0).all() and any_a.shape == (700, programs.LEVELS)
   np.testing.assert_array_equal(any_a, any_b)
   np.testing.assert_array_equal(fired_a, fired_b)
   np.testing.assert_allclose(scores_a, scores_b, rtol=1e-5, atol=1e-5)  # two programs, float32
@@ -770,7 +770,8 @@ TOGETHER = {"hotelling", "mewma", "max_variables"}
 def test_the_table_is_every_detector_of_numbers():
   want = {k for k, f in detectors.DETECTORS.items() if getattr(f, "takes", "") == "scalar"}
   assert (
-    want <= set(detect.table()) and set(detect.table()) - want == {"rolling_sigma_plain"} | TOGETHER
+    want <= set(programs.table())
+    and set(programs.table()) - want == {"rolling_sigma_plain"} | TOGETHER
   )
 
 
@@ -801,10 +802,10 @@ def test_columns_that_part_are_seen_by_those_that_watch_all(tmp_path):
   for name in ("hotelling", "mewma"):
     first = np.flatnonzero(result.fired[name][700:])
     assert len(first) and first[0] < 60 and rows[name]["columns"] == ["(all)"], name
-  detect.write(result, tmp_path)
+  results.write(result, tmp_path)
   assert "hotelling,(all)," in (tmp_path / "alarms.csv").read_text()
   # the very detector, on the residual of a run
-  inner = detect._together(
+  inner = programs.together(
     detectors.DETECTORS["hotelling"], rows["hotelling"]["threshold"], 1000, 2
   )
   middle, spread = np.mean(result.past, 0), np.std(result.past, 0)
@@ -834,7 +835,7 @@ def test_all_detectors_find_a_jump(tmp_path):
   result = detect.detect(log, nominal, arl0=150)
   rows = {r["detector"]: r for r in result.summary["detectors"]}
   assert list(rows) == [
-    name for name in detect.table() if name not in TOGETHER
+    name for name in programs.table() if name not in TOGETHER
   ]  # there is one column
   for name, row in rows.items():
     if row["threshold"] is not None:
@@ -852,7 +853,7 @@ def test_rolling_sigma_with_a_traced_threshold():
   run = lambda d: jax.lax.scan(d.update, d.init(), xs)[1]
   want, got = (
     run(rolling_sigma(window=100, warmup=100, threshold=2.0)),
-    jax.jit(lambda t: run(detect.table()["rolling_sigma_plain"](t, 100)))(2.0),
+    jax.jit(lambda t: run(programs.table()["rolling_sigma_plain"](t, 100)))(2.0),
   )
   assert want.fired.sum() > 3
   np.testing.assert_array_equal(want.fired, got.fired)
@@ -917,7 +918,7 @@ def test_files_and_json(mjx, logs, tmp_path):
   summary = json.loads(text)
   assert json.loads((out / "detect.json").read_text()) == summary and sorted(
     os.listdir(out)
-  ) == sorted(detect.FILES)
+  ) == sorted(results.FILES)
   with open(out / "alarms.csv", newline="") as f:
     alarms = list(csv.DictReader(f))
   for row in summary["detectors"]:
@@ -1041,18 +1042,18 @@ def test_bad_input_is_one_line(tmp_path, logs, mjx, monkeypatch, change, code, w
 
 def test_a_full_disk_leaves_the_earlier_detection(tmp_path, logs, monkeypatch):
   result = detect.detect(*logs, detectors=("cusum",), arl0=100)
-  detect.write(result, tmp_path)
-  before = {name: (tmp_path / name).read_bytes() for name in detect.FILES}
+  results.write(result, tmp_path)
+  before = {name: (tmp_path / name).read_bytes() for name in results.FILES}
 
   def full(*_, **__):
     raise OSError(28, "No space left on device")
 
   monkeypatch.setattr(tables.os, "replace", full)
   with pytest.raises(FileError) as error:
-    detect.write(result, tmp_path)
+    results.write(result, tmp_path)
   assert (
     "No space left" in one_line(error)
-    and {name: (tmp_path / name).read_bytes() for name in detect.FILES} == before
+    and {name: (tmp_path / name).read_bytes() for name in results.FILES} == before
   )
   assert not [name for name in os.listdir(tmp_path) if name.endswith(".tmp")]
 
@@ -1060,7 +1061,7 @@ def test_a_full_disk_leaves_the_earlier_detection(tmp_path, logs, monkeypatch):
 def test_a_spike_survives_the_drawing():
   x = np.zeros(100_000)
   x[70_001], x[50_000:50_200] = 9.0, np.nan
-  at, drawn = detect._envelope(x, 5)
+  at, drawn = results._envelope(x, 5)
   assert (
     len(at) == len(drawn) <= 4100
     and np.nanmax(drawn) == 9.0

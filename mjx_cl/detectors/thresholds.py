@@ -1,0 +1,30 @@
+"""Thresholds that the leaderboard found on healthy robots."""
+
+import functools
+import json
+import pathlib
+from typing import NamedTuple
+
+
+class Threshold(NamedTuple):
+  """A threshold that was found on healthy robots.
+
+  Attributes:
+    value: decision level of the score.
+    arl0: control steps per false alarm.
+    alarms: that were counted.
+  """
+
+  value: float
+  arl0: float
+  alarms: int
+
+
+@functools.cache
+def board() -> dict:
+  """What the leaderboard at ARL0 = 100,000 control steps found: robot -> name on the board ->
+  {settings, threshold, arl0, alarms}; written by benchmarks/thresholds.py from
+  results/leaderboard_100k. Shipped agents, seeds 100 to 109; detectors that can be had at that rate
+  alone.
+  """
+  return json.loads(pathlib.Path(__file__).with_suffix(".json").read_text())["robots"]
