@@ -2,36 +2,56 @@
 (mj_setConst, physics.fields).
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterable
+from typing import Any
 
 import jax.numpy as jnp
+import mujoco
 import numpy as np
+from jaxtyping import Array, Bool, Float, Key
 
 from mjx_cl.errors import UserError
 from mjx_cl.faults.actuator import dofs
-from mjx_cl.faults.base import Fault, actuator_targets, fault
+from mjx_cl.faults.base import (
+  Fault,
+  Ports,
+  Severity,
+  Values,
+  actuator_targets,
+  fault,
+  masks,
+  read,
+)
+from mjx_cl.faults.kinds import along
 
-if TYPE_CHECKING:
-  from collections.abc import Iterable
-
-  import jax
-
-  from mjx_cl.faults.base import Ports
+MASSES = ("mj.body_mass", "mj.body_inertia")
 
 
-def _bodies(env: Any, name: str) -> tuple[tuple[str, ...], jax.Array]:
-  """(names, bool mask (targets, nbody)) of spec.bodies."""
+def _bodies(env: Any, name: str) -> tuple[tuple[str, ...], Bool[Array, "targets nbody"]]:
+  """Names and masks of spec.bodies."""
   if not env.spec.bodies or getattr(env, "mj_model", None) is None:
     raise UserError(
       f"fault {name!r} needs bodies with a name and a mass, which robot {env.spec.name!r} does "
       "not have"
     )
-  size = env.mj_model.nbody
-  return tuple(n for n, _ in env.spec.bodies), jnp.asarray(
-    [[i in hit for i in range(size)] for _, hit in env.spec.bodies]
-  )
+  return masks(env.spec.bodies, env.mj_model.nbody)
+
+
+def _heavier(
+  name: str,
+  env: Any,
+  leaves: tuple[str, ...],
+  targets: Iterable[str],
+  growth: Callable[[Any, Severity], Array],
+  rows: Array | None = None,
+) -> Fault:
+  """A fault of mass and inertia, which grow alike: times growth(row, severity)."""
+
+  def act(row: Any, memory: Any, severity: Severity, key: Key[Array, ""], ports: Ports) -> Values:
+    grown = growth(row, severity)
+    return memory, {leaf: (value := read(ports, leaf)) * along(grown, value) for leaf in leaves}
+
+  return fault(name, env, leaves, targets, act, rows=rows)
 
 
 def payload(env: Any) -> Fault:
@@ -46,32 +66,20 @@ def payload(env: Any) -> Fault:
   of Isaac Lab (ANYmal-C, +-5 kg) and Walk These Ways.
   """
   if "mass" in env.model.task:
-
-    def act(
-      target: jax.Array, memory: Any, severity: jax.Array, key: jax.Array, ports: Ports
-    ) -> tuple[Any, dict[str, jax.Array]]:
-      grown = 1.0 + 0.4 * severity
-      return memory, {
-        "task.mass": ports.model.task["mass"] * grown,
-        "task.inertia": ports.model.task["inertia"] * grown,
-      }
-
-    return fault("payload", env, ("task.mass", "task.inertia"), ("trunk",), act)
-  _, mask = _bodies(env, "payload")
+    return _heavier(
+      "payload", env, ("task.mass", "task.inertia"), ("trunk",), lambda _, s: 1.0 + 0.4 * s
+    )
+  _bodies(env, "payload")
   mass = np.asarray(env.mj_model.body_mass)
-  trunk = int(env.spec.bodies[0][1][0])
-  share = float(mass.sum() / mass[trunk])
-
-  def act(  # type: ignore[no-redef]
-    target: jax.Array, memory: Any, severity: jax.Array, key: jax.Array, ports: Ports
-  ) -> tuple[Any, dict[str, jax.Array]]:
-    grown = jnp.where(jnp.arange(mass.size) == trunk, 1.0 + 0.4 * severity * share, 1.0)
-    return memory, {
-      "mj.body_mass": ports.model.mj["body_mass"] * grown,
-      "mj.body_inertia": ports.model.mj["body_inertia"] * grown[:, None],
-    }
-
-  return fault("payload", env, ("mj.body_mass", "mj.body_inertia"), ("trunk",), act)
+  trunk = np.arange(mass.size) == env.spec.bodies[0][1][0]
+  share = float(mass.sum() / mass[trunk][0])
+  return _heavier(
+    "payload",
+    env,
+    MASSES,
+    ("trunk",),
+    lambda _, severity: jnp.where(trunk, 1.0 + 0.4 * severity * share, 1.0),
+  )
 
 
 def com(env: Any) -> Fault:
@@ -91,8 +99,8 @@ def com(env: Any) -> Fault:
   of_trunk = (jnp.arange(model.nbody) == trunk)[:, None]
 
   def act(
-    direction: jax.Array, memory: Any, severity: jax.Array, key: jax.Array, ports: Ports
-  ) -> tuple[Any, dict[str, jax.Array]]:
+    direction: Float[Array, "3"], memory: Any, severity: Severity, key: Key[Array, ""], ports: Ports
+  ) -> Values:
     return memory, {
       "mj.body_ipos": ports.model.mj["body_ipos"]
       + jnp.where(of_trunk, 0.5 * severity * gyration * direction, 0.0)
@@ -108,18 +116,14 @@ def limb_mass(env: Any) -> Fault:
   than the trunk (drawn). Owns `mj.body_mass`, `mj.body_inertia`. Source: Nagabandi et al. 2019.
   """
   names, mask = _bodies(env, "limb_mass")
-  names, mask = names[1:], mask[1:]
-
-  def act(
-    hit: jax.Array, memory: Any, severity: jax.Array, key: jax.Array, ports: Ports
-  ) -> tuple[Any, dict[str, jax.Array]]:
-    grown = jnp.where(hit, 1.0 + 2.0 * severity, 1.0)
-    return memory, {
-      "mj.body_mass": ports.model.mj["body_mass"] * grown,
-      "mj.body_inertia": ports.model.mj["body_inertia"] * grown[:, None],
-    }
-
-  return fault("limb_mass", env, ("mj.body_mass", "mj.body_inertia"), names, act, rows=mask)
+  return _heavier(
+    "limb_mass",
+    env,
+    MASSES,
+    names[1:],
+    lambda hit, severity: jnp.where(hit, 1.0 + 2.0 * severity, 1.0),
+    mask[1:],
+  )
 
 
 def joint_damping(env: Any) -> Fault:
@@ -132,8 +136,8 @@ def joint_damping(env: Any) -> Fault:
   hits = mask.astype(jnp.float32) @ dofs(env, "joint_damping")
 
   def act(
-    hit: jax.Array, memory: Any, severity: jax.Array, key: jax.Array, ports: Ports
-  ) -> tuple[Any, dict[str, jax.Array]]:
+    hit: Float[Array, " nv"], memory: Any, severity: Severity, key: Key[Array, ""], ports: Ports
+  ) -> Values:
     return memory, {"mj.dof_damping": ports.model.mj["dof_damping"] + 10.0 * severity * hit}
 
   return fault("joint_damping", env, ("mj.dof_damping",), names, act, drawn=single, rows=hits)
@@ -159,13 +163,16 @@ def joint_friction(env: Any) -> Fault:
   if env.physics.name == "mjx" and not (model.dof_frictionloss > 0).any():
     raise UserError(
       "fault 'joint_friction': MJX builds no friction constraint for a model whose joints have "
-      "none, so it would do nothing; "
-      "choose physics native"
+      "none, so it would do nothing; choose physics native"
     )
 
   def act(
-    greatest: jax.Array, memory: Any, severity: jax.Array, key: jax.Array, ports: Ports
-  ) -> tuple[Any, dict[str, jax.Array]]:
+    greatest: Float[Array, " nv"],
+    memory: Any,
+    severity: Severity,
+    key: Key[Array, ""],
+    ports: Ports,
+  ) -> Values:
     return memory, {
       "mj.dof_frictionloss": ports.model.mj["dof_frictionloss"] + 0.25 * severity * greatest
     }
@@ -190,15 +197,14 @@ def range_loss(env: Any) -> Fault:
   Source: none; fault and range are this project's own choice.
   """
   names, mask, single = actuator_targets(env)
-  dofs(env, "range_loss")
+  dofs(env, "range_loss")  # which refuses a robot without one motor per joint
   model = env.mj_model
   joints = model.actuator_trnid[:, 0]
-  if not model.jnt_limited[joints].all():
+  free = [name for name, has in zip(env.spec.targets, model.jnt_limited[joints]) if not has]
+  if free:
     raise UserError(
       f"fault 'range_loss' needs joints with limits; these have none in robot {env.spec.name!r}: "
-      + ", ".join(
-        env.spec.targets[i] for i in np.flatnonzero(~model.jnt_limited[joints].astype(bool))
-      )
+      + ", ".join(free)
     )
   stance = getattr(env, "stance", None)  # joint angles of standing, in actuator order
   stance = model.qpos0[model.jnt_qposadr[joints]] if stance is None else np.asarray(stance)
@@ -207,8 +213,8 @@ def range_loss(env: Any) -> Fault:
   hits = jnp.zeros((len(names), model.njnt), bool).at[:, joints].set(mask)
 
   def act(
-    hit: jax.Array, memory: Any, severity: jax.Array, key: jax.Array, ports: Ports
-  ) -> tuple[Any, dict[str, jax.Array]]:
+    hit: Bool[Array, " njnt"], memory: Any, severity: Severity, key: Key[Array, ""], ports: Ports
+  ) -> Values:
     value = ports.model.mj["jnt_range"]
     return memory, {
       "mj.jnt_range": jnp.where(hit[:, None], value + 0.95 * severity * (middle - value), value)
@@ -227,30 +233,25 @@ DIRECTIONS = {
 }
 
 
-def heading_targets(env: Any, names: Iterable[str]) -> tuple[tuple[str, ...], jax.Array]:
-  """(names, unit vectors (targets, 3)) of the directions in which the robot's trunk is free to
-  move.
-  """
+def heading_targets(
+  env: Any, names: Iterable[str]
+) -> tuple[tuple[str, ...], Float[Array, "targets 3"]]:
+  """Names and unit vectors of the directions in which the robot's trunk is free to move."""
   free = np.abs(force_map(env)).sum(1) > 0
   kept = [n for n in names if free[np.flatnonzero(DIRECTIONS[n])[0]]]
   return tuple(kept), jnp.asarray([DIRECTIONS[n] for n in kept], jnp.float32)
 
 
-def force_map(env: Any) -> np.ndarray:
-  """(3, nv): a force F (world axes) [N] on the trunk is the generalised force F @ map.
+def force_map(env: Any) -> Float[np.ndarray, "3 nv"]:
+  """A force F (world axes) [N] on the trunk is the generalised force F @ map.
 
   The trunk's slide joints, or the translations of its free joint (the force then acts at the body's
   origin). Without a MuJoCo model the force's first two entries are along x and y of the world.
   """
-  import mujoco
-
   model = getattr(env, "mj_model", None)
   if model is None:
     size = 0 if env.model.force is None else env.model.force.shape[0]
-    out = np.zeros((3, size), np.float32)
-    for axis in range(min(2, size)):
-      out[axis, axis] = 1.0
-    return out
+    return np.eye(3, size, dtype=np.float32) * np.array([[1], [1], [0]], np.float32)
   out = np.zeros((3, model.nv), np.float32)
   trunk = int(env.spec.bodies[0][1][0]) if env.spec.bodies else 1
   for j in range(model.body_jntadr[trunk], model.body_jntadr[trunk] + model.body_jntnum[trunk]):
