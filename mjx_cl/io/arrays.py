@@ -1,7 +1,5 @@
 """Arrays in .npz files: a tree's leaves by the names of their paths; nothing is ever unpickled."""
 
-from __future__ import annotations
-
 import os
 import zipfile
 import zlib

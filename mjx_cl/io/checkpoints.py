@@ -1,7 +1,5 @@
 """Checkpoints by orbax: written to a temporary name and renamed, two kept, never unpickled."""
 
-from __future__ import annotations
-
 import itertools
 import logging
 import pathlib

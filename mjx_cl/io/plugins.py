@@ -2,8 +2,6 @@
 of a file, path/to/file.py:Name.
 """
 
-from __future__ import annotations
-
 import collections
 import functools
 import hashlib
