@@ -135,10 +135,9 @@ def available(env: Any) -> dict[str, Fault]:
   for name in FAULTS:
     try:
       out[name] = make(name, env)
-    except PluginError:
-      raise
-    except UserError:
-      continue
+    except UserError as e:
+      if isinstance(e, PluginError):
+        raise
   return out
 
 

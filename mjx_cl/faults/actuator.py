@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from mjx_cl.errors import UserError
-from mjx_cl.faults.base import Fault, Ports, Severity, Values, actuator_targets, fault
-from mjx_cl.faults.kinds import late, loss, scaled, signal
+from mjx_cl.faults.base import Fault, Ports, Severity, actuator_targets
+from mjx_cl.faults.kinds import late, leafwise, loss, scaled, signal, steady
 
 LOCK = (10.0, 1000.0)  # [kg m^2], [N m s/rad] at severity 1
 
@@ -41,7 +41,7 @@ def gear(env: Any) -> Fault:
   robot that does not load the joint. Source: the paper's walker experiment.
   """
   return scaled(
-    "gear", env, "mj.actuator_gear", actuator_targets(env), lambda severity: 1.0 - severity
+    "gear", env, "mj.actuator_gear", lambda severity: 1.0 - severity, actuator_targets(env)
   )
 
 
@@ -61,8 +61,8 @@ def torque_loss(env: Any) -> Fault:
     "torque_loss",
     env,
     "task.strength" if inner else "mj.actuator_gear",
-    actuator_targets(env),
     lambda severity: 1.0 - severity,
+    actuator_targets(env),
     "the position loop runs at every physics step, so a joint held less firmly may end a control "
     "step anywhere"
     if inner
@@ -83,8 +83,8 @@ def velocity_limit(env: Any) -> Fault:
     "velocity_limit",
     env,
     "task.velocity_limit",
-    actuator_targets(env),
     lambda severity: 1.0 - 0.95 * severity,
+    actuator_targets(env),
   )
 
 
@@ -102,20 +102,12 @@ def joint_lock(env: Any) -> Fault:
   joints of Nagabandi et al. 2019, which are limp; that one is held is this project's own choice.
   """
   names, mask, single = actuator_targets(env)
+  holds = {
+    "mj.dof_armature": lambda value, hit, severity: value + LOCK[0] * (severity * severity * hit),
+    "mj.dof_damping": lambda value, hit, severity: value + LOCK[1] * (severity * severity * hit),
+  }
   hits = mask.astype(jnp.float32) @ dofs(env, "joint_lock")
-
-  def act(
-    hit: Float[Array, " nv"], memory: Any, severity: Severity, key: Key[Array, ""], ports: Ports
-  ) -> Values:
-    extra = severity * severity * hit
-    return memory, {
-      "mj.dof_armature": ports.model.mj["dof_armature"] + LOCK[0] * extra,
-      "mj.dof_damping": ports.model.mj["dof_damping"] + LOCK[1] * extra,
-    }
-
-  return fault(
-    "joint_lock", env, ("mj.dof_armature", "mj.dof_damping"), names, act, drawn=single, rows=hits
-  )
+  return leafwise("joint_lock", env, holds, (names, hits, single))
 
 
 def stuck(env: Any) -> Fault:
@@ -147,11 +139,8 @@ def offset(env: Any) -> Fault:
   all. Owns `ctrl`. Not visible to: a command at its upper bound. Source: motor offsets of Walk
   These Ways; the range is this project's own choice.
   """
-  return signal(
-    "offset",
-    env,
-    "ctrl",
-    lambda m, severity, key, ports: (m, jnp.clip(ports.ctrl + 0.5 * severity, -1.0, 1.0)),
+  return steady(
+    "offset", env, "ctrl", lambda u, severity, key: jnp.clip(u + 0.5 * severity, -1.0, 1.0)
   )
 
 
@@ -163,13 +152,12 @@ def dead_band(env: Any) -> Fault:
   Severity: 1 is a band of half the half-range [half-ranges]. Target: an actuator (drawn), a group
   or all. Owns `ctrl`. Source: none; fault and range are this project's own choice.
   """
-
-  def change(
-    m: Any, severity: Severity, key: Key[Array, ""], ports: Ports
-  ) -> tuple[Any, Float[Array, " act"]]:
-    return m, jnp.sign(ports.ctrl) * jnp.maximum(jnp.abs(ports.ctrl) - 0.5 * severity, 0.0)
-
-  return signal("dead_band", env, "ctrl", change)
+  return steady(
+    "dead_band",
+    env,
+    "ctrl",
+    lambda u, severity, key: jnp.sign(u) * jnp.maximum(jnp.abs(u) - 0.5 * severity, 0.0),
+  )
 
 
 def command_dropout(env: Any) -> Fault:
@@ -203,13 +191,12 @@ def command_noise(env: Any) -> Fault:
   Severity: standard deviation [half-ranges]; 0.1, 0.3, 1.0 are realworldrl_suite's levels. Target:
   an actuator (drawn), a group or all. Owns `ctrl`. Source: realworldrl_suite.
   """
-
-  def change(
-    m: Any, severity: Severity, key: Key[Array, ""], ports: Ports
-  ) -> tuple[Any, Float[Array, " act"]]:
-    return m, jnp.clip(ports.ctrl + severity * jax.random.normal(key, ports.ctrl.shape), -1.0, 1.0)
-
-  return signal("command_noise", env, "ctrl", change)
+  return steady(
+    "command_noise",
+    env,
+    "ctrl",
+    lambda u, severity, key: jnp.clip(u + severity * jax.random.normal(key, u.shape), -1.0, 1.0),
+  )
 
 
 ACTUATOR = {

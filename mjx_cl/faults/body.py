@@ -8,21 +8,12 @@ from typing import Any
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Array, Bool, Float, Key
+from jaxtyping import Array, Bool, Float
 
 from mjx_cl.errors import UserError
 from mjx_cl.faults.actuator import dofs
-from mjx_cl.faults.base import (
-  Fault,
-  Ports,
-  Severity,
-  Values,
-  actuator_targets,
-  fault,
-  masks,
-  read,
-)
-from mjx_cl.faults.kinds import along
+from mjx_cl.faults.base import Fault, Severity, actuator_targets, masks
+from mjx_cl.faults.kinds import along, leafwise
 
 MASSES = ("mj.body_mass", "mj.body_inertia")
 
@@ -37,21 +28,9 @@ def _bodies(env: Any, name: str) -> tuple[tuple[str, ...], Bool[Array, "targets 
   return masks(env.spec.bodies, env.mj_model.nbody)
 
 
-def _heavier(
-  name: str,
-  env: Any,
-  leaves: tuple[str, ...],
-  targets: Iterable[str],
-  growth: Callable[[Any, Severity], Array],
-  rows: Array | None = None,
-) -> Fault:
-  """A fault of mass and inertia, which grow alike: times growth(row, severity)."""
-
-  def act(row: Any, memory: Any, severity: Severity, key: Key[Array, ""], ports: Ports) -> Values:
-    grown = growth(row, severity)
-    return memory, {leaf: (value := read(ports, leaf)) * along(grown, value) for leaf in leaves}
-
-  return fault(name, env, leaves, targets, act, rows=rows)
+def _heavier(growth: Callable[[Any, Severity], Array]) -> Callable[[Array, Any, Severity], Array]:
+  """A leaf times growth(row, severity)."""
+  return lambda value, row, severity: value * along(growth(row, severity), value)
 
 
 def payload(env: Any) -> Fault:
@@ -66,20 +45,15 @@ def payload(env: Any) -> Fault:
   of Isaac Lab (ANYmal-C, +-5 kg) and Walk These Ways.
   """
   if "mass" in env.model.task:
-    return _heavier(
-      "payload", env, ("task.mass", "task.inertia"), ("trunk",), lambda _, s: 1.0 + 0.4 * s
-    )
+    grown = lambda value, row, severity: value * (1.0 + 0.4 * severity)
+    leaves = {"task.mass": grown, "task.inertia": grown}
+    return leafwise("payload", env, leaves, (("trunk",), None, None))
   _bodies(env, "payload")
   mass = np.asarray(env.mj_model.body_mass)
   trunk = np.arange(mass.size) == env.spec.bodies[0][1][0]
   share = float(mass.sum() / mass[trunk][0])
-  return _heavier(
-    "payload",
-    env,
-    MASSES,
-    ("trunk",),
-    lambda _, severity: jnp.where(trunk, 1.0 + 0.4 * severity * share, 1.0),
-  )
+  grown = _heavier(lambda row, severity: jnp.where(trunk, 1.0 + 0.4 * severity * share, 1.0))
+  return leafwise("payload", env, dict.fromkeys(MASSES, grown), (("trunk",), None, None))
 
 
 def com(env: Any) -> Fault:
@@ -97,16 +71,10 @@ def com(env: Any) -> Fault:
   gyration = float(np.sqrt(model.body_inertia[trunk].sum() / 2 / model.body_mass[trunk]))
   names, directions = heading_targets(env, ("forward", "backward", "left", "right", "up", "down"))
   of_trunk = (jnp.arange(model.nbody) == trunk)[:, None]
-
-  def act(
-    direction: Float[Array, "3"], memory: Any, severity: Severity, key: Key[Array, ""], ports: Ports
-  ) -> Values:
-    return memory, {
-      "mj.body_ipos": ports.model.mj["body_ipos"]
-      + jnp.where(of_trunk, 0.5 * severity * gyration * direction, 0.0)
-    }
-
-  return fault("com", env, ("mj.body_ipos",), names, act, rows=directions)
+  moved = lambda value, direction, severity: (
+    value + jnp.where(of_trunk, 0.5 * severity * gyration * direction, 0.0)
+  )
+  return leafwise("com", env, {"mj.body_ipos": moved}, (names, directions, None))
 
 
 def limb_mass(env: Any) -> Fault:
@@ -116,14 +84,8 @@ def limb_mass(env: Any) -> Fault:
   than the trunk (drawn). Owns `mj.body_mass`, `mj.body_inertia`. Source: Nagabandi et al. 2019.
   """
   names, mask = _bodies(env, "limb_mass")
-  return _heavier(
-    "limb_mass",
-    env,
-    MASSES,
-    names[1:],
-    lambda hit, severity: jnp.where(hit, 1.0 + 2.0 * severity, 1.0),
-    mask[1:],
-  )
+  grown = _heavier(lambda hit, severity: jnp.where(hit, 1.0 + 2.0 * severity, 1.0))
+  return leafwise("limb_mass", env, dict.fromkeys(MASSES, grown), (names[1:], mask[1:], None))
 
 
 def joint_damping(env: Any) -> Fault:
@@ -134,13 +96,8 @@ def joint_damping(env: Any) -> Fault:
   """
   names, mask, single = actuator_targets(env)
   hits = mask.astype(jnp.float32) @ dofs(env, "joint_damping")
-
-  def act(
-    hit: Float[Array, " nv"], memory: Any, severity: Severity, key: Key[Array, ""], ports: Ports
-  ) -> Values:
-    return memory, {"mj.dof_damping": ports.model.mj["dof_damping"] + 10.0 * severity * hit}
-
-  return fault("joint_damping", env, ("mj.dof_damping",), names, act, drawn=single, rows=hits)
+  stiffer = lambda value, hit, severity: value + 10.0 * severity * hit
+  return leafwise("joint_damping", env, {"mj.dof_damping": stiffer}, (names, hits, single))
 
 
 def joint_friction(env: Any) -> Fault:
@@ -165,26 +122,12 @@ def joint_friction(env: Any) -> Fault:
       "fault 'joint_friction': MJX builds no friction constraint for a model whose joints have "
       "none, so it would do nothing; choose physics native"
     )
-
-  def act(
-    greatest: Float[Array, " nv"],
-    memory: Any,
-    severity: Severity,
-    key: Key[Array, ""],
-    ports: Ports,
-  ) -> Values:
-    return memory, {
-      "mj.dof_frictionloss": ports.model.mj["dof_frictionloss"] + 0.25 * severity * greatest
-    }
-
-  return fault(
+  rougher = lambda value, greatest, severity: value + 0.25 * severity * greatest
+  return leafwise(
     "joint_friction",
     env,
-    ("mj.dof_frictionloss",),
-    names,
-    act,
-    drawn=single,
-    rows=(mask * torque) @ which,
+    {"mj.dof_frictionloss": rougher},
+    (names, (mask * torque) @ which, single),
   )
 
 
@@ -211,16 +154,10 @@ def range_loss(env: Any) -> Fault:
   middle = np.zeros((model.njnt, 1), np.float32)
   middle[joints, 0] = np.clip(stance, *model.jnt_range[joints].T)
   hits = jnp.zeros((len(names), model.njnt), bool).at[:, joints].set(mask)
-
-  def act(
-    hit: Bool[Array, " njnt"], memory: Any, severity: Severity, key: Key[Array, ""], ports: Ports
-  ) -> Values:
-    value = ports.model.mj["jnt_range"]
-    return memory, {
-      "mj.jnt_range": jnp.where(hit[:, None], value + 0.95 * severity * (middle - value), value)
-    }
-
-  return fault("range_loss", env, ("mj.jnt_range",), names, act, drawn=single, rows=hits)
+  narrower = lambda value, hit, severity: jnp.where(
+    hit[:, None], value + 0.95 * severity * (middle - value), value
+  )
+  return leafwise("range_loss", env, {"mj.jnt_range": narrower}, (names, hits, single))
 
 
 DIRECTIONS = {

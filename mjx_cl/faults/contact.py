@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int, Key
 from mjx_cl.errors import UserError
 from mjx_cl.faults.base import Fault, Ports, Severity, Values, fault, masks, read
 from mjx_cl.faults.body import force_map, heading_targets
-from mjx_cl.faults.kinds import scaled
+from mjx_cl.faults.kinds import leafwise, scaled
 
 HEADINGS = ("forward", "backward", "left", "right")
 
@@ -44,7 +44,7 @@ def friction(env: Any) -> Fault:
     leaf, size = "mj.geom_friction", env.mj_model.ngeom
     check_priority(env, everything)
   names, mask = masks([("all", everything), *feet], size)
-  return scaled("friction", env, leaf, (names, mask, None), lambda severity: 1.0 - 0.95 * severity)
+  return scaled("friction", env, leaf, lambda severity: 1.0 - 0.95 * severity, (names, mask, None))
 
 
 def check_priority(env: Any, geoms: Iterable[int]) -> None:
@@ -75,15 +75,14 @@ def slope(env: Any) -> Fault:
   names, directions = heading_targets(env, HEADINGS)
   leaf = "task.gravity" if "gravity" in env.model.task else "mj.gravity"
 
-  def act(
-    direction: Float[Array, "3"], memory: Any, severity: Severity, key: Key[Array, ""], ports: Ports
-  ) -> Values:
-    value = read(ports, leaf)
+  def tilted(
+    value: Float[Array, "3"], downhill: Float[Array, "3"], severity: Severity
+  ) -> Float[Array, "3"]:
     angle = jnp.deg2rad(20.0) * severity
-    down = jnp.sin(angle) * direction - jnp.cos(angle) * jnp.asarray([0.0, 0.0, 1.0])
-    return memory, {leaf: jnp.linalg.norm(value) * down}
+    down = jnp.sin(angle) * downhill - jnp.cos(angle) * jnp.asarray([0.0, 0.0, 1.0])
+    return jnp.linalg.norm(value) * down
 
-  return fault("slope", env, (leaf,), names, act, rows=directions)
+  return leafwise("slope", env, {leaf: tilted}, (names, directions, None))
 
 
 def whole_mass(env: Any) -> float:
@@ -105,13 +104,8 @@ def wind(env: Any) -> Fault:
   """
   names, directions = heading_targets(env, HEADINGS)
   blows = 0.3 * 9.81 * whole_mass(env) * directions @ force_map(env)
-
-  def act(
-    blow: Float[Array, " nv"], memory: Any, severity: Severity, key: Key[Array, ""], ports: Ports
-  ) -> Values:
-    return memory, {"force": read(ports, "force") + severity * blow}
-
-  return fault("wind", env, ("force",), names, act, rows=blows)
+  blown = lambda value, blow, severity: value + severity * blow
+  return leafwise("wind", env, {"force": blown}, (names, blows, None))
 
 
 def push(env: Any) -> Fault:

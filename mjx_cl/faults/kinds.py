@@ -2,7 +2,7 @@
 late.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -28,33 +28,46 @@ def along(row: Shaped[Array, "..."], value: Shaped[Array, "..."]) -> Shaped[Arra
   return row.reshape(row.shape + (1,) * (value.ndim - row.ndim))
 
 
-def scaled(
+Targets = tuple[tuple[str, ...], Any, int | None]  # names, rows, how many may be drawn (None: all)
+
+
+def leafwise(
   name: str,
   env: Any,
-  leaf: str,
-  targets: tuple[tuple[str, ...], Any, int | None],
-  factor: Callable[[Severity], Severity],
+  maps: Mapping[str, Callable[[Array, Any, Severity], Array]],
+  targets: Targets,
   not_monotone: str = "",
 ) -> Fault:
-  """A fault that multiplies the target's entries of one leaf by factor(severity).
+  """A fault without memory whose leaves change each by itself.
 
   Args:
     name: registry name.
     env: robot.
-    leaf: that it owns; a target's mask is over its first axis.
-    targets: names, masks, and how many may be drawn (None: all).
-    factor: severity -> what the entries are multiplied by.
+    maps: leaf -> (value, row of the target, severity) -> new value.
+    targets: names, what each stands for (None: nothing), and how many may be drawn.
     not_monotone: as of `fault`.
   """
-  names, mask, drawn = targets
+  names, rows, drawn = targets
 
-  def act(
-    hit: Bool[Array, " n"], memory: Any, severity: Severity, key: Key[Array, ""], ports: Ports
-  ) -> Values:
-    value = read(ports, leaf)
-    return memory, {leaf: jnp.where(along(hit, value), value * factor(severity), value)}
+  def act(row: Any, memory: Any, severity: Severity, key: Key[Array, ""], ports: Ports) -> Values:
+    return memory, {leaf: new(read(ports, leaf), row, severity) for leaf, new in maps.items()}
 
-  return fault(name, env, (leaf,), names, act, (), drawn, not_monotone, mask)
+  return fault(name, env, tuple(maps), names, act, (), drawn, not_monotone, rows)
+
+
+def scaled(
+  name: str,
+  env: Any,
+  leaf: str,
+  factor: Callable[[Severity], Severity],
+  targets: Targets,
+  not_monotone: str = "",
+) -> Fault:
+  """A fault that multiplies the target's entries of one leaf by factor(severity)."""
+  change = lambda value, hit, severity: jnp.where(
+    along(hit, value), value * factor(severity), value
+  )
+  return leafwise(name, env, {leaf: change}, targets, not_monotone)
 
 
 def signal(
@@ -87,16 +100,21 @@ def signal(
   return fault(name, env, (port,), names, act, memory, drawn, not_monotone, mask)
 
 
+def steady(
+  name: str, env: Any, port: str, change: Callable[[Array, Severity, Key[Array, ""]], Array]
+) -> Fault:
+  """A `signal` without memory; change: (the signal, severity, key) -> the signal where it hits."""
+  return signal(
+    name, env, port, lambda m, severity, key, ports: (m, change(read(ports, port), severity, key))
+  )
+
+
 def loss(name: str, env: Any, port: str) -> Fault:
   """Entries of a signal are 0 with probability 0.5 severity, each entry and step alone."""
-
-  def change(
-    memory: Any, severity: Severity, key: Key[Array, ""], ports: Ports
-  ) -> tuple[Any, Array]:
-    value = read(ports, port)
-    return memory, jnp.where(jax.random.uniform(key, value.shape) < 0.5 * severity, 0.0, value)
-
-  return signal(name, env, port, change)
+  zeros = lambda value, severity, key: jnp.where(
+    jax.random.uniform(key, value.shape) < 0.5 * severity, 0.0, value
+  )
+  return steady(name, env, port, zeros)
 
 
 def late(name: str, env: Any, port: str, not_monotone: str) -> Fault:

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
 from mjx_cl.errors import UserError
-from mjx_cl.faults.base import Fault, Ports, Severity, Values, fault
-from mjx_cl.faults.kinds import late, loss, signal
+from mjx_cl.faults.base import Fault, Ports, Severity
+from mjx_cl.faults.kinds import late, leafwise, loss, signal, steady
 
 # at severity 1: probability that one begins, control steps that it lasts; the hard level of
 # realworldrl_suite
@@ -35,9 +35,7 @@ def bias(env: Any) -> Fault:
   as a step; the range is this project's own choice.
   """
   scale = scales(env)
-  return signal(
-    "bias", env, "obs", lambda m, severity, key, ports: (m, ports.obs + 2.0 * severity * scale)
-  )
+  return steady("bias", env, "obs", lambda x, severity, key: x + 2.0 * severity * scale)
 
 
 def drift(env: Any) -> Fault:
@@ -66,9 +64,7 @@ def scale(env: Any) -> Fault:
   channel. Owns `obs`. Not visible to: a channel that reads 0. Source: calibration faults (a reading
   times a constant) of Danesh and Fern 2021; the range is this project's own choice.
   """
-  return signal(
-    "scale", env, "obs", lambda m, severity, key, ports: (m, ports.obs * (1.0 - 0.9 * severity))
-  )
+  return steady("scale", env, "obs", lambda x, severity, key: x * (1.0 - 0.9 * severity))
 
 
 def noise(env: Any) -> Fault:
@@ -79,14 +75,11 @@ def noise(env: Any) -> Fault:
   Source: realworldrl_suite.
   """
   scale = scales(env)
-  return signal(
+  return steady(
     "noise",
     env,
     "obs",
-    lambda m, severity, key, ports: (
-      m,
-      ports.obs + severity * scale * jax.random.normal(key, scale.shape),
-    ),
+    lambda x, severity, key: x + severity * scale * jax.random.normal(key, scale.shape),
   )
 
 
@@ -211,13 +204,8 @@ def lidar_loss(env: Any) -> Fault:
     [[hit.index(i) / len(hit) if i in hit else 2.0 for i in range(size)] for _, hit in beams]
   )  # place in the sector, 2 outside it
   high = jnp.asarray([v.high if v.high < 1e9 else 0.0 for v in env.spec.obs], jnp.float32)
-
-  def act(
-    place: Float[Array, " obs"], memory: Any, severity: Severity, key: Key[Array, ""], ports: Ports
-  ) -> Values:
-    return memory, {"obs": jnp.where(place < severity, high, ports.obs)}
-
-  return fault("lidar_loss", env, ("obs",), [name for name, _ in beams], act, rows=rank)
+  blind = lambda value, place, severity: jnp.where(place < severity, high, value)
+  return leafwise("lidar_loss", env, {"obs": blind}, (tuple(name for name, _ in beams), rank, None))
 
 
 SENSOR = {

@@ -3,11 +3,10 @@
 from typing import Any
 
 import numpy as np
-from jaxtyping import Array, Key
 
 from mjx_cl.errors import UserError
-from mjx_cl.faults.base import Fault, Ports, Severity, Values, fault
-from mjx_cl.faults.kinds import scaled
+from mjx_cl.faults.base import Fault
+from mjx_cl.faults.kinds import leafwise, scaled
 
 
 def reward_weight(env: Any) -> Fault:
@@ -32,8 +31,8 @@ def reward_weight(env: Any) -> Fault:
     "reward_weight",
     env,
     "task.reward_weights",
-    (names, mask, None),
     lambda severity: 1.0 - severity,
+    (names, mask, None),
   )
 
 
@@ -44,13 +43,8 @@ def command_range(env: Any) -> Fault:
   Severity: 1 doubles it [m/s, rad/s]. Target: command, the only one. Owns `task.command_range`.
   Source: none; fault and range are this project's own choice.
   """
-
-  def act(
-    target: Any, memory: Any, severity: Severity, key: Key[Array, ""], ports: Ports
-  ) -> Values:
-    return memory, {"task.command_range": ports.model.task["command_range"] * (1.0 + severity)}
-
-  return fault("command_range", env, ("task.command_range",), ("command",), act)
+  wider = lambda value, _, severity: value * (1.0 + severity)
+  return leafwise("command_range", env, {"task.command_range": wider}, (("command",), None, None))
 
 
 TASK = {"reward_weight": reward_weight, "command_range": command_range}

@@ -156,10 +156,9 @@ class Trainer:
     return int(np.max(np.asarray(self.state.train.updates)))
 
   def _drive(self) -> np.ndarray:
-    drive = np.zeros((self.seeds, self.config.envs), bool)
-    if self.phase != "pure":
-      drive[:, : round(self.config.demo_share * self.config.envs)] = True
-    return drive
+    """Which robots the demonstrator drives: the first ones."""
+    driven = 0 if self.phase == "pure" else round(self.config.demo_share * self.config.envs)
+    return np.tile(np.arange(self.config.envs) < driven, (self.seeds, 1))
 
   def _shake(self) -> np.ndarray | None:
     """Probability of a random stretch for each robot, or None; the last robots are shaken, the
@@ -168,9 +167,8 @@ class Trainer:
     c = self.config
     if not c.shake or self.phase != "pure":
       return None
-    shake = np.zeros((self.seeds, c.envs), np.float32)
-    shake[:, c.envs - round(c.shake_share * c.envs) :] = c.shake
-    return shake
+    shaken = np.arange(c.envs) >= c.envs - round(c.shake_share * c.envs)
+    return np.tile(np.float32(c.shake) * shaken, (self.seeds, 1))
 
   def _weights(self) -> Weights:
     done, c = self.updates, self.config
