@@ -102,13 +102,20 @@ class Injection(NamedTuple):
     return jnp.stack([s.target for s in self.states], -1)
 
 
+def leaves(ports: Ports) -> dict[str, Any]:
+  """Everything that a fault may own, by name."""
+  return {
+    **{f"mj.{name}": value for name, value in ports.model.mj.items()},
+    **{f"task.{name}": value for name, value in ports.model.task.items()},
+    "force": ports.model.force,
+    "ctrl": ports.ctrl,
+    "obs": ports.obs,
+  }
+
+
 def read(ports: Ports, name: str) -> Any:
   """Value of the leaf `name`."""
-  kind, _, leaf = name.partition(".")
-  if kind in ("ctrl", "obs"):
-    return getattr(ports, kind)
-  held = getattr(ports.model, kind)
-  return held[leaf] if leaf else held
+  return leaves(ports)[name]
 
 
 def write(ports: Ports, name: str, value: Any) -> Ports:
@@ -135,6 +142,7 @@ def fault(
 
   Args:
     name: registry name.
+    env: robot.
     owns: names of its leaves; "obs" is owned alone.
     targets: names, the ones that may be drawn first.
     act: (row, memory, severity, key, ports) -> (memory', {owned leaf: new value}); for severity > 0
@@ -146,19 +154,12 @@ def fault(
       target. None: it gets the target's index.
 
   Raises:
-    UserError where `env` lacks one of the leaves.
+    UserError: `env` lacks one of the leaves.
   """
   targets = tuple(targets)
-  for leaf in owns:
-    require(env, leaf, name)
+  _check_leaves(name, env, owns)
   if not targets:
     raise UserError(f"fault {name!r} finds nothing to act on in robot {env.spec.name!r}")
-  senses = "obs" in owns
-  if senses and len(owns) > 1:
-    raise ValueError(
-      f"fault {name!r} owns obs and {', '.join(o for o in owns if o != 'obs')}: sensors are "
-      "read at another moment; make two faults"
-    )
   count = drawn or len(targets)
 
   def init(key: Key[Array, ""], target: ArrayLike = -1) -> State:
@@ -181,17 +182,19 @@ def fault(
       ports = write(ports, leaf, jnp.where(severity > 0, value.astype(old.dtype), old))
     return state._replace(memory=kept), ports
 
-  return Fault(name, tuple(owns), targets, count, init, apply, senses, not_monotone)
+  return Fault(name, tuple(owns), targets, count, init, apply, "obs" in owns, not_monotone)
 
 
-def require(env: Any, leaf: str, name: str) -> None:
-  """Raises UserError unless `env` has the leaf."""
-  kind, _, key = leaf.partition(".")
-  if kind in ("ctrl", "obs"):
-    return
-  held = getattr(env.model, kind)
-  if held is None or (key and key not in held):
-    raise UserError(f"fault {name!r} acts on {leaf}, which robot {env.spec.name!r} does not have")
+def _check_leaves(name: str, env: Any, owns: tuple[str, ...]) -> None:
+  held = leaves(Ports(env.model))
+  for leaf in owns:
+    if leaf not in ("ctrl", "obs") and held.get(leaf) is None:
+      raise UserError(f"fault {name!r} acts on {leaf}, which robot {env.spec.name!r} does not have")
+  if "obs" in owns and len(owns) > 1:
+    raise ValueError(
+      f"fault {name!r} owns obs and {', '.join(o for o in owns if o != 'obs')}: sensors are "
+      "read at another moment; make two faults"
+    )
 
 
 def owned_model(faults: tuple[Fault, ...], model: Model) -> Model:
@@ -240,9 +243,8 @@ def drive(
   faults = as_tuple(faults)
   walk = schedule.walk(injection.plan, injection.walk, t, jax.random.fold_in(key, OfFaults.WALK))
   injection = injection._replace(walk=walk)
-  severity = schedule.severity(injection.plan, walk, t) * jnp.asarray(
-    [bool(f.owns) for f in faults], jnp.float32
-  )  # `none` has no severity
+  some = jnp.asarray([bool(f.owns) for f in faults], jnp.float32)  # `none` has no severity
+  severity = schedule.severity(injection.plan, walk, t) * some
   return *_apply(faults, injection, t, key, ports, severity, False), severity
 
 
@@ -294,10 +296,6 @@ def _check_owned(fault: Fault, before: Ports, after: Ports) -> None:
   """Raises UserError, while the program is traced, where a Fault that was not built by `fault` has
   written a leaf that it does not own.
   """
-  leaves = lambda ports: (
-    {f"{kind}.{k}": v for kind in ("mj", "task") for k, v in getattr(ports.model, kind).items()}
-    | {"force": ports.model.force, "ctrl": ports.ctrl, "obs": ports.obs}
-  )
   old, new = leaves(before), leaves(after)
   touched = sorted(
     k for k in old.keys() | new.keys() if old.get(k) is not new.get(k) and k not in fault.owns

@@ -24,13 +24,14 @@ class Registry(collections.UserDict):
   is what stands there, see `find`; the table does not list it.
 
   Args:
-    group: of entry points, such as `mjx_cl.faults`. kind: what a message calls a member. own: the
-      members that are there already.
+    group: of entry points, such as `mjx_cl.faults`.
+    kind: what a message calls a member.
+    own: the members that are there already.
 
   Raises:
-    PluginError at each use, one line: a name that is taken, a module that cannot be loaded, a
-      member that cannot be called; UserError for a name
-    with a colon where nothing of that name is.
+    PluginError: at each use, one line: a name that is taken, a module that cannot be loaded, a
+      member that cannot be called.
+    UserError: a name with a colon where nothing of that name is.
   """
 
   def __init__(self, group: str, kind: str, own: dict[str, Any]) -> None:

@@ -131,11 +131,6 @@ def read_table(path: os.PathLike | str) -> dict[str, np.ndarray]:
   return {name: table[name].to_numpy() for name in table.column_names}
 
 
-def read_plain(path: os.PathLike | str) -> dict[str, list]:
-  """Columns of a Parquet file as Python values, null as None."""
-  return read_arrow(path).to_pydict()
-
-
 def read_rows(path: os.PathLike | str) -> list[dict[str, Any]]:
   """Rows of a Parquet file as Python values by column, null as None."""
   return read_arrow(path).to_pylist()
