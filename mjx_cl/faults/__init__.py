@@ -165,6 +165,9 @@ def build(
     `rollout.start` takes.
   """
   made = tuple(make(c.fault, env) for c in changes)
-  targets = [target_index(f, c.target) for f, c in zip(made, changes)]
   when = plan(*zip(*(numbers(c, onset) for c in changes)))
-  return made, when, jnp.asarray(targets, jnp.int32)
+  return (
+    made,
+    when,
+    jnp.asarray([target_index(f, c.target) for f, c in zip(made, changes)], jnp.int32),
+  )

@@ -106,8 +106,9 @@ def joint_lock(env: Any) -> Fault:
     "mj.dof_armature": lambda value, hit, severity: value + LOCK[0] * (severity * severity * hit),
     "mj.dof_damping": lambda value, hit, severity: value + LOCK[1] * (severity * severity * hit),
   }
-  hits = mask.astype(jnp.float32) @ dofs(env, "joint_lock")
-  return leafwise("joint_lock", env, holds, (names, hits, single))
+  return leafwise(
+    "joint_lock", env, holds, (names, mask.astype(jnp.float32) @ dofs(env, "joint_lock"), single)
+  )
 
 
 def stuck(env: Any) -> Fault:

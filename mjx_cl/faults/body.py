@@ -46,8 +46,9 @@ def payload(env: Any) -> Fault:
   """
   if "mass" in env.model.task:
     grown = lambda value, row, severity: value * (1.0 + 0.4 * severity)
-    leaves = {"task.mass": grown, "task.inertia": grown}
-    return leafwise("payload", env, leaves, (("trunk",), None, None))
+    return leafwise(
+      "payload", env, {"task.mass": grown, "task.inertia": grown}, (("trunk",), None, None)
+    )
   _bodies(env, "payload")
   mass = np.asarray(env.mj_model.body_mass)
   trunk = np.arange(mass.size) == env.spec.bodies[0][1][0]
@@ -95,9 +96,12 @@ def joint_damping(env: Any) -> Fault:
   Target: a joint (drawn), a leg or all. Owns `mj.dof_damping`. Source: realworldrl_suite.
   """
   names, mask, single = actuator_targets(env)
-  hits = mask.astype(jnp.float32) @ dofs(env, "joint_damping")
-  stiffer = lambda value, hit, severity: value + 10.0 * severity * hit
-  return leafwise("joint_damping", env, {"mj.dof_damping": stiffer}, (names, hits, single))
+  return leafwise(
+    "joint_damping",
+    env,
+    {"mj.dof_damping": lambda value, hit, severity: value + 10.0 * severity * hit},
+    (names, mask.astype(jnp.float32) @ dofs(env, "joint_damping"), single),
+  )
 
 
 def joint_friction(env: Any) -> Fault:
@@ -122,11 +126,10 @@ def joint_friction(env: Any) -> Fault:
       "fault 'joint_friction': MJX builds no friction constraint for a model whose joints have "
       "none, so it would do nothing; choose physics native"
     )
-  rougher = lambda value, greatest, severity: value + 0.25 * severity * greatest
   return leafwise(
     "joint_friction",
     env,
-    {"mj.dof_frictionloss": rougher},
+    {"mj.dof_frictionloss": lambda value, most, severity: value + 0.25 * severity * most},
     (names, (mask * torque) @ which, single),
   )
 

@@ -119,8 +119,7 @@ def live(
     )
     return (state, injection), (obs, out.reward, out.terminated)
 
-  times = jnp.arange(signal.shape[0])
-  return jax.lax.scan(step, (state, injection), (times, signal))[1]
+  return jax.lax.scan(step, (state, injection), (jnp.arange(signal.shape[0]), signal))[1]
 
 
 def program(env: Any, faults: tuple) -> Callable[..., Any]:

@@ -104,8 +104,12 @@ def wind(env: Any) -> Fault:
   """
   names, directions = heading_targets(env, HEADINGS)
   blows = 0.3 * 9.81 * whole_mass(env) * directions @ force_map(env)
-  blown = lambda value, blow, severity: value + severity * blow
-  return leafwise("wind", env, {"force": blown}, (names, blows, None))
+  return leafwise(
+    "wind",
+    env,
+    {"force": lambda value, blow, severity: value + severity * blow},
+    (names, blows, None),
+  )
 
 
 def push(env: Any) -> Fault:

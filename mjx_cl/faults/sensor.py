@@ -51,8 +51,9 @@ def drift(env: Any) -> Fault:
   def change(
     m: Any, severity: Severity, key: Key[Array, ""], ports: Ports
   ) -> tuple[Any, Float[Array, " obs"]]:
-    share = jnp.clip((ports.since + 1) / DRIFT_STEPS, 0.0, 1.0)
-    return m, ports.obs + 2.0 * severity * scale * share
+    return m, ports.obs + 2.0 * severity * scale * jnp.clip(
+      (ports.since + 1) / DRIFT_STEPS, 0.0, 1.0
+    )
 
   return signal("drift", env, "obs", change)
 

@@ -43,8 +43,12 @@ def command_range(env: Any) -> Fault:
   Severity: 1 doubles it [m/s, rad/s]. Target: command, the only one. Owns `task.command_range`.
   Source: none; fault and range are this project's own choice.
   """
-  wider = lambda value, _, severity: value * (1.0 + severity)
-  return leafwise("command_range", env, {"task.command_range": wider}, (("command",), None, None))
+  return leafwise(
+    "command_range",
+    env,
+    {"task.command_range": lambda value, _, severity: value * (1.0 + severity)},
+    (("command",), None, None),
+  )
 
 
 TASK = {"reward_weight": reward_weight, "command_range": command_range}

@@ -92,10 +92,12 @@ class Checkpoints:
 
   def __init__(self, folder: pathlib.Path | str) -> None:
     self.folder = pathlib.Path(folder).absolute()
-    options = ocp.CheckpointManagerOptions(
-      max_to_keep=2, enable_async_checkpointing=False, create=True
+    self._manager = ocp.CheckpointManager(
+      self.folder,
+      options=ocp.CheckpointManagerOptions(
+        max_to_keep=2, enable_async_checkpointing=False, create=True
+      ),
     )
-    self._manager = ocp.CheckpointManager(self.folder, options=options)
 
   def latest(self) -> int | None:
     """Number of the newest complete checkpoint."""

@@ -159,9 +159,8 @@ PACKAGES = (
 
 def provenance() -> dict[str, Any]:
   """Versions, machine and commit of this process, for config.json; cores: those that it may use."""
-  versions = {name: _version(name) for name in PACKAGES}
   return {
-    "versions": versions,
+    "versions": {name: _version(name) for name in PACKAGES},
     "python": platform.python_version(),
     "git_commit": _commit(),
     "machine": {

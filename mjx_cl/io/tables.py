@@ -79,14 +79,15 @@ def write_table(
     differences = {name: "DELTA_BINARY_PACKED" for name in ("stream", "step") if name in columns}
     apart = dict.fromkeys(split, "BYTE_STREAM_SPLIT")
     how |= {"use_dictionary": False, "column_encoding": apart | differences}
-  table = pyarrow.table(arrays)
-  folders.atomic(path, lambda file: pyarrow.parquet.write_table(table, file, **how))
+  folders.atomic(path, lambda file: pyarrow.parquet.write_table(pyarrow.table(arrays), file, **how))
 
 
 def write_arrow(path: os.PathLike | str, table: pyarrow.Table) -> None:
   """Writes a pyarrow Table as Parquet, compressed as `write_table` does."""
-  how = {"compression": "zstd", "use_dictionary": False}
-  folders.atomic(path, lambda file: pyarrow.parquet.write_table(table, file, **how))
+  folders.atomic(
+    path,
+    lambda file: pyarrow.parquet.write_table(table, file, compression="zstd", use_dictionary=False),
+  )
 
 
 def read_suite(name: str, folder: pathlib.Path) -> tuple[pathlib.Path, dict]:

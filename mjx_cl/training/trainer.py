@@ -116,8 +116,7 @@ class Trainer:
     self.learn = {"pure": make_learn(self.plain, dreamer.batch, dreamer.length, self.mesh)}
     if self.expert:
       sizes = len(env.spec.obs), len(env.spec.act)
-      free = dataclasses.replace(dreamer, anchor=0.0)
-      cloning = Agent(free, *sizes, clone_std=config.clone_std)
+      cloning = Agent(dataclasses.replace(dreamer, anchor=0.0), *sizes, clone_std=config.clone_std)
       rollout = Rollout(
         env, cloning, fault, config.repeat, expert=self.expert, expert_noise=config.demo_noise
       )
@@ -132,8 +131,9 @@ class Trainer:
     train = jax.vmap(self.plain.init)(jax.random.split(key_init, self.seeds))
     begin = lambda k: start(env, self.plain, fault, k, plan=self._drawn(k), target=self.target)
     streams = nest(begin, 0, 0)(jax.random.split(key_stream, (self.seeds, config.envs)))
-    sizes = len(env.spec.obs), len(env.spec.act), size.deter, size.stoch
-    empty = replay_lib.init(config.envs, config.capacity, *sizes)
+    empty = replay_lib.init(
+      config.envs, config.capacity, len(env.spec.obs), len(env.spec.act), size.deter, size.stoch
+    )
     replay = jax.tree.map(lambda x: jnp.broadcast_to(x, (self.seeds,) + x.shape).copy(), empty)
     return Learner(train, streams, replay, key)
 
@@ -304,8 +304,9 @@ class Trainer:
     self.state = self.state._replace(train=train, replay=replay, key=key)
     self._notice_failures(np.asarray(bad))
     alive = [g for g in range(self.seeds) if g not in self.failed]
-    means = {k: float(np.mean(np.asarray(v)[alive])) for k, v in metrics.items()}
-    return means | {"failed_seeds": len(self.failed)}
+    return {k: float(np.mean(np.asarray(v)[alive])) for k, v in metrics.items()} | {
+      "failed_seeds": len(self.failed)
+    }
 
   def _notice_failures(self, culprits: np.ndarray) -> None:
     """Stops every seed with a term at fault (agent.culprit): its weights are those before that
