@@ -288,9 +288,8 @@ class Trainer:
     if int(np.min(windows)) < size:
       return {}
     self.owed += CHUNK * self.config.envs * self.config.ratio / size
-    kept = (
-      0 if self.phase == "pure" else self.config.pure
-    )  # the last phase gets its updates in full
+    # the last phase gets its updates in full
+    kept = 0 if self.phase == "pure" else self.config.pure
     count = max(0, min(int(self.owed), self.config.updates - self.updates - kept))
     if not count:
       return {}
