@@ -31,8 +31,8 @@ def write(path: str | os.PathLike, arrays: Mapping[str, object], small: bool = F
   Raises:
     FileError where the disk is full or the folder refuses; what was at `path` stays.
   """
-  save = np.savez_compressed if small else np.savez
-  folders.atomic(path, lambda file: save(file, **{k: np.asarray(v) for k, v in arrays.items()}))  # type: ignore[arg-type]
+  save: Any = np.savez_compressed if small else np.savez
+  folders.atomic(path, lambda file: save(file, **{k: np.asarray(v) for k, v in arrays.items()}))
 
 
 def read(path: str | os.PathLike) -> dict[str, np.ndarray]:

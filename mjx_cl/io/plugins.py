@@ -139,11 +139,11 @@ def _file(path: pathlib.Path, changed: int) -> types.ModuleType:
   """The module in a file, loaded once for each time that it was written (`changed` [ns])."""
   # under a name of its own: two files of one name must not be taken for each other
   inner = f"mjx_cl_file_{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:12]}"
-  spec = importlib.util.spec_from_file_location(inner, path)
-  module = importlib.util.module_from_spec(spec)  # type: ignore[arg-type]
+  spec: Any = importlib.util.spec_from_file_location(inner, path)
+  module = importlib.util.module_from_spec(spec)
   sys.modules[inner] = module  # dataclasses look their module up there
   try:
-    spec.loader.exec_module(module)  # type: ignore[union-attr]
+    spec.loader.exec_module(module)
   except BaseException:
     del sys.modules[inner]
     raise

@@ -243,6 +243,6 @@ def query(
 
 def _describe(db: duckdb.DuckDBPyConnection, name: str) -> tuple[str, int, str]:
   quoted = '"' + name.replace('"', '""') + '"'
-  rows = db.execute(f"select count(*) from {quoted}").fetchone()[0]  # type: ignore[index]
+  [(rows,)] = db.execute(f"select count(*) from {quoted}").fetchall()
   columns = db.execute(f"select * from {quoted} limit 0").description
   return name, rows, ", ".join(column[0] for column in columns)

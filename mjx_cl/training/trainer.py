@@ -96,7 +96,7 @@ class Trainer:
       1 if self.mesh is None or jax.default_backend() == "cpu" else self.mesh.size,
     )
     fault, self.plan, self.target = faults_of(env, config)
-    self.fault = fault if config.fault else None
+    self.fault: Any = fault if config.fault else None
     self._programs(env, fault)
     self.state = self._place(self._begun(env, fault, seed))
     self.returns = episodes.Returns((seeds, config.envs))
@@ -211,7 +211,7 @@ class Trainer:
     drawn: that follows from its key and its clock.
     """
     key = jax.random.fold_in(jax.random.fold_in(stream.key, OfStream.TRAINING_FAULT), stream.t)
-    fresh = faults.begin(self.fault, key, self._drawn(key), self.target)  # type: ignore[arg-type]
+    fresh = faults.begin(self.fault, key, self._drawn(key), self.target)
     return stream._replace(
       injection=jax.tree.map(
         lambda a, b: jnp.where(ended, jnp.asarray(a, b.dtype), b), fresh, stream.injection
