@@ -104,7 +104,7 @@ def make(name: str, env: Any) -> Fault:
   """Builds fault `name` for the robot `env`.
 
   Raises:
-    UserError: for an unknown name, a fault that has nothing to act on in this robot, and whatever
+    UserError: an unknown name, a fault that has nothing to act on in this robot, and whatever
       goes wrong in one of another package.
   """
   try:

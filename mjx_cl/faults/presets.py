@@ -42,7 +42,7 @@ class Change:
     share: in [0, 1], see SCHEDULES.
 
   Raises:
-    UserError for an unknown schedule or a number out of range.
+    UserError: an unknown schedule or a number out of range.
   """
 
   fault: str
@@ -202,7 +202,7 @@ def find(name: str, env_name: str) -> Preset:
   targets, is for them to say. What turns a robot into another one it may not.
 
   Raises:
-    UserError for an unknown name, or one of another robot.
+    UserError: an unknown name, or one of another robot.
   """
   shipped = env_name in {preset.robot for preset in PRESETS.values()}
   fits = lambda preset: preset.robot in (env_name, "*") or not (shipped or preset.becomes)
@@ -242,8 +242,8 @@ def resolve(
     Changes; of a robot that becomes another one, those of that other one.
 
   Raises:
-    UserError for an unknown preset or schedule, one of another robot, a number out of range, or
-    settings that the preset brings itself.
+    UserError: an unknown preset or schedule, one of another robot, a number out of range, or
+      settings that the preset brings itself.
   """
   level = Change.severity if severity is None else severity
   own = Change(fault, target, level, 0, duration, schedule, period, share)

@@ -127,8 +127,8 @@ class Checkpoints:
     the broken one is set aside: its folder is renamed to NUMBER.broken.
 
     Raises:
-      FileError where none can be read, or it is of another size or dtype, or reading failed for
-      another reason than the file (memory, open files, ...); nothing is set aside then.
+      FileError: none can be read, or it is of another size or dtype, or reading failed for
+        another reason than the file (memory, open files, ...); nothing is set aside then.
     """
     packed, numbers, first = pack(like), sorted(self._manager.all_steps(), reverse=True), None
     if not numbers:

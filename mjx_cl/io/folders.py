@@ -15,7 +15,7 @@ def atomic(path: str | os.PathLike, write: Callable[[BinaryIO], object]) -> None
   """Calls `write` with a binary file of a temporary name and renames it to `path`.
 
   Raises:
-    FileError where the disk is full or the folder refuses; what was at `path` stays.
+    FileError: the disk is full or the folder refuses; what was at `path` stays.
   """
   path = pathlib.Path(path)
   tmp = path.with_name(path.name + ".tmp")
@@ -134,7 +134,7 @@ def claim_folder(
     `new`, `resume` or `done` (a finished run that --resume finds).
 
   Raises:
-    UserError where the folder holds another run and neither --resume nor --overwrite was given.
+    UserError: the folder holds another run and neither --resume nor --overwrite was given.
   """
   out = _folder(out)
   if resume and overwrite:

@@ -34,7 +34,7 @@ def read_json(path: os.PathLike | str) -> dict[str, Any]:
   """The JSON object in a file.
 
   Raises:
-    FileError where there is none, or something else.
+    FileError: there is none, or something else.
   """
   try:
     value = json.loads(pathlib.Path(path).read_text())
@@ -94,7 +94,8 @@ def read_suite(name: str, folder: pathlib.Path) -> tuple[pathlib.Path, dict]:
   """A suite by name, FOLDER/NAME.toml, or from a TOML file: (its path, its tables).
 
   Raises:
-    UserError for an unknown name; FileError for a file that is no TOML.
+    UserError: an unknown name.
+    FileError: a file that is no TOML.
   """
   path = folder / f"{name}.toml"
   if not path.exists():
@@ -116,7 +117,7 @@ def read_arrow(path: os.PathLike | str) -> pyarrow.Table:
   """A Parquet file as a pyarrow Table.
 
   Raises:
-    FileError for a file that cannot be read.
+    FileError: a file that cannot be read.
   """
   try:
     return pyarrow.parquet.read_table(path)
@@ -147,7 +148,7 @@ def views(folders: tuple[str, ...] = (), results: str = "results") -> dict[str, 
     results: the folder whose name is left out; it need not exist.
 
   Raises:
-    UserError where a folder is missing, nothing is found, or two tables would have one name.
+    UserError: a folder is missing, nothing is found, or two tables would have one name.
   """
   found: dict[str, pathlib.Path] = {}
   seen = set()

@@ -75,7 +75,7 @@ def check(
     shards: devices over which the seeds are spread.
 
   Raises:
-    UserError that names the number which would fit.
+    UserError: names the number which would fit.
   """
   setting, records_of = what
   wanted = need(size, obs_size, act_size, records, bins)

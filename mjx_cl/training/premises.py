@@ -60,7 +60,7 @@ def faults_of(
   Plan and -1, since both are drawn.
 
   Raises:
-    UserError: for what is unknown, belongs to another robot, or turns the robot into another one.
+    UserError: what is unknown, belongs to another robot, or turns the robot into another one.
   """
   if config.fault is None or not presets.named(config.fault):
     return faults.make(config.fault or "none", env), None, -1

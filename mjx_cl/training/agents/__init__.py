@@ -104,8 +104,8 @@ def load(
     departures: fields of its DreamerConfig to go on with otherwise, e.g. lr; None: its own.
 
   Raises:
-    UserError: for an agent of another robot or an unknown name.
-    FileError: for a broken or foreign file.
+    UserError: an agent of another robot or an unknown name.
+    FileError: a broken or foreign file.
   """
   related = agents_of or getattr(envs.ENVS.data.get(env_name), "agents_of", None)
   name = path or (related if related and env_name not in shipped() else env_name)
