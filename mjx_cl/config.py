@@ -146,7 +146,6 @@ class DreamerConfig:
     size: Row of the size table, see `mjx-cl list sizes`.
     batch: Sequences of one update.
     length: Trained steps of a sequence.
-    context: Leading records of a window that only give the initial state; 1.
     imagine: Imagined steps from each start.
     last_starts: Imagination starts are the last so many states of each sequence; 0: all.
     horizon: The discount is 1 - 1 / horizon.
@@ -174,7 +173,6 @@ class DreamerConfig:
   size: str = "size12m"
   batch: int = 16
   length: int = 64
-  context: int = 1
   imagine: int = 15
   last_starts: int = 0
   horizon: int = 333
@@ -209,8 +207,6 @@ class DreamerConfig:
         f"min_std and max_std must lie above 0 and up to 1, min_std below; got {self.min_std} "
         f"and {self.max_std}"
       )
-    if self.context != 1:
-      raise UserError(f"context must be 1, as in the authors' code; got {self.context}")
     if self.length < 2:  # the value of a replayed state is learnt from the one behind it
       raise UserError(f"length must be at least 2; got {self.length}")
     if self.last_starts == 1 or not 0 <= self.last_starts <= self.length:
@@ -234,7 +230,6 @@ class TrainConfig:
     ratio: Replayed steps per collected record; 1,024 is one update per record at batch 16 x 64.
     capacity: Records kept per robot.
     repeat: Control steps for which an action is held.
-    episode: Control steps after which a training episode is cut off; None: the robot's own.
     lr_end: Learning rate at the last update, reached linearly over the last `pure` updates; None:
       constant.
     demonstrator: Path of a demonstrator policy, `reference` (the robot's own driver that knows its
@@ -268,7 +263,6 @@ class TrainConfig:
   ratio: float = 1024.0
   capacity: int = 62_500
   repeat: int = 1
-  episode: int | None = None
   lr_end: float | None = None
   demonstrator: str | None = None
   demo_share: float = 0.5
@@ -288,27 +282,8 @@ class TrainConfig:
   severity: float = 1.0
 
   def __post_init__(self) -> None:
-    whole(
-      self,
-      "envs",
-      "updates",
-      "capacity",
-      "repeat",
-      "clone",
-      "fade",
-      "pure",
-      "hold",
-      *(("episode",) if self.episode is not None else ()),
-    )
-    positive(
-      self,
-      "envs",
-      "updates",
-      "ratio",
-      "capacity",
-      "repeat",
-      *(("episode",) if self.episode is not None else ()),
-    )
+    whole(self, "envs", "updates", "capacity", "repeat", "clone", "fade", "pure", "hold")
+    positive(self, "envs", "updates", "ratio", "capacity", "repeat")
     fraction(self, "demo_share", "clone_until", "shake", "shake_share", "severity")
     positive(self, "clone_std")
     not_below_0(
@@ -572,7 +547,7 @@ PRESETS = {
 
 
 # settings of earlier versions, with the one value that still means what is done today
-GONE = {"jitter": 0.0}
+GONE: dict[str, Any] = {"jitter": 0.0, "episode": None, "context": 1}
 
 
 def recorded(kind: type, record: Mapping[str, Any]) -> dict[str, Any]:

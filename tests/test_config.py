@@ -2,14 +2,17 @@
 
 import pytest
 
-from mjx_cl.config import TrainConfig, recorded
+from mjx_cl.config import DreamerConfig, TrainConfig, recorded
 
 
 def test_a_setting_that_is_gone_is_dropped_where_it_meant_nothing():
-  assert recorded(TrainConfig, {"envs": 8, "jitter": 0.0}) == {"envs": 8}
+  assert recorded(TrainConfig, {"envs": 8, "jitter": 0.0, "episode": None}) == {"envs": 8}
+  assert recorded(DreamerConfig, {"batch": 4, "context": 1}) == {"batch": 4}
 
 
-@pytest.mark.parametrize("name, value", [("jitter", 0.1), ("ration", 4)])
+@pytest.mark.parametrize(
+  "name, value", [("jitter", 0.1), ("ration", 4), ("episode", 500), ("context", 2)]
+)
 def test_a_setting_that_meant_something_is_named(name, value):
   with pytest.raises(ValueError, match=f"{name}={value} is no setting of this version"):
     recorded(TrainConfig, {"envs": 8, name: value})

@@ -200,6 +200,7 @@ def do_train(args: Train) -> None:
   from mjx_cl import envs
   from mjx_cl.io import folders
   from mjx_cl.runs import run
+  from mjx_cl.training import files, premises
   from mjx_cl.training import trainer as train
 
   env = envs.make(args.env, args.physics)
@@ -207,13 +208,13 @@ def do_train(args: Train) -> None:
     None,
     "ppo",
   ):  # whatever can be refused is refused before an earlier training is touched
-    train.expert(env, args.demonstrator)
-  train.faults_of(env, train_config)
-  train.shown(train_config, args.out, args.demonstrator)
-  train.check(env, dreamer, train_config, args.agent)
+    premises.expert(env, args.demonstrator)
+  premises.faults_of(env, train_config)
+  files.shown(train_config, args.out, args.demonstrator)
+  premises.check(env, dreamer, train_config, args.agent)
   state = folders.claim_folder(args.out, args.resume, args.overwrite, done_marker="agent/card.json")
   if state != "new":
-    updates = train.check_same(
+    updates = files.check_same(
       args.out, env, dreamer, train_config, args.seed, args.seeds, args.demonstrator, args.agent
     )
   if state == "done":
@@ -233,9 +234,9 @@ def do_train(args: Train) -> None:
       ):
         raise UserError(f"--overwrite removes --{name} {given} with {out}; give another --out")
     run.clear(out)
-    train.clear(out)
+    files.clear(out)
   command = "mjx-cl " + " ".join(sys.argv[1:]) if len(sys.argv) > 1 else "mjx-cl train"
-  trainer = train.build(
+  trainer = files.build(
     env,
     dreamer,
     train_config,
@@ -251,7 +252,7 @@ def do_train(args: Train) -> None:
   display = TrainDisplay(train_config.updates)
   with display:
     train.run(trainer, display, args.save_every_s)
-  card = train.export(trainer)
+  card = files.export(trainer)
   if args.json:
     emit(card)
   else:

@@ -6,13 +6,13 @@ Fault is taken, a tuple of them is too. Their severities, onsets, schedules and 
 so any mix over a batch of robots is one trace.
 """
 
-from __future__ import annotations
-
 import inspect
 import re
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
+from jaxtyping import Array, Int
 
 from mjx_cl.errors import PluginError, UserError, choose
 from mjx_cl.faults.actuator import ACTUATOR
@@ -31,18 +31,12 @@ from mjx_cl.faults.base import (
 )
 from mjx_cl.faults.body import BODY
 from mjx_cl.faults.contact import CONTACT
-from mjx_cl.faults.schedule import FOREVER, SCHEDULES, Plan, plan
+from mjx_cl.faults.presets import SCHEDULES, Change
+from mjx_cl.faults.schedule import FOREVER, Plan, numbers, plan
 from mjx_cl.faults.sensor import SENSOR
 from mjx_cl.faults.task import TASK
 from mjx_cl.faults.transfer import TRANSFER
 from mjx_cl.io.plugins import Registry, line
-
-if TYPE_CHECKING:
-  from collections.abc import Iterable
-
-  import jax
-
-  from mjx_cl.faults.presets import Change
 
 FAMILIES = {
   "actuator": ACTUATOR,
@@ -87,25 +81,22 @@ class Said(NamedTuple):
 
 def said(name: str) -> Said:
   """`Said` of fault `name`."""
-  text = inspect.getdoc(FAULTS[name]) or ""
-  last = " ".join(text.split("\n\n")[-1].split()).replace("`", "")
-  found = {
-    word: re.search(rf"\b{word}:? (.*?)\.(?: [A-Z]|$)", last)
-    for word in ("Severity", "Target", "Owns")
-  }
-  return Said(
-    " ".join(text.split("\n\n")[0].split()), *(hit[1] if hit else "" for hit in found.values())
-  )
+  paragraphs = [" ".join(x.split()) for x in (inspect.getdoc(FAULTS[name]) or "").split("\n\n")]
+  last = paragraphs[-1].replace("`", "")
+  hits = [
+    re.search(rf"\b{word}:? (.*?)\.(?: [A-Z]|$)", last) for word in ("Severity", "Target", "Owns")
+  ]
+  return Said(paragraphs[0], *(hit[1] if hit else "" for hit in hits))
 
 
 def about(name: str) -> str:
   """One line on fault `name` from its docstring: family, what happens, what severity means, what a
   target is, what it owns.
   """
-  own = said(name)
+  what, *rest = said(name)
   return "; ".join(
-    [f"{family(name)}: {own.what}"]
-    + [f"{word}: {getattr(own, word)}" for word in Said._fields[1:] if getattr(own, word)]
+    [f"{family(name)}: {what}"]
+    + [f"{word}: {text}" for word, text in zip(Said._fields[1:], rest) if text]
   )
 
 
@@ -113,12 +104,11 @@ def make(name: str, env: Any) -> Fault:
   """Builds fault `name` for the robot `env`.
 
   Raises:
-    UserError for an unknown name, a fault that has nothing to act on in this robot, and whatever
-    goes wrong in one of another package.
+    UserError: an unknown name, a fault that has nothing to act on in this robot, and whatever
+      goes wrong in one of another package.
   """
-  build: Any = choose("fault", name, FAULTS)
   try:
-    made = build(env)
+    made: Any = choose("fault", name, FAULTS)(env)
     if not isinstance(made, Fault):
       raise PluginError(
         f"fault {name!r} gives {type(made).__name__} in place of a Fault, see "
@@ -145,10 +135,9 @@ def available(env: Any) -> dict[str, Fault]:
   for name in FAULTS:
     try:
       out[name] = make(name, env)
-    except PluginError:
-      raise
-    except UserError:
-      continue
+    except UserError as e:
+      if isinstance(e, PluginError):
+        raise
   return out
 
 
@@ -167,24 +156,18 @@ def target_index(fault: Fault, target: str | None) -> int:
 
 
 def build(
-  changes: Iterable[Change], env: Any, onset: int = 0
-) -> tuple[tuple[Fault, ...], Plan, jax.Array]:
+  changes: Sequence[Change], env: Any, onset: int = 0
+) -> tuple[tuple[Fault, ...], Plan, Int[Array, " faults"]]:
   """The changes of a run (presets.Change) on one robot.
 
   Returns:
-    (faults, plan, targets): tuple of F Faults, Plan with leading (F,), int32 (F,); what
+    (faults, plan, targets): tuple of F Faults, Plan with leading (F,), targets; what
     `rollout.start` takes.
   """
   made = tuple(make(c.fault, env) for c in changes)
-  targets = [target_index(f, c.target) for f, c in zip(made, changes)]
-  column = lambda get: [get(c) for c in changes]
-  kinds = [list(SCHEDULES).index(c.schedule) for c in changes]
-  when = plan(
-    column(lambda c: c.severity),
-    column(lambda c: onset + c.after),
-    column(lambda c: c.duration or FOREVER),
-    kinds,
-    column(lambda c: c.period),
-    column(lambda c: c.share),
+  when = plan(*zip(*(numbers(c, onset) for c in changes)))
+  return (
+    made,
+    when,
+    jnp.asarray([target_index(f, c.target) for f, c in zip(made, changes)], jnp.int32),
   )
-  return made, when, jnp.asarray(targets, jnp.int32)

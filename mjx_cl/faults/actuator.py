@@ -5,29 +5,23 @@ leg) or all. Where a fault remembers, an episode's start fills its memory anew w
 command.
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float, Key
 
 from mjx_cl.errors import UserError
-from mjx_cl.faults.base import Fault, actuator_targets, fault, read
+from mjx_cl.faults.base import Fault, Ports, Severity, actuator_targets
+from mjx_cl.faults.kinds import late, leafwise, loss, scaled, signal, steady
 
-if TYPE_CHECKING:
-  from collections.abc import Callable
-
-  from mjx_cl.faults.base import Ports
-
-MOST_DELAY = 9  # control steps at severity 1: the hard level of realworldrl_suite
 LOCK = (10.0, 1000.0)  # [kg m^2], [N m s/rad] at severity 1
 
 
-def dofs(env: Any, name: str) -> np.ndarray:
-  """Which degree of freedom each actuator drives, float32 (A, nv) of 0 and 1: `mask @ dofs` is a
-  mask of degrees of freedom.
+def dofs(env: Any, name: str) -> Float[np.ndarray, "act nv"]:
+  """Which degree of freedom each actuator drives, of 0 and 1: `mask @ dofs` is a mask of degrees of
+  freedom.
   """
   model = getattr(env, "mj_model", None)
   if model is None or len(env.spec.targets) != model.nu:
@@ -46,15 +40,9 @@ def gear(env: Any) -> Fault:
   Target: a joint (drawn), a leg or all. Owns `mj.actuator_gear` [ratio], (nu, 6). Not visible to: a
   robot that does not load the joint. Source: the paper's walker experiment.
   """
-  names, mask, single = actuator_targets(env)
-
-  def act(
-    hit: jax.Array, memory: Any, severity: jax.Array, key: jax.Array, ports: Ports
-  ) -> tuple[Any, dict[str, jax.Array]]:
-    value = ports.model.mj["actuator_gear"]
-    return memory, {"mj.actuator_gear": jnp.where(hit[:, None], value * (1.0 - severity), value)}
-
-  return fault("gear", env, ("mj.actuator_gear",), names, act, drawn=single, rows=mask)
+  return scaled(
+    "gear", env, "mj.actuator_gear", lambda severity: 1.0 - severity, actuator_targets(env)
+  )
 
 
 def torque_loss(env: Any) -> Fault:
@@ -68,27 +56,17 @@ def torque_loss(env: Any) -> Fault:
   walker). Source: torque factors 0.9 to 1.1 in training (Walk These Ways), 0 for a crippled leg
   (Nagabandi et al. 2019).
   """
-  names, mask, single = actuator_targets(env)
-  leaf = "task.strength" if "strength" in env.model.task else "mj.actuator_gear"
-
-  def act(
-    hit: jax.Array, memory: Any, severity: jax.Array, key: jax.Array, ports: Ports
-  ) -> tuple[Any, dict[str, jax.Array]]:
-    value = read(ports, leaf)
-    return memory, {
-      leaf: jnp.where(hit.reshape((-1,) + (1,) * (value.ndim - 1)), value * (1.0 - severity), value)
-    }
-
-  reason = (
-    ""
-    if leaf.startswith("mj.")
-    else (
-      "the position loop runs at every physics step, so a joint held less firmly may end a "
-      "control step anywhere"
-    )
-  )
-  return fault(
-    "torque_loss", env, (leaf,), names, act, drawn=single, not_monotone=reason, rows=mask
+  inner = "strength" in env.model.task
+  return scaled(
+    "torque_loss",
+    env,
+    "task.strength" if inner else "mj.actuator_gear",
+    lambda severity: 1.0 - severity,
+    actuator_targets(env),
+    "the position loop runs at every physics step, so a joint held less firmly may end a control "
+    "step anywhere"
+    if inner
+    else "",
   )
 
 
@@ -101,15 +79,13 @@ def velocity_limit(env: Any) -> Fault:
   Target: a joint (drawn), a leg or all. Owns `task.velocity_limit`, (A,). Not visible to: a gait
   below the lower limit. Source: the paper's quadruped experiment.
   """
-  names, mask, single = actuator_targets(env)
-
-  def act(
-    hit: jax.Array, memory: Any, severity: jax.Array, key: jax.Array, ports: Ports
-  ) -> tuple[Any, dict[str, jax.Array]]:
-    value = ports.model.task["velocity_limit"]
-    return memory, {"task.velocity_limit": jnp.where(hit, value * (1.0 - 0.95 * severity), value)}
-
-  return fault("velocity_limit", env, ("task.velocity_limit",), names, act, drawn=single, rows=mask)
+  return scaled(
+    "velocity_limit",
+    env,
+    "task.velocity_limit",
+    lambda severity: 1.0 - 0.95 * severity,
+    actuator_targets(env),
+  )
 
 
 def joint_lock(env: Any) -> Fault:
@@ -126,42 +102,13 @@ def joint_lock(env: Any) -> Fault:
   joints of Nagabandi et al. 2019, which are limp; that one is held is this project's own choice.
   """
   names, mask, single = actuator_targets(env)
-  hits = mask.astype(jnp.float32) @ dofs(env, "joint_lock")
-
-  def act(
-    hit: jax.Array, memory: Any, severity: jax.Array, key: jax.Array, ports: Ports
-  ) -> tuple[Any, dict[str, jax.Array]]:
-    extra = severity * severity * hit
-    armature, damping = ports.model.mj["dof_armature"], ports.model.mj["dof_damping"]
-    return memory, {
-      "mj.dof_armature": armature + LOCK[0] * extra,
-      "mj.dof_damping": damping + LOCK[1] * extra,
-    }
-
-  return fault(
-    "joint_lock", env, ("mj.dof_armature", "mj.dof_damping"), names, act, drawn=single, rows=hits
+  holds = {
+    "mj.dof_armature": lambda value, hit, severity: value + LOCK[0] * (severity * severity * hit),
+    "mj.dof_damping": lambda value, hit, severity: value + LOCK[1] * (severity * severity * hit),
+  }
+  return leafwise(
+    "joint_lock", env, holds, (names, mask.astype(jnp.float32) @ dofs(env, "joint_lock"), single)
   )
-
-
-def _command(
-  name: str,
-  env: Any,
-  change: Callable[..., tuple[Any, jax.Array]],
-  memory: Any = (),
-  not_monotone: str = "",
-) -> Fault:
-  """A fault of the command alone; change(hit (A,), memory, severity, key, ports) -> (memory',
-  ctrl').
-  """
-  names, mask, single = actuator_targets(env)
-
-  def act(
-    hit: jax.Array, memory: Any, severity: jax.Array, key: jax.Array, ports: Ports
-  ) -> tuple[Any, dict[str, jax.Array]]:
-    memory, value = change(hit, memory, severity, key, ports)
-    return memory, {"ctrl": jnp.where(hit, value, ports.ctrl)}
-
-  return fault(name, env, ("ctrl",), names, act, memory, single, not_monotone, mask)
 
 
 def stuck(env: Any) -> Fault:
@@ -176,12 +123,12 @@ def stuck(env: Any) -> Fault:
   """
 
   def change(
-    hit: jax.Array, held: jax.Array, severity: jax.Array, key: jax.Array, ports: Ports
-  ) -> tuple[jax.Array, jax.Array]:
+    held: Float[Array, " act"], severity: Severity, key: Key[Array, ""], ports: Ports
+  ) -> tuple[Float[Array, " act"], Float[Array, " act"]]:
     held = jnp.where((severity > 0) & ~ports.first, held, ports.ctrl)
     return held, (1.0 - severity) * ports.ctrl + severity * held
 
-  return _command("stuck", env, change, jnp.zeros(len(env.spec.act)))
+  return signal("stuck", env, "ctrl", change, jnp.zeros(len(env.spec.act)))
 
 
 def offset(env: Any) -> Fault:
@@ -193,10 +140,8 @@ def offset(env: Any) -> Fault:
   all. Owns `ctrl`. Not visible to: a command at its upper bound. Source: motor offsets of Walk
   These Ways; the range is this project's own choice.
   """
-  return _command(
-    "offset",
-    env,
-    lambda hit, m, severity, key, ports: (m, jnp.clip(ports.ctrl + 0.5 * severity, -1.0, 1.0)),
+  return steady(
+    "offset", env, "ctrl", lambda u, severity, key: jnp.clip(u + 0.5 * severity, -1.0, 1.0)
   )
 
 
@@ -208,13 +153,12 @@ def dead_band(env: Any) -> Fault:
   Severity: 1 is a band of half the half-range [half-ranges]. Target: an actuator (drawn), a group
   or all. Owns `ctrl`. Source: none; fault and range are this project's own choice.
   """
-
-  def change(
-    hit: jax.Array, m: Any, severity: jax.Array, key: jax.Array, ports: Ports
-  ) -> tuple[Any, jax.Array]:
-    return m, jnp.sign(ports.ctrl) * jnp.maximum(jnp.abs(ports.ctrl) - 0.5 * severity, 0.0)
-
-  return _command("dead_band", env, change)
+  return steady(
+    "dead_band",
+    env,
+    "ctrl",
+    lambda u, severity, key: jnp.sign(u) * jnp.maximum(jnp.abs(u) - 0.5 * severity, 0.0),
+  )
 
 
 def command_dropout(env: Any) -> Fault:
@@ -225,13 +169,7 @@ def command_dropout(env: Any) -> Fault:
   Severity: 1 loses every other command [probability]. Target: an actuator (drawn), a group or all.
   Owns `ctrl`. Source: dropped commands; realworldrl_suite drops observations with 0.01 to 0.1.
   """
-
-  def change(
-    hit: jax.Array, m: Any, severity: jax.Array, key: jax.Array, ports: Ports
-  ) -> tuple[Any, jax.Array]:
-    return m, jnp.where(jax.random.uniform(key, hit.shape) < 0.5 * severity, 0.0, ports.ctrl)
-
-  return _command("command_dropout", env, change)
+  return loss("command_dropout", env, "ctrl")
 
 
 def command_delay(env: Any) -> Fault:
@@ -243,24 +181,7 @@ def command_delay(env: Any) -> Fault:
   hard. Target: an actuator (drawn), a group or all. Owns `ctrl`. Memory: the last 9 commands; an
   episode's start fills it with its first command. Source: realworldrl_suite.
   """
-
-  def change(
-    hit: jax.Array, line: jax.Array, severity: jax.Array, key: jax.Array, ports: Ports
-  ) -> tuple[jax.Array, jax.Array]:
-    line = jnp.where(
-      ports.first,
-      jnp.broadcast_to(ports.ctrl, line.shape),
-      jnp.concatenate([ports.ctrl[None], line[:-1]]),
-    )
-    return line, line[jnp.ceil(MOST_DELAY * severity).astype(jnp.int32)]
-
-  return _command(
-    "command_delay",
-    env,
-    change,
-    jnp.zeros((MOST_DELAY + 1, len(env.spec.act))),
-    "an older command may be nearer to the present one",
-  )
+  return late("command_delay", env, "ctrl", "an older command may be nearer to the present one")
 
 
 def command_noise(env: Any) -> Fault:
@@ -271,13 +192,12 @@ def command_noise(env: Any) -> Fault:
   Severity: standard deviation [half-ranges]; 0.1, 0.3, 1.0 are realworldrl_suite's levels. Target:
   an actuator (drawn), a group or all. Owns `ctrl`. Source: realworldrl_suite.
   """
-
-  def change(
-    hit: jax.Array, m: Any, severity: jax.Array, key: jax.Array, ports: Ports
-  ) -> tuple[Any, jax.Array]:
-    return m, jnp.clip(ports.ctrl + severity * jax.random.normal(key, hit.shape), -1.0, 1.0)
-
-  return _command("command_noise", env, change)
+  return steady(
+    "command_noise",
+    env,
+    "ctrl",
+    lambda u, severity, key: jnp.clip(u + severity * jax.random.normal(key, u.shape), -1.0, 1.0),
+  )
 
 
 ACTUATOR = {

@@ -5,23 +5,22 @@ the severity is above 0. So severity 0 is nominal bit for bit, and a leaf that i
 be touched, whatever the fault's author wrote.
 """
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from mjx_cl.errors import UserError
 from mjx_cl.faults import schedule
 from mjx_cl.keys import OfFaults
 from mjx_cl.types import Model
 
-if TYPE_CHECKING:
-  from collections.abc import Iterable
-
-  import numpy as np
+Severity = Float[Array, ""]
+Values = tuple[Any, dict[str, Array]]  # of `act`: (memory', {owned leaf: new value})
 
 
 class Ports(NamedTuple):
@@ -37,10 +36,10 @@ class Ports(NamedTuple):
   """
 
   model: Model
-  ctrl: jax.Array | Any = None
-  obs: jax.Array | Any = None
-  first: jax.Array | bool = False
-  since: jax.Array | int = 0
+  ctrl: Any = None
+  obs: Any = None
+  first: Any = False
+  since: Any = 0
 
 
 class State(NamedTuple):
@@ -53,7 +52,7 @@ class State(NamedTuple):
     memory: a pytree (delay lines, held values), () where there is none.
   """
 
-  target: jax.Array
+  target: Array
   row: Any
   memory: Any
 
@@ -95,38 +94,37 @@ class Injection(NamedTuple):
 
   states: tuple[State, ...]
   plan: schedule.Plan
-  walk: jax.Array
+  walk: Array
 
   @property
-  def target(self) -> jax.Array:
-    """int32 (F,), target of each fault."""
+  def target(self) -> Int[Array, "... faults"]:
+    """Target of each fault."""
     return jnp.stack([s.target for s in self.states], -1)
 
 
-def read(ports: Ports, name: str) -> jax.Array:
+def leaves(ports: Ports) -> dict[str, Any]:
+  """Everything that a fault may own, by name."""
+  return {
+    **{f"mj.{name}": value for name, value in ports.model.mj.items()},
+    **{f"task.{name}": value for name, value in ports.model.task.items()},
+    "force": ports.model.force,
+    "ctrl": ports.ctrl,
+    "obs": ports.obs,
+  }
+
+
+def read(ports: Ports, name: str) -> Any:
   """Value of the leaf `name`."""
-  kind, _, leaf = name.partition(".")
-  return (
-    getattr(ports.model, kind)[leaf]  # type: ignore[return-value]
-    if leaf
-    else ports.model.force
-    if kind == "force"
-    else getattr(ports, kind)
-  )
+  return leaves(ports)[name]
 
 
-def write(ports: Ports, name: str, value: jax.Array) -> Ports:
+def write(ports: Ports, name: str, value: Any) -> Ports:
   """Ports with `value` in the leaf `name`."""
   kind, _, leaf = name.partition(".")
-  if leaf:
-    return ports._replace(
-      model=ports.model._replace(**{kind: getattr(ports.model, kind) | {leaf: value}})
-    )
-  return (
-    ports._replace(model=ports.model._replace(force=value))
-    if kind == "force"
-    else ports._replace(**{kind: value})  # type: ignore[arg-type]
-  )
+  if kind in ("ctrl", "obs"):
+    return ports._replace(**{kind: value})
+  held = getattr(ports.model, kind) | {leaf: value} if leaf else value
+  return ports._replace(model=ports.model._replace(**{kind: held}))
 
 
 def fault(
@@ -134,16 +132,17 @@ def fault(
   env: Any,
   owns: tuple[str, ...],
   targets: Iterable[str],
-  act: Callable[..., Any],
+  act: Callable[..., Values],
   memory: Any = (),
   drawn: int | None = None,
   not_monotone: str = "",
-  rows: jax.Array | np.ndarray | None = None,
+  rows: Array | np.ndarray | None = None,
 ) -> Fault:
   """Builds a Fault of `env`.
 
   Args:
     name: registry name.
+    env: robot.
     owns: names of its leaves; "obs" is owned alone.
     targets: names, the ones that may be drawn first.
     act: (row, memory, severity, key, ports) -> (memory', {owned leaf: new value}); for severity > 0
@@ -155,29 +154,24 @@ def fault(
       target. None: it gets the target's index.
 
   Raises:
-    UserError where `env` lacks one of the leaves.
+    UserError: `env` lacks one of the leaves.
   """
   targets = tuple(targets)
-  for leaf in owns:
-    require(env, leaf, name)
+  _check_leaves(name, env, owns)
   if not targets:
     raise UserError(f"fault {name!r} finds nothing to act on in robot {env.spec.name!r}")
-  senses = "obs" in owns
-  if senses and len(owns) > 1:
-    raise ValueError(
-      f"fault {name!r} owns obs and {', '.join(o for o in owns if o != 'obs')}: sensors are "
-      "read at another moment; make two faults"
-    )
   count = drawn or len(targets)
 
-  def init(key: jax.Array, target: jax.Array | int = -1) -> State:
+  def init(key: Key[Array, ""], target: ArrayLike = -1) -> State:
     target = jnp.asarray(target)
     index = jnp.where(target < 0, jax.random.randint(key, (), 0, count), target).astype(jnp.int32)
     return State(
       index, index if rows is None else jnp.asarray(rows)[index], jax.tree.map(jnp.asarray, memory)
     )
 
-  def apply(state: State, severity: jax.Array, key: jax.Array, ports: Ports) -> tuple[State, Ports]:
+  def apply(
+    state: State, severity: Severity, key: Key[Array, ""], ports: Ports
+  ) -> tuple[State, Ports]:
     kept, values = act(state.row, state.memory, severity, key, ports)
     if set(values) != set(owns):
       raise ValueError(
@@ -188,17 +182,19 @@ def fault(
       ports = write(ports, leaf, jnp.where(severity > 0, value.astype(old.dtype), old))
     return state._replace(memory=kept), ports
 
-  return Fault(name, tuple(owns), targets, count, init, apply, senses, not_monotone)
+  return Fault(name, tuple(owns), targets, count, init, apply, "obs" in owns, not_monotone)
 
 
-def require(env: Any, leaf: str, name: str) -> None:
-  """Raises UserError unless `env` has the leaf."""
-  kind, _, key = leaf.partition(".")
-  if kind in ("ctrl", "obs"):
-    return
-  held = getattr(env.model, kind)
-  if held is None or (key and key not in held):
-    raise UserError(f"fault {name!r} acts on {leaf}, which robot {env.spec.name!r} does not have")
+def _check_leaves(name: str, env: Any, owns: tuple[str, ...]) -> None:
+  held = leaves(Ports(env.model))
+  for leaf in owns:
+    if leaf not in ("ctrl", "obs") and held.get(leaf) is None:
+      raise UserError(f"fault {name!r} acts on {leaf}, which robot {env.spec.name!r} does not have")
+  if "obs" in owns and len(owns) > 1:
+    raise ValueError(
+      f"fault {name!r} owns obs and {', '.join(o for o in owns if o != 'obs')}: sensors are "
+      "read at another moment; make two faults"
+    )
 
 
 def owned_model(faults: tuple[Fault, ...], model: Model) -> Model:
@@ -219,11 +215,12 @@ def as_tuple(faults: Fault | Iterable[Fault]) -> tuple[Fault, ...]:
 
 
 def begin(
-  faults: Fault | Iterable[Fault], key: jax.Array, plan: schedule.Plan, target: jax.Array | int = -1
+  faults: Fault | Iterable[Fault],
+  key: Key[Array, ""],
+  plan: schedule.Plan,
+  target: ArrayLike = -1,
 ) -> Injection:
-  """Injection of `faults` before the first step; `target` int32 () or (F,), -1: drawn
-  from `key`.
-  """
+  """Injection of `faults` before the first step; `target` () or (F,), -1: drawn from `key`."""
   faults = as_tuple(faults)
   target = jnp.broadcast_to(jnp.asarray(target, jnp.int32), (len(faults),))
   keys = [key] + [jax.random.fold_in(key, i) for i in range(1, len(faults))]
@@ -232,31 +229,34 @@ def begin(
 
 
 def drive(
-  faults: Fault | Iterable[Fault], injection: Injection, t: jax.Array, key: jax.Array, ports: Ports
-) -> tuple[Injection, Ports, jax.Array]:
+  faults: Fault | Iterable[Fault],
+  injection: Injection,
+  t: Int[Array, ""],
+  key: Key[Array, ""],
+  ports: Ports,
+) -> tuple[Injection, Ports, Float[Array, " faults"]]:
   """Applies every fault that acts on the driven robot, in order, in control step t.
 
   Returns:
-    (injection', ports', severity of each fault now, float32 (F,)).
+    (injection', ports', severity of each fault now).
   """
   faults = as_tuple(faults)
   walk = schedule.walk(injection.plan, injection.walk, t, jax.random.fold_in(key, OfFaults.WALK))
   injection = injection._replace(walk=walk)
-  severity = schedule.severity(injection.plan, walk, t) * jnp.asarray(
-    [bool(f.owns) for f in faults], jnp.float32
-  )  # `none` has no severity
+  some = jnp.asarray([bool(f.owns) for f in faults], jnp.float32)  # `none` has no severity
+  severity = schedule.severity(injection.plan, walk, t) * some
   return *_apply(faults, injection, t, key, ports, severity, False), severity
 
 
 def sense(
   faults: Fault | Iterable[Fault],
   injection: Injection,
-  t: jax.Array,
-  key: jax.Array,
+  t: Int[Array, ""],
+  key: Key[Array, ""],
   model: Model,
-  obs: jax.Array,
-  first: jax.Array | bool = False,
-) -> tuple[Injection, jax.Array]:
+  obs: Float[Array, " obs"],
+  first: Bool[ArrayLike, ""] = False,
+) -> tuple[Injection, Float[Array, " obs"]]:
   """Applies every sensor fault to the observation that is read at control step t. Returns
   (injection', obs').
 
@@ -276,10 +276,10 @@ def sense(
 def _apply(
   faults: tuple[Fault, ...],
   injection: Injection,
-  t: jax.Array,
-  key: jax.Array,
+  t: Int[Array, ""],
+  key: Key[Array, ""],
   ports: Ports,
-  severity: jax.Array,
+  severity: Float[Array, " faults"],
   senses: bool,
 ) -> tuple[Injection, Ports]:
   states = list(injection.states)
@@ -296,10 +296,6 @@ def _check_owned(fault: Fault, before: Ports, after: Ports) -> None:
   """Raises UserError, while the program is traced, where a Fault that was not built by `fault` has
   written a leaf that it does not own.
   """
-  leaves = lambda ports: (
-    {f"{kind}.{k}": v for kind in ("mj", "task") for k, v in getattr(ports.model, kind).items()}
-    | {"force": ports.model.force, "ctrl": ports.ctrl, "obs": ports.obs}
-  )
   old, new = leaves(before), leaves(after)
   touched = sorted(
     k for k in old.keys() | new.keys() if old.get(k) is not new.get(k) and k not in fault.owns
@@ -313,7 +309,6 @@ def _check_owned(fault: Fault, before: Ports, after: Ports) -> None:
 
 def none(env: Any) -> Fault:
   """No fault at all: the nominal robot."""
-  del env
   return Fault(
     "none",
     (),
@@ -328,32 +323,28 @@ def none(env: Any) -> Fault:
 # ---- targets -------------------------------------------------------------------------------------
 
 
-def actuator_targets(env: Any) -> tuple[tuple[str, ...], jax.Array, int]:
-  """Single actuators, then groups, then all: (names, bool mask (targets, A), how many
-  are single).
+def masks(
+  rows: Iterable[tuple[str, Iterable[int]]], size: int
+) -> tuple[tuple[str, ...], Bool[Array, "targets size"]]:
+  """Names, and which of `size` things each stands for, of rows (name, indices)."""
+  names, hits = zip(*rows)
+  return names, jnp.asarray([[i in hit for i in range(size)] for hit in hits])
+
+
+def actuator_targets(env: Any) -> tuple[tuple[str, ...], Bool[Array, "targets act"], int]:
+  """Single actuators, then groups, then all: (names, masks, how many are single)."""
+  singles, size = env.spec.targets, len(env.spec.act)
+  rows = [(name, (i,)) for i, name in enumerate(singles)] + list(env.spec.act_groups)
+  if "all" not in dict(rows):
+    rows.append(("all", range(size)))
+  return *masks(rows, size), len(singles)
+
+
+def channel_targets(env: Any) -> tuple[tuple[str, ...], Bool[Array, "targets obs"], int]:
+  """Groups of the observation, `all`, then single channels: (names, masks, how many may be
+  drawn).
   """
-  size = len(env.spec.act)
-  rows = [(name, (i,)) for i, name in enumerate(env.spec.targets)] + list(env.spec.act_groups)
-  return _masks(rows, size, len(env.spec.targets))
-
-
-def channel_targets(env: Any) -> tuple[tuple[str, ...], jax.Array, int]:
-  """Groups of the observation, `all`, then single channels: (names, bool mask (targets, O), how
-  many may be drawn).
-  """
-  size = len(env.spec.obs)
-  groups = list(env.spec.obs_groups)
-  rows = groups + [("all", tuple(range(size)))]
-  have = {name for name, _ in rows}
-  rows += [(var.name, (i,)) for i, var in enumerate(env.spec.obs) if var.name not in have]
-  return _masks(rows, size, max(1, len(groups)), whole=False)
-
-
-def _masks(
-  rows: Iterable[tuple[str, tuple[int, ...]]], size: int, single: int, whole: bool = True
-) -> tuple[tuple[str, ...], jax.Array, int]:
-  rows = list(rows)
-  if whole and "all" not in {name for name, _ in rows}:
-    rows.append(("all", tuple(range(size))))
-  mask = jnp.asarray([[i in hit for i in range(size)] for _, hit in rows])
-  return tuple(name for name, _ in rows), mask, single
+  groups, size = env.spec.obs_groups, len(env.spec.obs)
+  rows = dict(groups) | {"all": range(size)}
+  rows |= {var.name: (i,) for i, var in enumerate(env.spec.obs) if var.name not in rows}
+  return *masks(rows.items(), size), max(1, len(groups))

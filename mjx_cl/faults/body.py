@@ -2,36 +2,35 @@
 (mj_setConst, physics.fields).
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterable
+from typing import Any
 
 import jax.numpy as jnp
+import mujoco
 import numpy as np
+from jaxtyping import Array, Bool, Float
 
 from mjx_cl.errors import UserError
 from mjx_cl.faults.actuator import dofs
-from mjx_cl.faults.base import Fault, actuator_targets, fault
+from mjx_cl.faults.base import Fault, Severity, actuator_targets, masks
+from mjx_cl.faults.kinds import along, leafwise
 
-if TYPE_CHECKING:
-  from collections.abc import Iterable
-
-  import jax
-
-  from mjx_cl.faults.base import Ports
+MASSES = ("mj.body_mass", "mj.body_inertia")
 
 
-def _bodies(env: Any, name: str) -> tuple[tuple[str, ...], jax.Array]:
-  """(names, bool mask (targets, nbody)) of spec.bodies."""
+def _bodies(env: Any, name: str) -> tuple[tuple[str, ...], Bool[Array, "targets nbody"]]:
+  """Names and masks of spec.bodies."""
   if not env.spec.bodies or getattr(env, "mj_model", None) is None:
     raise UserError(
       f"fault {name!r} needs bodies with a name and a mass, which robot {env.spec.name!r} does "
       "not have"
     )
-  size = env.mj_model.nbody
-  return tuple(n for n, _ in env.spec.bodies), jnp.asarray(
-    [[i in hit for i in range(size)] for _, hit in env.spec.bodies]
-  )
+  return masks(env.spec.bodies, env.mj_model.nbody)
+
+
+def _heavier(growth: Callable[[Any, Severity], Array]) -> Callable[[Array, Any, Severity], Array]:
+  """A leaf times growth(row, severity)."""
+  return lambda value, row, severity: value * along(growth(row, severity), value)
 
 
 def payload(env: Any) -> Fault:
@@ -46,32 +45,16 @@ def payload(env: Any) -> Fault:
   of Isaac Lab (ANYmal-C, +-5 kg) and Walk These Ways.
   """
   if "mass" in env.model.task:
-
-    def act(
-      target: jax.Array, memory: Any, severity: jax.Array, key: jax.Array, ports: Ports
-    ) -> tuple[Any, dict[str, jax.Array]]:
-      grown = 1.0 + 0.4 * severity
-      return memory, {
-        "task.mass": ports.model.task["mass"] * grown,
-        "task.inertia": ports.model.task["inertia"] * grown,
-      }
-
-    return fault("payload", env, ("task.mass", "task.inertia"), ("trunk",), act)
-  _, mask = _bodies(env, "payload")
+    grown = lambda value, row, severity: value * (1.0 + 0.4 * severity)
+    return leafwise(
+      "payload", env, {"task.mass": grown, "task.inertia": grown}, (("trunk",), None, None)
+    )
+  _bodies(env, "payload")
   mass = np.asarray(env.mj_model.body_mass)
-  trunk = int(env.spec.bodies[0][1][0])
-  share = float(mass.sum() / mass[trunk])
-
-  def act(  # type: ignore[no-redef]
-    target: jax.Array, memory: Any, severity: jax.Array, key: jax.Array, ports: Ports
-  ) -> tuple[Any, dict[str, jax.Array]]:
-    grown = jnp.where(jnp.arange(mass.size) == trunk, 1.0 + 0.4 * severity * share, 1.0)
-    return memory, {
-      "mj.body_mass": ports.model.mj["body_mass"] * grown,
-      "mj.body_inertia": ports.model.mj["body_inertia"] * grown[:, None],
-    }
-
-  return fault("payload", env, ("mj.body_mass", "mj.body_inertia"), ("trunk",), act)
+  trunk = np.arange(mass.size) == env.spec.bodies[0][1][0]
+  share = float(mass.sum() / mass[trunk][0])
+  grown = _heavier(lambda row, severity: jnp.where(trunk, 1.0 + 0.4 * severity * share, 1.0))
+  return leafwise("payload", env, dict.fromkeys(MASSES, grown), (("trunk",), None, None))
 
 
 def com(env: Any) -> Fault:
@@ -89,16 +72,10 @@ def com(env: Any) -> Fault:
   gyration = float(np.sqrt(model.body_inertia[trunk].sum() / 2 / model.body_mass[trunk]))
   names, directions = heading_targets(env, ("forward", "backward", "left", "right", "up", "down"))
   of_trunk = (jnp.arange(model.nbody) == trunk)[:, None]
-
-  def act(
-    direction: jax.Array, memory: Any, severity: jax.Array, key: jax.Array, ports: Ports
-  ) -> tuple[Any, dict[str, jax.Array]]:
-    return memory, {
-      "mj.body_ipos": ports.model.mj["body_ipos"]
-      + jnp.where(of_trunk, 0.5 * severity * gyration * direction, 0.0)
-    }
-
-  return fault("com", env, ("mj.body_ipos",), names, act, rows=directions)
+  moved = lambda value, direction, severity: (
+    value + jnp.where(of_trunk, 0.5 * severity * gyration * direction, 0.0)
+  )
+  return leafwise("com", env, {"mj.body_ipos": moved}, (names, directions, None))
 
 
 def limb_mass(env: Any) -> Fault:
@@ -108,18 +85,8 @@ def limb_mass(env: Any) -> Fault:
   than the trunk (drawn). Owns `mj.body_mass`, `mj.body_inertia`. Source: Nagabandi et al. 2019.
   """
   names, mask = _bodies(env, "limb_mass")
-  names, mask = names[1:], mask[1:]
-
-  def act(
-    hit: jax.Array, memory: Any, severity: jax.Array, key: jax.Array, ports: Ports
-  ) -> tuple[Any, dict[str, jax.Array]]:
-    grown = jnp.where(hit, 1.0 + 2.0 * severity, 1.0)
-    return memory, {
-      "mj.body_mass": ports.model.mj["body_mass"] * grown,
-      "mj.body_inertia": ports.model.mj["body_inertia"] * grown[:, None],
-    }
-
-  return fault("limb_mass", env, ("mj.body_mass", "mj.body_inertia"), names, act, rows=mask)
+  grown = _heavier(lambda hit, severity: jnp.where(hit, 1.0 + 2.0 * severity, 1.0))
+  return leafwise("limb_mass", env, dict.fromkeys(MASSES, grown), (names[1:], mask[1:], None))
 
 
 def joint_damping(env: Any) -> Fault:
@@ -129,14 +96,12 @@ def joint_damping(env: Any) -> Fault:
   Target: a joint (drawn), a leg or all. Owns `mj.dof_damping`. Source: realworldrl_suite.
   """
   names, mask, single = actuator_targets(env)
-  hits = mask.astype(jnp.float32) @ dofs(env, "joint_damping")
-
-  def act(
-    hit: jax.Array, memory: Any, severity: jax.Array, key: jax.Array, ports: Ports
-  ) -> tuple[Any, dict[str, jax.Array]]:
-    return memory, {"mj.dof_damping": ports.model.mj["dof_damping"] + 10.0 * severity * hit}
-
-  return fault("joint_damping", env, ("mj.dof_damping",), names, act, drawn=single, rows=hits)
+  return leafwise(
+    "joint_damping",
+    env,
+    {"mj.dof_damping": lambda value, hit, severity: value + 10.0 * severity * hit},
+    (names, mask.astype(jnp.float32) @ dofs(env, "joint_damping"), single),
+  )
 
 
 def joint_friction(env: Any) -> Fault:
@@ -159,25 +124,13 @@ def joint_friction(env: Any) -> Fault:
   if env.physics.name == "mjx" and not (model.dof_frictionloss > 0).any():
     raise UserError(
       "fault 'joint_friction': MJX builds no friction constraint for a model whose joints have "
-      "none, so it would do nothing; "
-      "choose physics native"
+      "none, so it would do nothing; choose physics native"
     )
-
-  def act(
-    greatest: jax.Array, memory: Any, severity: jax.Array, key: jax.Array, ports: Ports
-  ) -> tuple[Any, dict[str, jax.Array]]:
-    return memory, {
-      "mj.dof_frictionloss": ports.model.mj["dof_frictionloss"] + 0.25 * severity * greatest
-    }
-
-  return fault(
+  return leafwise(
     "joint_friction",
     env,
-    ("mj.dof_frictionloss",),
-    names,
-    act,
-    drawn=single,
-    rows=(mask * torque) @ which,
+    {"mj.dof_frictionloss": lambda value, most, severity: value + 0.25 * severity * most},
+    (names, (mask * torque) @ which, single),
   )
 
 
@@ -190,31 +143,24 @@ def range_loss(env: Any) -> Fault:
   Source: none; fault and range are this project's own choice.
   """
   names, mask, single = actuator_targets(env)
-  dofs(env, "range_loss")
+  dofs(env, "range_loss")  # which refuses a robot without one motor per joint
   model = env.mj_model
   joints = model.actuator_trnid[:, 0]
-  if not model.jnt_limited[joints].all():
+  free = [name for name, has in zip(env.spec.targets, model.jnt_limited[joints]) if not has]
+  if free:
     raise UserError(
       f"fault 'range_loss' needs joints with limits; these have none in robot {env.spec.name!r}: "
-      + ", ".join(
-        env.spec.targets[i] for i in np.flatnonzero(~model.jnt_limited[joints].astype(bool))
-      )
+      + ", ".join(free)
     )
   stance = getattr(env, "stance", None)  # joint angles of standing, in actuator order
   stance = model.qpos0[model.jnt_qposadr[joints]] if stance is None else np.asarray(stance)
   middle = np.zeros((model.njnt, 1), np.float32)
   middle[joints, 0] = np.clip(stance, *model.jnt_range[joints].T)
   hits = jnp.zeros((len(names), model.njnt), bool).at[:, joints].set(mask)
-
-  def act(
-    hit: jax.Array, memory: Any, severity: jax.Array, key: jax.Array, ports: Ports
-  ) -> tuple[Any, dict[str, jax.Array]]:
-    value = ports.model.mj["jnt_range"]
-    return memory, {
-      "mj.jnt_range": jnp.where(hit[:, None], value + 0.95 * severity * (middle - value), value)
-    }
-
-  return fault("range_loss", env, ("mj.jnt_range",), names, act, drawn=single, rows=hits)
+  narrower = lambda value, hit, severity: jnp.where(
+    hit[:, None], value + 0.95 * severity * (middle - value), value
+  )
+  return leafwise("range_loss", env, {"mj.jnt_range": narrower}, (names, hits, single))
 
 
 DIRECTIONS = {
@@ -227,30 +173,25 @@ DIRECTIONS = {
 }
 
 
-def heading_targets(env: Any, names: Iterable[str]) -> tuple[tuple[str, ...], jax.Array]:
-  """(names, unit vectors (targets, 3)) of the directions in which the robot's trunk is free to
-  move.
-  """
+def heading_targets(
+  env: Any, names: Iterable[str]
+) -> tuple[tuple[str, ...], Float[Array, "targets 3"]]:
+  """Names and unit vectors of the directions in which the robot's trunk is free to move."""
   free = np.abs(force_map(env)).sum(1) > 0
   kept = [n for n in names if free[np.flatnonzero(DIRECTIONS[n])[0]]]
   return tuple(kept), jnp.asarray([DIRECTIONS[n] for n in kept], jnp.float32)
 
 
-def force_map(env: Any) -> np.ndarray:
-  """(3, nv): a force F (world axes) [N] on the trunk is the generalised force F @ map.
+def force_map(env: Any) -> Float[np.ndarray, "3 nv"]:
+  """A force F (world axes) [N] on the trunk is the generalised force F @ map.
 
   The trunk's slide joints, or the translations of its free joint (the force then acts at the body's
   origin). Without a MuJoCo model the force's first two entries are along x and y of the world.
   """
-  import mujoco
-
   model = getattr(env, "mj_model", None)
   if model is None:
     size = 0 if env.model.force is None else env.model.force.shape[0]
-    out = np.zeros((3, size), np.float32)
-    for axis in range(min(2, size)):
-      out[axis, axis] = 1.0
-    return out
+    return np.eye(3, size, dtype=np.float32) * np.array([[1], [1], [0]], np.float32)
   out = np.zeros((3, model.nv), np.float32)
   trunk = int(env.spec.bodies[0][1][0]) if env.spec.bodies else 1
   for j in range(model.body_jntadr[trunk], model.body_jntadr[trunk] + model.body_jntnum[trunk]):

@@ -1,21 +1,20 @@
 """Faults between the robot and the world: grip, slope, pushes, wind."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
+from jaxtyping import Array, Float, Int, Key
 
 from mjx_cl.errors import UserError
-from mjx_cl.faults.base import Fault, fault, read
+from mjx_cl.faults.base import Fault, Ports, Severity, Values, fault, masks, read
 from mjx_cl.faults.body import force_map, heading_targets
+from mjx_cl.faults.kinds import leafwise, scaled
 
-if TYPE_CHECKING:
-  from collections.abc import Iterable
-
-  from mjx_cl.faults.base import Ports
+HEADINGS = ("forward", "backward", "left", "right")
 
 PUSH_EVERY = 100  # control steps between two pushes
 PUSH_FOR = 4  # control steps that one lasts
@@ -32,39 +31,24 @@ def friction(env: Any) -> Fault:
   otherwise, and the fault would do nothing. Source: friction of realworldrl_suite, MuJoCo
   Playground and f1tenth_gym.
   """
-  feet = list(env.spec.feet)
+  feet = env.spec.feet
   if not feet:
     raise UserError(
       f"fault 'friction' needs feet or wheels with a name, which robot {env.spec.name!r} does "
       "not have"
     )
   everything = tuple(sorted({i for _, hit in feet for i in hit}))
-  feet = [("all", everything)] + feet
-  names = tuple(name for name, _ in feet)
   if "friction" in env.model.task:
     leaf, size = "task.friction", env.model.task["friction"].shape[0]
   else:
     leaf, size = "mj.geom_friction", env.mj_model.ngeom
     check_priority(env, everything)
-  mask = jnp.asarray([[i in hit for i in range(size)] for _, hit in feet])
-
-  def act(
-    hit: jax.Array, memory: Any, severity: jax.Array, key: jax.Array, ports: Ports
-  ) -> tuple[Any, dict[str, jax.Array]]:
-    value = read(ports, leaf)
-    return memory, {
-      leaf: jnp.where(
-        hit.reshape((-1,) + (1,) * (value.ndim - 1)), value * (1.0 - 0.95 * severity), value
-      )
-    }
-
-  return fault("friction", env, (leaf,), names, act, rows=mask)
+  names, mask = masks([("all", everything), *feet], size)
+  return scaled("friction", env, leaf, lambda severity: 1.0 - 0.95 * severity, (names, mask, None))
 
 
 def check_priority(env: Any, geoms: Iterable[int]) -> None:
   """Raises UserError where a foot's friction is masked by what it stands on."""
-  import mujoco
-
   model = env.mj_model
   floor = [g for g in range(model.ngeom) if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_PLANE]
   masked = [
@@ -88,20 +72,17 @@ def slope(env: Any) -> Fault:
   left, right as far as the robot can move there. Owns `mj.gravity` (3,) [m/s^2], or `task.gravity`.
   Source: slopes of Nagabandi et al. (learning_to_adapt); the range is this project's own choice.
   """
-  names, directions = heading_targets(env, ("forward", "backward", "left", "right"))
+  names, directions = heading_targets(env, HEADINGS)
   leaf = "task.gravity" if "gravity" in env.model.task else "mj.gravity"
 
-  def act(
-    direction: jax.Array, memory: Any, severity: jax.Array, key: jax.Array, ports: Ports
-  ) -> tuple[Any, dict[str, jax.Array]]:
-    value = read(ports, leaf)
+  def tilted(
+    value: Float[Array, "3"], downhill: Float[Array, "3"], severity: Severity
+  ) -> Float[Array, "3"]:
     angle = jnp.deg2rad(20.0) * severity
-    tilted = jnp.linalg.norm(value) * (
-      jnp.sin(angle) * direction - jnp.cos(angle) * jnp.asarray([0.0, 0.0, 1.0])
-    )
-    return memory, {leaf: tilted}
+    down = jnp.sin(angle) * downhill - jnp.cos(angle) * jnp.asarray([0.0, 0.0, 1.0])
+    return jnp.linalg.norm(value) * down
 
-  return fault("slope", env, (leaf,), names, act, rows=directions)
+  return leafwise("slope", env, {leaf: tilted}, (names, directions, None))
 
 
 def whole_mass(env: Any) -> float:
@@ -121,15 +102,14 @@ def wind(env: Any) -> Fault:
   Source: force faults of PEDM, Haider et al. 2023; direction and range are this project's own
   choice.
   """
-  names, directions = heading_targets(env, ("forward", "backward", "left", "right"))
+  names, directions = heading_targets(env, HEADINGS)
   blows = 0.3 * 9.81 * whole_mass(env) * directions @ force_map(env)
-
-  def act(
-    blow: jax.Array, memory: Any, severity: jax.Array, key: jax.Array, ports: Ports
-  ) -> tuple[Any, dict[str, jax.Array]]:
-    return memory, {"force": ports.model.force + severity * blow}  # type: ignore[operator]
-
-  return fault("wind", env, ("force",), names, act, rows=blows)
+  return leafwise(
+    "wind",
+    env,
+    {"force": lambda value, blow, severity: value + severity * blow},
+    (names, blows, None),
+  )
 
 
 def push(env: Any) -> Fault:
@@ -142,21 +122,18 @@ def push(env: Any) -> Fault:
   Target: trunk, the only one. Owns `force` (nv,). Memory: the direction of the latest blow.
   Source: pushes of Isaac Lab.
   """
-  _, directions = heading_targets(env, ("forward", "backward", "left", "right"))
-  blows = (
-    1.5 * whole_mass(env) / (PUSH_FOR * env.spec.control_s) * directions @ force_map(env)
-  )  # (directions, nv)
+  _, directions = heading_targets(env, HEADINGS)
+  blows = 1.5 * whole_mass(env) / (PUSH_FOR * env.spec.control_s) * directions @ force_map(env)
 
   def act(
-    target: jax.Array, memory: Any, severity: jax.Array, key: jax.Array, ports: Ports
-  ) -> tuple[Any, dict[str, jax.Array]]:
+    target: Any, memory: Int[Array, ""], severity: Severity, key: Key[Array, ""], ports: Ports
+  ) -> Values:
     phase = jnp.mod(ports.since, PUSH_EVERY)
     which = jnp.where(phase == 0, jax.random.randint(key, (), 0, directions.shape[0]), memory)
     strength = jnp.where(phase < PUSH_FOR, severity, 0.0)
     chosen = (jnp.arange(blows.shape[0]) == which)[:, None]
-    return which, {
-      "force": ports.model.force + strength * jnp.sum(jnp.where(chosen, blows, 0.0), 0)  # type: ignore[operator]
-    }
+    blow = jnp.sum(jnp.where(chosen, blows, 0.0), 0)
+    return which, {"force": read(ports, "force") + strength * blow}
 
   return fault("push", env, ("force",), ("trunk",), act, jnp.int32(0))
 

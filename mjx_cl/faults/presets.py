@@ -5,11 +5,9 @@ A preset is a tuple of changes to one robot. Onsets are counted from the run's o
 one makes a sequence; equal ones act at once.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
-from mjx_cl.config import FOREVER, RunConfig, named
+from mjx_cl.config import FOREVER, RunConfig, fraction, named
 from mjx_cl.errors import UserError
 
 SCHEDULES = {
@@ -22,16 +20,29 @@ SCHEDULES = {
 }
 
 
+def place(schedule: str) -> int:
+  """Place of a schedule in SCHEDULES; UserError for an unknown one."""
+  if schedule not in SCHEDULES:
+    raise UserError(f"unknown schedule {schedule!r}; choose from: {', '.join(SCHEDULES)}")
+  return list(SCHEDULES).index(schedule)
+
+
 @dataclass(frozen=True)
 class Change:
   """One fault of a preset.
 
   Attributes:
-    fault, target: names; target None: drawn from the stream's seed.
+    fault: its name.
+    target: its name; None: drawn from the stream's seed.
     severity: in [0, 1].
     after: control steps from the run's onset.
     duration: control steps, None: never repaired.
-    schedule, period, share: see faults.schedule.
+    schedule: a name of SCHEDULES.
+    period: control steps, see SCHEDULES.
+    share: in [0, 1], see SCHEDULES.
+
+  Raises:
+    UserError: an unknown schedule or a number out of range.
   """
 
   fault: str
@@ -43,13 +54,25 @@ class Change:
   period: int = 1000
   share: float = 0.5
 
+  def __post_init__(self) -> None:
+    fraction(self, "severity", "share")
+    place(self.schedule)
+    for name, value in (("duration", self.duration), ("period", self.period)):
+      if value is not None and not (1 <= value < FOREVER and value == int(value)):
+        raise UserError(
+          f"{name} must be a whole number in 1..{FOREVER - 1:,} control steps; got {value}"
+        )
+
 
 @dataclass(frozen=True)
 class Preset:
   """Named changes of one robot, `*` for any.
 
   Attributes:
-    robot: environment. changes: see Change. source: of the figures.
+    robot: environment.
+    changes: of it, in force one after the other.
+    about: what happens, in words.
+    source: of the figures.
     becomes: environment that the robot turns into at the end of its first episode that ends at the
       onset or later, None: stays.
     then: changes of the robot that it has become, instead of `changes`; they come an episode after
@@ -65,23 +88,16 @@ class Preset:
 
 
 THIRD = (1.0 - 1.0 / 3.0) / 0.95  # severity of velocity_limit that leaves a third
-# coefficient left under the rear wheels, of 0.65: a car that has adapted loses a fifth of its
-# reward, results/socks.json
-SOCKS_GRIP = 0.575
+SOCKS_GRIP = 0.575  # friction coefficient under rear wheels in socks; without them 0.65
 SOCKS = (1.0 - SOCKS_GRIP / 0.65) / 0.95
 SOCKS_AFTER = 42_000  # control steps, 35 minutes
-# thirds of 9 steps of delay; deviation; severity of a burst, probability that it begins and control
-# steps that it lasts
+# realworldrl_suite's levels: thirds of 9 steps of delay; deviation; severity of a burst, its
+# probability, control steps that it lasts; delay of the reward, how often an action is repeated
 LEVELS = {
-  "easy": (1, 0.1, 0.1, 0.01, 1),
-  "medium": (2, 0.3, 0.5, 0.05, 5),
-  "hard": (3, 1.0, 1.0, 0.1, 10),
+  "easy": (1, 0.1, 0.1, 0.01, 1, 10, 1),
+  "medium": (2, 0.3, 0.5, 0.05, 5, 20, 2),
+  "hard": (3, 1.0, 1.0, 0.1, 10, 40, 3),
 }
-THERE = {
-  "easy": (10, 1),
-  "medium": (20, 2),
-  "hard": (40, 3),
-}  # the suite's delay of the reward, length of an action
 
 PRESETS: dict[str, Preset] = {
   "walker/gear-half": Preset(
@@ -127,69 +143,41 @@ PRESETS: dict[str, Preset] = {
     "the paper, race car; chosen to cost the paper's 20 % of reward, no figure of a sock was found",
   ),
 }
-for _level, (_thirds, _deviation, _burst, _probability, _lasts) in LEVELS.items():
+for _level, (
+  _thirds,
+  _deviation,
+  _burst,
+  _probability,
+  _lasts,
+  _reward,
+  _repeats,
+) in LEVELS.items():
   _rwrl = f"realworldrl_suite, level {_level}"
-  _reward, _repeats = THERE[_level]
-  _once = f"each for {_lasts} control step{'s' * (_lasts > 1)}"
-  _beyond = "; of the suite's combined challenge they leave out dummy channels, changed lengths" + (
-    f", repeated actions (each for {_repeats}) and the reward's delay ({_reward} control steps)"
-    if _repeats > 1
-    else f" and the reward's delay ({_reward} control steps)"
-  )
-  PRESETS |= {
-    f"any/observation-delay-{_level}": Preset(
-      "*",
-      (Change("delay", "all", _thirds / 3),),
-      f"observations {3 * _thirds} control steps late",
-      _rwrl,
-    ),
-    f"any/action-delay-{_level}": Preset(
-      "*",
-      (Change("command_delay", "all", _thirds / 3),),
-      f"commands {3 * _thirds} control steps late",
-      _rwrl,
-    ),
-    f"any/observation-noise-{_level}": Preset(
-      "*",
-      (Change("noise", "all", _deviation),),
+  _repeated = f", repeated actions (each for {_repeats})" if _repeats > 1 else ""
+  _likely = f"with probability {_probability:g}, each for {_lasts} control step{'s' * (_lasts > 1)}"
+  _challenges = {
+    "observation-delay": ("delay", _thirds / 3, f"observations {3 * _thirds} control steps late"),
+    "action-delay": ("command_delay", _thirds / 3, f"commands {3 * _thirds} control steps late"),
+    "observation-noise": (
+      "noise",
+      _deviation,
       f"Gaussian noise of {_deviation:g} typical deviations (there: of raw units)",
-      _rwrl,
     ),
-    f"any/action-noise-{_level}": Preset(
-      "*",
-      (Change("command_noise", "all", _deviation),),
-      f"Gaussian noise of {_deviation:g} on commands",
-      _rwrl,
-    ),
-    f"any/observation-dropout-{_level}": Preset(
-      "*",
-      (Change("dropout_burst", "all", _burst),),
-      f"readings lost with probability {_probability:g}, {_once}",
-      _rwrl,
-    ),
-    f"any/observation-stuck-{_level}": Preset(
-      "*",
-      (Change("freeze_burst", "all", _burst),),
-      f"readings held with probability {_probability:g}, {_once}",
-      _rwrl,
-    ),
-    f"any/all-{_level}": Preset(
-      "*",
-      tuple(
-        Change(f, "all", s)
-        for f, s in (
-          ("delay", _thirds / 3),
-          ("command_delay", _thirds / 3),
-          ("noise", _deviation),
-          ("command_noise", _deviation),
-          ("dropout_burst", _burst),
-          ("freeze_burst", _burst),
-        )
-      ),
-      f"all of these at once{_beyond}",
-      _rwrl,
-    ),
+    "action-noise": ("command_noise", _deviation, f"Gaussian noise of {_deviation:g} on commands"),
+    "observation-dropout": ("dropout_burst", _burst, f"readings lost {_likely}"),
+    "observation-stuck": ("freeze_burst", _burst, f"readings held {_likely}"),
   }
+  PRESETS |= {
+    f"any/{name}-{_level}": Preset("*", (Change(fault, "all", severity),), about, _rwrl)
+    for name, (fault, severity, about) in _challenges.items()
+  }
+  PRESETS[f"any/all-{_level}"] = Preset(
+    "*",
+    tuple(Change(fault, "all", severity) for fault, severity, _ in _challenges.values()),
+    "all of these at once; of the suite's combined challenge they leave out dummy channels, "
+    f"changed lengths{_repeated} and the reward's delay ({_reward} control steps)",
+    _rwrl,
+  )
 for _level, _damping, _grip in (("easy", 0.05, 0.2), ("medium", 0.25, 0.5), ("hard", 1.0, 1.0)):
   PRESETS |= {
     f"walker/damping-{_level}": Preset(
@@ -214,7 +202,7 @@ def find(name: str, env_name: str) -> Preset:
   targets, is for them to say. What turns a robot into another one it may not.
 
   Raises:
-    UserError for an unknown name, or one of another robot.
+    UserError: an unknown name, or one of another robot.
   """
   shipped = env_name in {preset.robot for preset in PRESETS.values()}
   fits = lambda preset: preset.robot in (env_name, "*") or not (shipped or preset.becomes)
@@ -241,42 +229,26 @@ def resolve(
   """The changes that a fault or a preset stands for on a robot, its settings checked.
 
   Args:
+    env_name: robot.
     fault: name of a fault, or of a preset, which brings its own targets, severities and schedules.
-    severity: in [0, 1]; None: 0.5, or the preset's. duration: control steps, where the preset
-      leaves it open; None: never repaired.
-    schedule, period, share: see SCHEDULES and `Change`.
+    target: see `Change`.
+    severity: in [0, 1]; None: 0.5, or the preset's.
+    duration: control steps, where the preset leaves it open; None: never repaired.
+    schedule: see `Change`.
+    period: see `Change`.
+    share: see `Change`.
 
   Returns:
     Changes; of a robot that becomes another one, those of that other one.
 
   Raises:
-    UserError for an unknown preset or schedule, one of another robot, a number out of range, or
-    settings that the preset brings itself.
+    UserError: an unknown preset or schedule, one of another robot, a number out of range, or
+      settings that the preset brings itself.
   """
-  if severity is not None and not 0.0 <= severity <= 1.0:  # also true for nan
-    raise UserError(f"severity must lie in [0, 1]; got {severity}")
-  if not 0.0 <= share <= 1.0:
-    raise UserError(f"share must lie in [0, 1]; got {share}")
-  if schedule not in SCHEDULES:
-    raise UserError(f"unknown schedule {schedule!r}; choose from: {', '.join(SCHEDULES)}")
-  for name, value in (("duration", duration), ("period", period)):
-    if value is not None and not (1 <= value < FOREVER and value == int(value)):
-      raise UserError(
-        f"{name} must be a whole number in 1..{FOREVER - 1:,} control steps; got {value}"
-      )
+  level = Change.severity if severity is None else severity
+  own = Change(fault, target, level, 0, duration, schedule, period, share)
   if not named(fault):
-    return (
-      Change(
-        fault,
-        target,
-        Change.severity if severity is None else severity,
-        0,
-        duration,
-        schedule,
-        period,
-        share,
-      ),
-    )
+    return (own,)
   preset = find(fault, env_name)
   if severity is not None or target is not None:
     raise UserError(

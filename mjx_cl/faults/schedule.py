@@ -2,20 +2,17 @@
 `SCHEDULES` (presets.py) is the one table.
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, Int, Key
 
-from mjx_cl.errors import UserError
-from mjx_cl.faults.presets import FOREVER, SCHEDULES
+from mjx_cl.faults.presets import FOREVER, Change, place
 
-if TYPE_CHECKING:
-  from collections.abc import Sequence
-
-  from jax.typing import ArrayLike
+Numbers = ArrayLike | Sequence[float]
 
 
 class Plan(NamedTuple):
@@ -24,34 +21,45 @@ class Plan(NamedTuple):
 
   Attributes:
     severity: float32, at most reached.
-    onset, duration: int32, control steps; FOREVER is never repaired.
+    onset: int32, first control step.
+    duration: int32, control steps; FOREVER is never repaired.
     kind: int32, index into SCHEDULES.
-    period: int32, control steps, at least 1. share: float32 in [0, 1].
+    period: int32, control steps, at least 1.
+    share: float32 in [0, 1].
   """
 
-  severity: jax.Array
-  onset: jax.Array
-  duration: jax.Array
-  kind: jax.Array
-  period: jax.Array
-  share: jax.Array
+  severity: Array
+  onset: Array
+  duration: Array
+  kind: Array
+  period: Array
+  share: Array
 
 
 def plan(
-  severity: ArrayLike | Sequence[float] = 0.0,
-  onset: ArrayLike | Sequence[float] = 0,
-  duration: ArrayLike | Sequence[float] = FOREVER,
-  schedule: str | ArrayLike | Sequence[float] = "abrupt",
-  period: ArrayLike | Sequence[float] = 1000,
-  share: ArrayLike | Sequence[float] = 0.5,
+  severity: Numbers = 0.0,
+  onset: Numbers = 0,
+  duration: Numbers = FOREVER,
+  schedule: str | Numbers = "abrupt",
+  period: Numbers = 1000,
+  share: Numbers = 0.5,
 ) -> Plan:
   """A Plan from numbers or arrays; `schedule` is a name or an array of indices."""
-  if isinstance(schedule, str):
-    if schedule not in SCHEDULES:
-      raise UserError(f"unknown schedule {schedule!r}; choose from: {', '.join(SCHEDULES)}")
-    schedule = list(SCHEDULES).index(schedule)
+  kind = place(schedule) if isinstance(schedule, str) else schedule
   i, f = lambda x: jnp.asarray(x, jnp.int32), lambda x: jnp.asarray(x, jnp.float32)
-  return Plan(f(severity), i(onset), i(duration), i(schedule), i(period), f(share))
+  return Plan(f(severity), i(onset), i(duration), i(kind), i(period), f(share))
+
+
+def numbers(change: Change, onset: int) -> tuple[float, int, int, int, int, float]:
+  """What `plan` takes of a Change of a run whose onset is `onset`."""
+  return (
+    change.severity,
+    onset + change.after,
+    change.duration or FOREVER,
+    place(change.schedule),
+    change.period,
+    change.share,
+  )
 
 
 def spread(plan: Plan, faults: int) -> Plan:
@@ -59,16 +67,17 @@ def spread(plan: Plan, faults: int) -> Plan:
   return Plan(*(jnp.broadcast_to(x, (faults,)) for x in plan))
 
 
-def abrupt(t: jax.Array, onset: jax.Array, duration: jax.Array) -> jax.Array:
-  """1 for onset <= t < onset + duration, else 0, float32 (). `onset`, `duration` in control steps;
-  FOREVER is never repaired.
+def abrupt(
+  t: Int[Array, ""], onset: Int[Array, "*f"], duration: Int[Array, "*f"]
+) -> Float[Array, "*f"]:
+  """1 for onset <= t < onset + duration, else 0. `onset`, `duration` in control steps; FOREVER is
+  never repaired.
   """
   return ((t >= onset) & (t - onset < duration)).astype(jnp.float32)
 
 
-def factor(plan: Plan, walk: jax.Array, t: jax.Array) -> jax.Array:
-  """Share of the severity that is in force at control step t, float32, of the shape of the plan's
-  leaves.
+def factor(plan: Plan, walk: Float[Array, "*f"], t: Int[Array, ""]) -> Float[Array, "*f"]:
+  """Share of the severity that is in force at control step t.
 
     abrupt 1;  ramp min(1, (since + 1) / period);  intermittent 1 if (since mod period) < share
     period else 0;
@@ -87,18 +96,19 @@ def factor(plan: Plan, walk: jax.Array, t: jax.Array) -> jax.Array:
   return jnp.where(abrupt(t, plan.onset, plan.duration) > 0, chosen, 0.0)
 
 
-def severity(plan: Plan, walk: jax.Array, t: jax.Array) -> jax.Array:
-  """Severity in force, float32 in [0, 1]."""
+def severity(plan: Plan, walk: Float[Array, "*f"], t: Int[Array, ""]) -> Float[Array, "*f"]:
+  """Severity in force, in [0, 1]."""
   return plan.severity * factor(plan, walk, t)
 
 
-def walk(plan: Plan, value: jax.Array, t: jax.Array, key: jax.Array) -> jax.Array:
+def walk(
+  plan: Plan, value: Float[Array, "*f"], t: Int[Array, ""], key: Key[Array, ""]
+) -> Float[Array, "*f"]:
   """Where the random walk stands at control step t: a new step at the onset and every `period`
   after it, reflected at 0 and 1.
   """
   since = t - plan.onset
   due = (since >= 0) & (jnp.mod(since, plan.period) == 0)
-  moved = value + plan.share * jax.random.normal(key, value.shape)
-  moved = jnp.abs(moved)  # reflected at 0
+  moved = jnp.abs(value + plan.share * jax.random.normal(key, value.shape))  # reflected at 0
   moved = jnp.clip(1.0 - jnp.abs(1.0 - moved), 0.0, 1.0)  # and at 1
   return jnp.where(due, moved, value)

@@ -6,51 +6,25 @@ channel]. A target is a group of channels, all, or one channel; a target that is
 from the groups. Where a fault remembers, an episode's start fills its memory anew.
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, Key
 
 from mjx_cl.errors import UserError
-from mjx_cl.faults.base import Fault, channel_targets, fault
+from mjx_cl.faults.base import Fault, Ports, Severity
+from mjx_cl.faults.kinds import late, leafwise, loss, signal, steady
 
-if TYPE_CHECKING:
-  from collections.abc import Callable
-
-  from mjx_cl.faults.base import Ports
-
-MOST_DELAY = 9  # control steps at severity 1
-BURST = (
-  0.1,
-  10,
-  # at severity 1: probability that one begins, control steps that it lasts; the hard level of
-  # realworldrl_suite
-)
+# at severity 1: probability that one begins, control steps that it lasts; the hard level of
+# realworldrl_suite
+BURST = (0.1, 10)
 DRIFT_STEPS = 2000  # control steps until a drift is complete
 
 
-def _sensor(
-  name: str,
-  env: Any,
-  change: Callable[..., tuple[Any, jax.Array]],
-  memory: Any = (),
-  not_monotone: str = "",
-) -> Fault:
-  """A fault of the observation alone; change(memory, severity, key, ports, scale) -> (memory',
-  obs').
-  """
-  names, mask, single = channel_targets(env)
-  scale = jnp.asarray([v.scale for v in env.spec.obs], jnp.float32)
-
-  def act(
-    hit: jax.Array, memory: Any, severity: jax.Array, key: jax.Array, ports: Ports
-  ) -> tuple[Any, dict[str, jax.Array]]:
-    memory, value = change(memory, severity, key, ports, scale)
-    return memory, {"obs": jnp.where(hit, value, ports.obs)}
-
-  return fault(name, env, ("obs",), names, act, memory, single, not_monotone, mask)
+def scales(env: Any) -> Float[Array, " obs"]:
+  """Typical deviation of each channel [its unit]."""
+  return jnp.asarray([v.scale for v in env.spec.obs], jnp.float32)
 
 
 def bias(env: Any) -> Fault:
@@ -60,9 +34,8 @@ def bias(env: Any) -> Fault:
   all, or one channel. Owns `obs`. Source: bias drift, which isaac-sim/IsaacLab#7451 asks for, here
   as a step; the range is this project's own choice.
   """
-  return _sensor(
-    "bias", env, lambda m, severity, key, ports, scale: (m, ports.obs + 2.0 * severity * scale)
-  )
+  scale = scales(env)
+  return steady("bias", env, "obs", lambda x, severity, key: x + 2.0 * severity * scale)
 
 
 def drift(env: Any) -> Fault:
@@ -73,14 +46,16 @@ def drift(env: Any) -> Fault:
   onset. Target: a group of channels (drawn), all, or one channel. Owns `obs`. Source: sensor drift
   of Danesh and Fern 2021; the range is this project's own choice.
   """
+  scale = scales(env)
 
   def change(
-    m: Any, severity: jax.Array, key: jax.Array, ports: Ports, scale: jax.Array
-  ) -> tuple[Any, jax.Array]:
-    share = jnp.clip((ports.since + 1) / DRIFT_STEPS, 0.0, 1.0)
-    return m, ports.obs + 2.0 * severity * scale * share
+    m: Any, severity: Severity, key: Key[Array, ""], ports: Ports
+  ) -> tuple[Any, Float[Array, " obs"]]:
+    return m, ports.obs + 2.0 * severity * scale * jnp.clip(
+      (ports.since + 1) / DRIFT_STEPS, 0.0, 1.0
+    )
 
-  return _sensor("drift", env, change)
+  return signal("drift", env, "obs", change)
 
 
 def scale(env: Any) -> Fault:
@@ -90,9 +65,7 @@ def scale(env: Any) -> Fault:
   channel. Owns `obs`. Not visible to: a channel that reads 0. Source: calibration faults (a reading
   times a constant) of Danesh and Fern 2021; the range is this project's own choice.
   """
-  return _sensor(
-    "scale", env, lambda m, severity, key, ports, _: (m, ports.obs * (1.0 - 0.9 * severity))
-  )
+  return steady("scale", env, "obs", lambda x, severity, key: x * (1.0 - 0.9 * severity))
 
 
 def noise(env: Any) -> Fault:
@@ -102,13 +75,12 @@ def noise(env: Any) -> Fault:
   raw units. Target: a group of channels (drawn), all, or one channel. Owns `obs`.
   Source: realworldrl_suite.
   """
-  return _sensor(
+  scale = scales(env)
+  return steady(
     "noise",
     env,
-    lambda m, severity, key, ports, scale: (
-      m,
-      ports.obs + severity * scale * jax.random.normal(key, scale.shape),
-    ),
+    "obs",
+    lambda x, severity, key: x + severity * scale * jax.random.normal(key, scale.shape),
   )
 
 
@@ -122,14 +94,7 @@ def dropout(env: Any) -> Fault:
   Target: a group of channels (drawn), all, or one channel. Owns `obs`. Not visible to: a channel
   that reads 0. Source: dropped observations of realworldrl_suite.
   """
-  return _sensor(
-    "dropout",
-    env,
-    lambda m, severity, key, ports, _: (
-      m,
-      jnp.where(jax.random.uniform(key, ports.obs.shape) < 0.5 * severity, 0.0, ports.obs),
-    ),
-  )
+  return loss("dropout", env, "obs")
 
 
 def freeze(env: Any) -> Fault:
@@ -146,23 +111,24 @@ def freeze(env: Any) -> Fault:
   """
 
   def change(
-    held: jax.Array, severity: jax.Array, key: jax.Array, ports: Ports, _: jax.Array
-  ) -> tuple[jax.Array, jax.Array]:
+    held: Float[Array, " obs"], severity: Severity, key: Key[Array, ""], ports: Ports
+  ) -> tuple[Float[Array, " obs"], Float[Array, " obs"]]:
     hold = (jax.random.uniform(key, ports.obs.shape) < severity) & ~jnp.asarray(ports.first)
     value = jnp.where(hold, held, ports.obs)
     return value, value
 
-  return _sensor("freeze", env, change, jnp.zeros(len(env.spec.obs)))
+  return signal("freeze", env, "obs", change, jnp.zeros(len(env.spec.obs)))
 
 
-def _burst(left: jax.Array, severity: jax.Array, key: jax.Array, ports: Ports) -> jax.Array:
-  """Control steps (O,) that the burst of each channel still lasts, this one included; a new one may
+def _burst(
+  left: Int[Array, " obs"], severity: Severity, key: Key[Array, ""], ports: Ports
+) -> Int[Array, " obs"]:
+  """Control steps that the burst of each channel still lasts, this one included; a new one may
   begin where none is under way.
   """
   begins = jax.random.uniform(key, ports.obs.shape) < BURST[0] * severity
-  lasts = jnp.maximum(
-    1, jnp.ceil(BURST[1] * severity - 1e-4).astype(jnp.int32)
-  )  # 0.1, 0.5, 1 are 1, 5, 10, whatever float32 makes of them
+  # 0.1, 0.5, 1 are 1, 5, 10, whatever float32 makes of them
+  lasts = jnp.maximum(1, jnp.ceil(BURST[1] * severity - 1e-4).astype(jnp.int32))
   left = jnp.where(ports.first, 0, left)
   return jnp.where(left > 0, left, jnp.where(begins, lasts, 0))
 
@@ -178,12 +144,12 @@ def dropout_burst(env: Any) -> Fault:
   """
 
   def change(
-    left: jax.Array, severity: jax.Array, key: jax.Array, ports: Ports, _: jax.Array
-  ) -> tuple[jax.Array, jax.Array]:
+    left: Int[Array, " obs"], severity: Severity, key: Key[Array, ""], ports: Ports
+  ) -> tuple[Int[Array, " obs"], Float[Array, " obs"]]:
     left = _burst(left, severity, key, ports)
     return jnp.maximum(left - 1, 0), jnp.where(left > 0, 0.0, ports.obs)
 
-  return _sensor("dropout_burst", env, change, jnp.zeros(len(env.spec.obs), jnp.int32))
+  return signal("dropout_burst", env, "obs", change, jnp.zeros(len(env.spec.obs), jnp.int32))
 
 
 def freeze_burst(env: Any) -> Fault:
@@ -197,23 +163,18 @@ def freeze_burst(env: Any) -> Fault:
   """
 
   def change(
-    memory: tuple[jax.Array, jax.Array],
-    severity: jax.Array,
-    key: jax.Array,
+    memory: tuple[Int[Array, " obs"], Float[Array, " obs"]],
+    severity: Severity,
+    key: Key[Array, ""],
     ports: Ports,
-    _: jax.Array,
-  ) -> tuple[tuple[jax.Array, jax.Array], jax.Array]:
+  ) -> tuple[tuple[Int[Array, " obs"], Float[Array, " obs"]], Float[Array, " obs"]]:
     left, held = memory
     left = jnp.where(jnp.asarray(ports.first), 0, _burst(left, severity, key, ports))
     value = jnp.where(left > 0, held, ports.obs)
     return (jnp.maximum(left - 1, 0), value), value
 
-  return _sensor(
-    "freeze_burst",
-    env,
-    change,
-    (jnp.zeros(len(env.spec.obs), jnp.int32), jnp.zeros(len(env.spec.obs))),
-  )
+  size = len(env.spec.obs)
+  return signal("freeze_burst", env, "obs", change, (jnp.zeros(size, jnp.int32), jnp.zeros(size)))
 
 
 def delay(env: Any) -> Fault:
@@ -223,24 +184,7 @@ def delay(env: Any) -> Fault:
   hard. Target: a group of channels (drawn), all, or one channel. Owns `obs`. Memory: the last 9
   readings; an episode's start fills it with its first reading. Source: realworldrl_suite.
   """
-
-  def change(
-    line: jax.Array, severity: jax.Array, key: jax.Array, ports: Ports, _: jax.Array
-  ) -> tuple[jax.Array, jax.Array]:
-    line = jnp.where(
-      ports.first,
-      jnp.broadcast_to(ports.obs, line.shape),
-      jnp.concatenate([ports.obs[None], line[:-1]]),
-    )
-    return line, line[jnp.ceil(MOST_DELAY * severity).astype(jnp.int32)]
-
-  return _sensor(
-    "delay",
-    env,
-    change,
-    jnp.zeros((MOST_DELAY + 1, len(env.spec.obs))),
-    "an older reading may be nearer to the present one",
-  )
+  return late("delay", env, "obs", "an older reading may be nearer to the present one")
 
 
 def lidar_loss(env: Any) -> Fault:
@@ -261,13 +205,8 @@ def lidar_loss(env: Any) -> Fault:
     [[hit.index(i) / len(hit) if i in hit else 2.0 for i in range(size)] for _, hit in beams]
   )  # place in the sector, 2 outside it
   high = jnp.asarray([v.high if v.high < 1e9 else 0.0 for v in env.spec.obs], jnp.float32)
-
-  def act(
-    place: jax.Array, memory: Any, severity: jax.Array, key: jax.Array, ports: Ports
-  ) -> tuple[Any, dict[str, jax.Array]]:
-    return memory, {"obs": jnp.where(place < severity, high, ports.obs)}
-
-  return fault("lidar_loss", env, ("obs",), [name for name, _ in beams], act, rows=rank)
+  blind = lambda value, place, severity: jnp.where(place < severity, high, value)
+  return leafwise("lidar_loss", env, {"obs": blind}, (tuple(name for name, _ in beams), rank, None))
 
 
 SENSOR = {

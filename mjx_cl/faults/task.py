@@ -1,19 +1,12 @@
 """Changes of the task itself: what is rewarded, what is asked for."""
 
-from __future__ import annotations
+from typing import Any
 
-from typing import TYPE_CHECKING, Any
-
-import jax.numpy as jnp
 import numpy as np
 
 from mjx_cl.errors import UserError
-from mjx_cl.faults.base import Fault, fault
-
-if TYPE_CHECKING:
-  import jax
-
-  from mjx_cl.faults.base import Ports
+from mjx_cl.faults.base import Fault
+from mjx_cl.faults.kinds import leafwise, scaled
 
 
 def reward_weight(env: Any) -> Fault:
@@ -25,28 +18,21 @@ def reward_weight(env: Any) -> Fault:
   """
   terms = getattr(env, "reward_terms", ())
   weights = np.asarray(env.model.task.get("reward_weights", ()))
-  counted = [
-    i for i, w in enumerate(weights[: len(terms)]) if w != 0
-  ]  # a term that counts nothing has nothing to lose
-  if not counted:
+  # a term that counts nothing has nothing to lose
+  counted = np.flatnonzero(weights[: len(terms)])
+  if not counted.size:
     raise UserError(
       f"fault 'reward_weight' needs a reward of weighted terms, which robot {env.spec.name!r} "
       "does not have"
     )
 
-  def act(
-    hit: jax.Array, memory: Any, severity: jax.Array, key: jax.Array, ports: Ports
-  ) -> tuple[Any, dict[str, jax.Array]]:
-    value = ports.model.task["reward_weights"]
-    return memory, {"task.reward_weights": jnp.where(hit, value * (1.0 - severity), value)}
-
-  return fault(
+  names, mask = tuple(terms[i] for i in counted), np.eye(len(weights), dtype=bool)[counted]
+  return scaled(
     "reward_weight",
     env,
-    ("task.reward_weights",),
-    [terms[i] for i in counted],
-    act,
-    rows=np.eye(len(weights), dtype=bool)[counted],
+    "task.reward_weights",
+    lambda severity: 1.0 - severity,
+    (names, mask, None),
   )
 
 
@@ -57,13 +43,12 @@ def command_range(env: Any) -> Fault:
   Severity: 1 doubles it [m/s, rad/s]. Target: command, the only one. Owns `task.command_range`.
   Source: none; fault and range are this project's own choice.
   """
-
-  def act(
-    target: jax.Array, memory: Any, severity: jax.Array, key: jax.Array, ports: Ports
-  ) -> tuple[Any, dict[str, jax.Array]]:
-    return memory, {"task.command_range": ports.model.task["command_range"] * (1.0 + severity)}
-
-  return fault("command_range", env, ("task.command_range",), ("command",), act)
+  return leafwise(
+    "command_range",
+    env,
+    {"task.command_range": lambda value, _, severity: value * (1.0 + severity)},
+    (("command",), None, None),
+  )
 
 
 TASK = {"reward_weight": reward_weight, "command_range": command_range}

@@ -1,19 +1,12 @@
 """The reality gap of the car, item by item, as ordinary faults of `car_real`."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax.numpy as jnp
+from jaxtyping import Array, Int, Key
 
 from mjx_cl.errors import UserError
-from mjx_cl.faults.base import Fault, fault
-from mjx_cl.types import Model
-
-if TYPE_CHECKING:
-  import jax
-
-  from mjx_cl.faults.base import Ports
+from mjx_cl.faults.base import Fault, Ports, Severity, Values, fault, read
 
 
 def gap(env: Any) -> Fault:
@@ -34,15 +27,14 @@ def gap(env: Any) -> Fault:
   leaves = tuple(sorted({item.leaf for item in items.values()}))
 
   def act(
-    target: jax.Array, memory: Any, severity: jax.Array, key: jax.Array, ports: Ports
-  ) -> tuple[Any, dict[str, jax.Array]]:
-    model = Model(dict(ports.model.mj), dict(ports.model.task), ports.model.force)
+    target: Int[Array, ""], memory: Any, severity: Severity, key: Key[Array, ""], ports: Ports
+  ) -> Values:
+    model = ports.model
     for i, name in enumerate(items):
       model = env.widen(
         model, name, jnp.where((target == i) | (target == len(items)), severity, 0.0)
       )
-    value = lambda leaf: getattr(model, leaf.split(".")[0])[leaf.split(".")[1]]
-    return memory, {leaf: value(leaf) for leaf in leaves}
+    return memory, {leaf: read(Ports(model), leaf) for leaf in leaves}
 
   return fault("gap", env, leaves, tuple(items) + ("all",), act, drawn=len(items))
 

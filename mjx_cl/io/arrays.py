@@ -1,7 +1,5 @@
 """Arrays in .npz files: a tree's leaves by the names of their paths; nothing is ever unpickled."""
 
-from __future__ import annotations
-
 import os
 import zipfile
 import zlib
@@ -31,17 +29,17 @@ def write(path: str | os.PathLike, arrays: Mapping[str, object], small: bool = F
     small: whether they are compressed.
 
   Raises:
-    FileError where the disk is full or the folder refuses; what was at `path` stays.
+    FileError: the disk is full or the folder refuses; what was at `path` stays.
   """
-  save = np.savez_compressed if small else np.savez
-  folders.atomic(path, lambda file: save(file, **{k: np.asarray(v) for k, v in arrays.items()}))  # type: ignore[arg-type]
+  save: Any = np.savez_compressed if small else np.savez
+  folders.atomic(path, lambda file: save(file, **{k: np.asarray(v) for k, v in arrays.items()}))
 
 
 def read(path: str | os.PathLike) -> dict[str, np.ndarray]:
   """Arrays of an .npz file by name.
 
   Raises:
-    FileError where there is none or it is broken.
+    FileError: there is none or it is broken.
   """
   try:
     with np.load(path, allow_pickle=False) as z:

@@ -1,7 +1,5 @@
 """Checkpoints by orbax: written to a temporary name and renamed, two kept, never unpickled."""
 
-from __future__ import annotations
-
 import itertools
 import logging
 import pathlib
@@ -62,13 +60,11 @@ def _fault_of_the_machine(error: BaseException | None) -> bool:
   A file or folder that is missing, or one in the place of the other, is damage. TensorStore and XLA
   raise other kinds and say it in words.
   """
+  damage = (FileNotFoundError, NotADirectoryError, IsADirectoryError)
+  words = r"RESOURCE_EXHAUSTED|PERMISSION_DENIED|OS error (?!2\b|20\b|21\b)\d"
   while error is not None:
-    if isinstance(error, MemoryError) or (
-      isinstance(error, OSError)
-      and not isinstance(error, (FileNotFoundError, NotADirectoryError, IsADirectoryError))
-    ):
-      return True
-    if re.search(r"RESOURCE_EXHAUSTED|PERMISSION_DENIED|OS error (?!2\b|20\b|21\b)\d", str(error)):
+    of_machine = isinstance(error, (MemoryError, OSError)) and not isinstance(error, damage)
+    if of_machine or re.search(words, str(error)):
       return True
     error = error.__cause__ or error.__context__
   return False
@@ -76,9 +72,8 @@ def _fault_of_the_machine(error: BaseException | None) -> bool:
 
 def _first_line(error: BaseException) -> str:
   why = (str(error).splitlines() or [""])[0] or type(error).__name__
-  return (
-    "its contents are not those that are asked for" if "truth value" in why else why
-  )  # orbax fails to print how two trees differ
+  # orbax fails to print how two trees differ
+  return "its contents are not those that are asked for" if "truth value" in why else why
 
 
 def _dtypes(tree: Any) -> dict[tuple[str, ...], np.dtype]:
@@ -97,10 +92,12 @@ class Checkpoints:
 
   def __init__(self, folder: pathlib.Path | str) -> None:
     self.folder = pathlib.Path(folder).absolute()
-    options = ocp.CheckpointManagerOptions(
-      max_to_keep=2, enable_async_checkpointing=False, create=True
+    self._manager = ocp.CheckpointManager(
+      self.folder,
+      options=ocp.CheckpointManagerOptions(
+        max_to_keep=2, enable_async_checkpointing=False, create=True
+      ),
     )
-    self._manager = ocp.CheckpointManager(self.folder, options=options)
 
   def latest(self) -> int | None:
     """Number of the newest complete checkpoint."""
@@ -130,8 +127,8 @@ class Checkpoints:
     the broken one is set aside: its folder is renamed to NUMBER.broken.
 
     Raises:
-      FileError where none can be read, or it is of another size or dtype, or reading failed for
-      another reason than the file (memory, open files, ...); nothing is set aside then.
+      FileError: none can be read, or it is of another size or dtype, or reading failed for
+        another reason than the file (memory, open files, ...); nothing is set aside then.
     """
     packed, numbers, first = pack(like), sorted(self._manager.all_steps(), reverse=True), None
     if not numbers:
@@ -161,8 +158,7 @@ class Checkpoints:
         f"{first}; it is broken, of another version or of another kind of device: --overwrite "
         "begins anew"
       ) from None
-    same = jax.tree.map(lambda a, b: a.shape == b.shape, out["tree"], packed)
-    if not all(jax.tree.leaves(same)):
+    if not jax.tree.all(jax.tree.map(lambda a, b: a.shape == b.shape, out["tree"], packed)):
       raise FileError(f"checkpoint {number} in {self.folder} belongs to another size or robot")
     for path, dtype in _dtypes(packed).items():
       if stored.get(path, dtype) != dtype:  # orbax has cast it
@@ -187,13 +183,10 @@ class Checkpoints:
     exists); the numbers are free again.
     """
     for number in numbers:
-      names = itertools.chain(
-        [f"{number}.broken"], (f"{number}.broken-{k}" for k in itertools.count(2))
-      )
+      names = itertools.chain(["broken"], (f"broken-{k}" for k in itertools.count(2)))
+      places = (self.folder / f"{number}.{name}" for name in names)
       try:
-        (self.folder / str(number)).rename(
-          next(path for path in (self.folder / name for name in names) if not path.exists())
-        )
+        (self.folder / str(number)).rename(next(path for path in places if not path.exists()))
       except OSError as e:
         raise FileError(
           f"cannot set the broken checkpoint {number} in {self.folder} aside: {e}"

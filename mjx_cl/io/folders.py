@@ -1,7 +1,6 @@
 """Folders of results: files written whole or not at all, and who may write where."""
 
-from __future__ import annotations
-
+import itertools
 import os
 import pathlib
 import re
@@ -16,7 +15,7 @@ def atomic(path: str | os.PathLike, write: Callable[[BinaryIO], object]) -> None
   """Calls `write` with a binary file of a temporary name and renames it to `path`.
 
   Raises:
-    FileError where the disk is full or the folder refuses; what was at `path` stays.
+    FileError: the disk is full or the folder refuses; what was at `path` stays.
   """
   path = pathlib.Path(path)
   tmp = path.with_name(path.name + ".tmp")
@@ -39,15 +38,21 @@ def make(folder: pathlib.Path) -> None:
     raise FileError(f"cannot make {folder}: {e.strerror}") from None
 
 
-def probe(out: str | os.PathLike) -> None:
-  """Makes the folder `out` and refuses one that cannot be written to, before what goes there is
-  computed. An empty folder that was not there is left.
-  """
+def _folder(out: str | os.PathLike) -> pathlib.Path:
+  """`out`, which is refused where it can be no folder."""
   if not str(out):
     raise UserError("--out is a folder; got an empty name")
   out = pathlib.Path(out)
   if out.exists() and not out.is_dir():
     raise UserError(f"--out {out} is a file")
+  return out
+
+
+def probe(out: str | os.PathLike) -> None:
+  """Makes the folder `out` and refuses one that cannot be written to, before what goes there is
+  computed. An empty folder that was not there is left.
+  """
+  out = _folder(out)
   try:
     out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryFile(dir=out):
@@ -106,14 +111,18 @@ def _foreign(out: pathlib.Path) -> str | None:
     "work/checkpoints": r"\d.*",
     "checkpoints": r"\d.*",
   }
-  strange = [name for name in (*RESULTS, "agent") if (out / name).exists()]
-  strange += [
-    f"{folder}/{path.name}"
-    for folder, known in left.items()
-    for path in sorted((out / folder).glob("*"))
-    if not re.fullmatch(known, path.name)
-  ]
-  return strange[0] if strange else None
+  return next(
+    itertools.chain(
+      (name for name in (*RESULTS, "agent") if (out / name).exists()),
+      (
+        f"{folder}/{path.name}"
+        for folder, known in left.items()
+        for path in sorted((out / folder).glob("*"))
+        if not re.fullmatch(known, path.name)
+      ),
+    ),
+    None,
+  )
 
 
 def claim_folder(
@@ -125,13 +134,9 @@ def claim_folder(
     `new`, `resume` or `done` (a finished run that --resume finds).
 
   Raises:
-    UserError where the folder holds another run and neither --resume nor --overwrite was given.
+    UserError: the folder holds another run and neither --resume nor --overwrite was given.
   """
-  if not str(out):
-    raise UserError("--out is a folder; got an empty name")
-  out = pathlib.Path(out)
-  if out.exists() and not out.is_dir():
-    raise UserError(f"--out {out} is a file")
+  out = _folder(out)
   if resume and overwrite:
     raise UserError("--resume and --overwrite exclude each other")
   if (out / "config.json").exists():

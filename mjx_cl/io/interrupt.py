@@ -4,15 +4,13 @@ Raising inside a physics callback would surface as an XLA error with half a chun
 the chunk end, the state be saved, and then KeyboardInterrupt be raised.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal
 import sys
 import threading
 import types
-from typing import Any, TextIO
+from typing import Any, Self, TextIO
 
 
 class Lasting:
@@ -73,7 +71,7 @@ class Interruptible:
     self._set = False
     self._old: dict[int, Any] = {}
 
-  def __enter__(self) -> Interruptible:
+  def __enter__(self) -> Self:
     if threading.current_thread() is threading.main_thread():
       for number in (signal.SIGINT, signal.SIGTERM):
         self._old[number] = signal.signal(number, self._handle)
@@ -90,9 +88,7 @@ class Interruptible:
       Interruptible.again = True
       raise KeyboardInterrupt
     self._set = True
-    with contextlib.suppress(
-      RuntimeError
-    ):  # the stream itself was being written to: a reentrant call
+    with contextlib.suppress(RuntimeError):  # the stream is being written to: a reentrant call
       print("mjx-cl: stopping after this chunk, saving", file=sys.stderr, flush=True)
 
   def check(self) -> None:

@@ -2,8 +2,6 @@
 to.
 """
 
-from __future__ import annotations
-
 import pathlib
 
 import jax
@@ -22,10 +20,6 @@ NO_LIMIT = 2**60
 def resident(need: int) -> int:
   """Bytes that a process grows to whose weights and replays take `need` bytes; of an accelerator's
   memory those alone.
-
-  By runs of ten walkers an arm, native physics: 2.7 GiB of 0.8 to the end (two arms, 25,000 steps);
-  up to a third save, traces still short, 2.5 of 0.8 (one arm, 64,000) and 3.6 of 1.6 (two). Nothing
-  larger was measured.
   """
   return PROCESS + int(GROWTH * need) if jax.default_backend() == "cpu" else need
 
@@ -36,41 +30,40 @@ def container(
   """Bytes that the memory limit of this process's control group (a container, a batch job) leaves,
   never below 0; None where there is no limit.
 
-    min over the group and those it lies in of  limit - (used - page cache that can be reclaimed at
-    once)
+    min over the group and those it lies in of
+      limit - (used - page cache that can be reclaimed at once)
 
   Args:
     root: where control groups are mounted: version 2 itself, version 1 with its memory controller
       in `memory`.
     groups: file that names the groups of this process, a line `number:controllers:path` each.
   """
+  names = _text(groups).splitlines()
   versions = (
-    (pathlib.Path(root), "0::", "memory.max", "memory.current", ("inactive_file",)),
+    (
+      pathlib.Path(root),
+      next((x.partition("0::")[2] for x in names if "0::" in x), ""),
+      ("memory.max", "memory.current"),
+      ("inactive_file",),
+    ),
     (
       pathlib.Path(root, "memory"),
-      ":memory:",
-      "memory.limit_in_bytes",
-      "memory.usage_in_bytes",
+      next((x.partition(":memory:")[2] for x in names if ":memory:" in x), ""),
+      ("memory.limit_in_bytes", "memory.usage_in_bytes"),
       ("total_inactive_file", "inactive_file"),
     ),
   )
   left = []
-  for mount, sign, limit, used, caches in versions:
-    own = [
-      line.partition(sign)[2].strip("/") for line in _text(groups).splitlines() if sign in line
-    ]
-    path = mount.joinpath(*own[:1])
+  for mount, own, files, caches in versions:
+    path = mount / own.strip("/")
     for folder in {mount, *(p for p in (path, *path.parents) if p.is_relative_to(mount))}:
-      most, now = _text(folder / limit).strip(), _text(folder / used).strip()
-      if (
-        not (most.isdigit() and now.isdigit()) or int(most) >= NO_LIMIT
-      ):  # `max`, and files that are not there
-        continue
-      stat = dict(
-        line.split()[:2] for line in _text(folder / "memory.stat").splitlines() if " " in line
-      )
-      cache = next((int(stat[name]) for name in caches if name in stat), 0)
-      left.append(max(0, int(most) - max(0, int(now) - cache)))
+      most, now = (_text(folder / name).strip() for name in files)
+      # `max`, and files that are not there, are no numbers
+      if most.isdigit() and now.isdigit() and int(most) < NO_LIMIT:
+        lines = (line.split() for line in _text(folder / "memory.stat").splitlines())
+        stat = {words[0]: words[1] for words in lines if len(words) > 1}
+        cache = next((int(stat[name]) for name in caches if name in stat), 0)
+        left.append(max(0, int(most) - max(0, int(now) - cache)))
   return min(left, default=None)
 
 

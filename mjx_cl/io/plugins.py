@@ -2,8 +2,6 @@
 of a file, path/to/file.py:Name.
 """
 
-from __future__ import annotations
-
 import collections
 import functools
 import hashlib
@@ -26,13 +24,14 @@ class Registry(collections.UserDict):
   is what stands there, see `find`; the table does not list it.
 
   Args:
-    group: of entry points, such as `mjx_cl.faults`. kind: what a message calls a member. own: the
-      members that are there already.
+    group: of entry points, such as `mjx_cl.faults`.
+    kind: what a message calls a member.
+    own: the members that are there already.
 
   Raises:
-    PluginError at each use, one line: a name that is taken, a module that cannot be loaded, a
-      member that cannot be called; UserError for a name
-    with a colon where nothing of that name is.
+    PluginError: at each use, one line: a name that is taken, a module that cannot be loaded, a
+      member that cannot be called.
+    UserError: a name with a colon where nothing of that name is.
   """
 
   def __init__(self, group: str, kind: str, own: dict[str, Any]) -> None:
@@ -140,11 +139,11 @@ def _file(path: pathlib.Path, changed: int) -> types.ModuleType:
   """The module in a file, loaded once for each time that it was written (`changed` [ns])."""
   # under a name of its own: two files of one name must not be taken for each other
   inner = f"mjx_cl_file_{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:12]}"
-  spec = importlib.util.spec_from_file_location(inner, path)
-  module = importlib.util.module_from_spec(spec)  # type: ignore[arg-type]
+  spec: Any = importlib.util.spec_from_file_location(inner, path)
+  module = importlib.util.module_from_spec(spec)
   sys.modules[inner] = module  # dataclasses look their module up there
   try:
-    spec.loader.exec_module(module)  # type: ignore[union-attr]
+    spec.loader.exec_module(module)
   except BaseException:
     del sys.modules[inner]
     raise

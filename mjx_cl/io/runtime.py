@@ -1,56 +1,40 @@
-"""What must be decided before JAX starts its first backend: XLA flags, compile cache, dispatch.
+"""What must be decided before JAX starts its first backend: devices, compile cache, dispatch.
 
 Importing this module is free of JAX; `setup()` is idempotent. The command line calls it before a
 command that computes; a program of one's own calls it before its first use of JAX: `from mjx_cl
 import runtime; runtime.setup()`.
 """
 
-from __future__ import annotations
-
+import ctypes
 import functools
 import importlib.metadata
 import os
 import pathlib
 import platform
+import re
 import subprocess
 import sys
 from typing import Any
 
-# jaxlib 0.10.x can lose a completion event in MJX programs and hang for ever (256 robots under
-# vmap: most runs); this flag cures it.
-_SCHEDULER_FLAG = "--xla_cpu_enable_concurrency_optimized_scheduler"
 _DEVICES_FLAG = "--xla_force_host_platform_device_count"
 _done = False
-
-
-def xla_flags(jaxlib_version: str, user_flags: str) -> str:
-  """XLA_FLAGS for this jaxlib: the user's own flags, unchanged and in order, plus what the version
-  needs.
-
-  Args:
-    jaxlib_version: e.g. "0.9.2".
-    user_flags: the present value of the environment variable, possibly empty.
-
-  Returns:
-    The value to set. A flag that the user has set to anything is left as the user set it.
-  """
-  major, minor = (int(x) for x in jaxlib_version.split(".")[:2])
-  flags = user_flags.split()
-  if (major, minor) == (0, 10) and not any(f.split("=")[0] == _SCHEDULER_FLAG for f in flags):
-    flags.append(f"{_SCHEDULER_FLAG}=false")
-  return " ".join(flags)
 
 
 def cache_dir() -> pathlib.Path:
   """Folder of JAX's persistent compile cache: `MJX_CL_CACHE`, else the platform's user cache
   folder.
   """
-  override = os.environ.get("MJX_CL_CACHE")
-  if override:
-    return pathlib.Path(override).expanduser()
-  if sys.platform == "darwin":
-    return pathlib.Path("~/Library/Caches/mjx_cl").expanduser()
-  return pathlib.Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")).expanduser() / "mjx_cl"
+  mac = "~/Library/Caches" if sys.platform == "darwin" else None
+  users = mac or os.environ.get("XDG_CACHE_HOME", "~/.cache")
+  return pathlib.Path(os.environ.get("MJX_CL_CACHE") or f"{users}/mjx_cl").expanduser()
+
+
+def _glibc(function: str, *arguments: int) -> bool:
+  """What a function of glibc's allocator answers; False where there is no glibc."""
+  try:
+    return sys.platform == "linux" and bool(getattr(ctypes.CDLL(None), function)(*arguments))
+  except (AttributeError, OSError):
+    return False
 
 
 def keep_memory() -> bool:
@@ -58,39 +42,24 @@ def keep_memory() -> bool:
   where that was done.
 
   XLA takes the scratch memory of a program anew at each call. Through mmap every call then touches
-  fresh pages, and the page faults make a size1m update 1.2 to 1.4 times as long (row `update
-  size1m, default allocator / kept memory` of results/dreamer_update_xeon.json and
-  results/dreamer_update.json). The process stays as large as its peak. A user who has set
-  MALLOC_MMAP_MAX_, MALLOC_MMAP_THRESHOLD_ or MALLOC_TRIM_THRESHOLD_ is left alone; so is every
-  other C library.
+  fresh pages, and updates take longer for the page faults. The process stays as large as its peak.
+  A user who has set MALLOC_MMAP_MAX_, MALLOC_MMAP_THRESHOLD_ or MALLOC_TRIM_THRESHOLD_ is left
+  alone; so is every other C library.
   """
-  if sys.platform != "linux" or any(
-    name in os.environ
-    for name in ("MALLOC_MMAP_MAX_", "MALLOC_MMAP_THRESHOLD_", "MALLOC_TRIM_THRESHOLD_")
-  ):
-    return False
-  import ctypes
-
   trim_threshold, mmap_max = -1, -4  # M_TRIM_THRESHOLD and M_MMAP_MAX of malloc.h
-  try:
-    mallopt = ctypes.CDLL(None).mallopt
-  except (AttributeError, OSError):  # no glibc
-    return False
-  return bool(mallopt(mmap_max, 0) and mallopt(trim_threshold, -1))
+  own = ("MALLOC_MMAP_MAX_", "MALLOC_MMAP_THRESHOLD_", "MALLOC_TRIM_THRESHOLD_")
+  return (
+    os.environ.keys().isdisjoint(own)
+    and _glibc("mallopt", mmap_max, 0)
+    and _glibc("mallopt", trim_threshold, -1)
+  )
 
 
 def give_back() -> bool:
   """Hands free memory back to the system where glibc keeps it (`keep_memory`); True where that was
   done. For after what needed much and comes seldom: a save.
   """
-  if sys.platform != "linux":
-    return False
-  import ctypes
-
-  try:
-    return bool(ctypes.CDLL(None).malloc_trim(0))
-  except (AttributeError, OSError):  # no glibc
-    return False
+  return _glibc("malloc_trim", 0)
 
 
 def cores() -> list[int]:
@@ -110,13 +79,11 @@ def sharing(seeds: int) -> int:
 
 
 def seeds_by() -> str:
-  """How the seeds of a device share a program of updates (train.make_learn): `map`, one after
+  """How the seeds of a device share a program of updates (learn.make_learn): `map`, one after
   another, on a CPU; `vmap`, all in each product, elsewhere.
 
-  On CPUs both take the same time: ten seeds of size1m 0.96 and 0.95 of ten times one
-  (results/dreamer_update_xeon.json), 0.98 and 1.02 (results/dreamer_update.json); `map` needs the
-  scratch memory of one seed. A GPU is not filled by one seed; there `vmap` is a choice by
-  expectation, not measured.
+  On CPUs both take the same time, and `map` needs the scratch memory of one seed. A GPU is not
+  filled by one seed.
   """
   import jax
 
@@ -124,8 +91,8 @@ def seeds_by() -> str:
 
 
 def setup(devices: int = 1) -> None:
-  """Sets XLA flags, the compile cache, the allocator and synchronous CPU dispatch. Call before the
-  first JAX computation.
+  """Sets the count of devices, the compile cache, the allocator and synchronous CPU dispatch. Call
+  before the first JAX computation.
 
   Args:
     devices: as how many devices a CPU counts. A program that is sharded over them keeps the cores
@@ -143,15 +110,13 @@ def setup(devices: int = 1) -> None:
     return
   _done = True
   keep_memory()
-  flags = xla_flags(importlib.metadata.version("jaxlib"), os.environ.get("XLA_FLAGS", ""))
-  if flags:
-    os.environ["XLA_FLAGS"] = flags
   # XLA's loader prints an error of a page for each cached program over two pseudo features of the
   # compiler that no CPU reports
   os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
   import jax
 
-  if devices > 1 and _DEVICES_FLAG not in flags and "JAX_NUM_CPU_DEVICES" not in os.environ:
+  theirs = _DEVICES_FLAG in os.environ.get("XLA_FLAGS", "") or "JAX_NUM_CPU_DEVICES" in os.environ
+  if devices > 1 and not theirs:
     jax.config.update("jax_num_cpu_devices", devices)
   jax.config.update("jax_cpu_enable_async_dispatch", False)
   folder = cache_dir()
@@ -160,9 +125,8 @@ def setup(devices: int = 1) -> None:
   except OSError:
     return  # a read-only home: everything works, programs are compiled anew
   jax.config.update("jax_compilation_cache_dir", str(folder))
-  jax.config.update(
-    "jax_persistent_cache_min_compile_time_secs", 0.0
-  )  # a run starts with hundreds of small ones, some 30 ms each
+  # a run starts with hundreds of small programs
+  jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
   jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
 
 
@@ -195,14 +159,8 @@ PACKAGES = (
 
 def provenance() -> dict[str, Any]:
   """Versions, machine and commit of this process, for config.json; cores: those that it may use."""
-  versions: dict[str, str | None] = {}
-  for name in PACKAGES:
-    try:
-      versions[name] = importlib.metadata.version(name)
-    except importlib.metadata.PackageNotFoundError:
-      versions[name] = None
   return {
-    "versions": versions,
+    "versions": {name: _version(name) for name in PACKAGES},
     "python": platform.python_version(),
     "git_commit": _commit(),
     "machine": {
@@ -212,6 +170,13 @@ def provenance() -> dict[str, Any]:
       "arch": platform.machine(),
     },
   }
+
+
+def _version(package: str) -> str | None:
+  try:
+    return importlib.metadata.version(package)
+  except importlib.metadata.PackageNotFoundError:
+    return None
 
 
 @functools.cache
@@ -233,10 +198,6 @@ def _commit() -> str | None:
 
 
 def _cpu() -> str:
-  try:
-    for line in pathlib.Path("/proc/cpuinfo").read_text().splitlines():
-      if line.startswith("model name"):
-        return line.split(":", 1)[1].strip()
-  except OSError:
-    pass
-  return platform.processor() or platform.machine()
+  info = pathlib.Path("/proc/cpuinfo")
+  named = re.search(r"^model name.*?:(.*)", info.read_text() if info.exists() else "", re.M)
+  return named[1].strip() if named else platform.processor() or platform.machine()

@@ -1,14 +1,12 @@
 """Result files: JSON, Parquet, suites in TOML, and SQL views over tables."""
 
-from __future__ import annotations
-
 import json
 import os
 import pathlib
 import re
 import tomllib
 from collections.abc import Mapping
-from typing import Any, NoReturn
+from typing import Any
 
 import duckdb
 import numpy as np
@@ -36,7 +34,7 @@ def read_json(path: os.PathLike | str) -> dict[str, Any]:
   """The JSON object in a file.
 
   Raises:
-    FileError where there is none, or something else.
+    FileError: there is none, or something else.
   """
   try:
     value = json.loads(pathlib.Path(path).read_text())
@@ -62,30 +60,26 @@ def write_table(
   """Writes columns (name -> 1-D array or list) as Parquet; nan becomes null.
 
   Args:
-    codec, level: of the compression. split: float columns whose bytes are stored apart, which suits
-      rounded values; integers then as differences.
+    path: of the file.
+    columns: name -> values.
+    nan_is_null: whether a nan becomes null.
+    codec: of the compression.
+    level: of the compression.
+    split: float columns whose bytes are stored apart, which suits rounded values; integers then as
+      differences.
   """
   arrays = {}
-  how = (
-    {
-      "use_dictionary": False,
-      "column_encoding": {name: "BYTE_STREAM_SPLIT" for name in split}
-      | {name: "DELTA_BINARY_PACKED" for name in ("stream", "step") if name in columns},
-    }
-    if split
-    else {}
-  )
   for name, values in columns.items():
     floating = isinstance(values, np.ndarray) and values.dtype.kind == "f"
     arrays[name] = pyarrow.array(
       values, mask=np.isnan(values) if floating and nan_is_null else None
     )
-  folders.atomic(
-    path,
-    lambda file: pyarrow.parquet.write_table(
-      pyarrow.table(arrays), file, compression=codec, compression_level=level, **how
-    ),
-  )
+  how: dict[str, Any] = {"compression": codec, "compression_level": level}
+  if split:
+    differences = {name: "DELTA_BINARY_PACKED" for name in ("stream", "step") if name in columns}
+    apart = dict.fromkeys(split, "BYTE_STREAM_SPLIT")
+    how |= {"use_dictionary": False, "column_encoding": apart | differences}
+  folders.atomic(path, lambda file: pyarrow.parquet.write_table(pyarrow.table(arrays), file, **how))
 
 
 def write_arrow(path: os.PathLike | str, table: pyarrow.Table) -> None:
@@ -100,7 +94,8 @@ def read_suite(name: str, folder: pathlib.Path) -> tuple[pathlib.Path, dict]:
   """A suite by name, FOLDER/NAME.toml, or from a TOML file: (its path, its tables).
 
   Raises:
-    UserError for an unknown name; FileError for a file that is no TOML.
+    UserError: an unknown name.
+    FileError: a file that is no TOML.
   """
   path = folder / f"{name}.toml"
   if not path.exists():
@@ -122,7 +117,7 @@ def read_arrow(path: os.PathLike | str) -> pyarrow.Table:
   """A Parquet file as a pyarrow Table.
 
   Raises:
-    FileError for a file that cannot be read.
+    FileError: a file that cannot be read.
   """
   try:
     return pyarrow.parquet.read_table(path)
@@ -138,15 +133,9 @@ def read_table(path: os.PathLike | str) -> dict[str, np.ndarray]:
   return {name: table[name].to_numpy() for name in table.column_names}
 
 
-def read_plain(path: os.PathLike | str) -> dict[str, list]:
-  """Columns of a Parquet file as Python values, null as None."""
-  return read_arrow(path).to_pydict()
-
-
 def read_rows(path: os.PathLike | str) -> list[dict[str, Any]]:
   """Rows of a Parquet file as Python values by column, null as None."""
-  columns = read_plain(path)
-  return [dict(zip(columns, cells)) for cells in zip(*columns.values())]
+  return read_arrow(path).to_pylist()
 
 
 def views(folders: tuple[str, ...] = (), results: str = "results") -> dict[str, pathlib.Path]:
@@ -159,16 +148,15 @@ def views(folders: tuple[str, ...] = (), results: str = "results") -> dict[str, 
     results: the folder whose name is left out; it need not exist.
 
   Raises:
-    UserError where a folder is missing, nothing is found, or two tables would have one name.
+    UserError: a folder is missing, nothing is found, or two tables would have one name.
   """
-  found: dict[str, pathlib.Path]
-  at: Any
-  found, seen = {}, set()
+  found: dict[str, pathlib.Path] = {}
+  seen = set()
   for folder in (results, *folders):
-    name, sign, at = folder.partition("=")
+    name, sign, where = folder.partition("=")
     if not sign or pathlib.Path(folder).is_dir():
-      name, at = "", folder
-    at = pathlib.Path(at)
+      name, where = "", folder
+    at = pathlib.Path(where)
     if not at.is_dir():
       if folder == results:
         continue
@@ -181,12 +169,11 @@ def views(folders: tuple[str, ...] = (), results: str = "results") -> dict[str, 
       name = "_".join(
         re.sub(r"\W+", "_", part) for part in (*first, *file.relative_to(at).with_suffix("").parts)
       ).lower()
-      name = "_" + name if name[:1].isdigit() else name  # no SQL word begins with a digit
+      name = "_" * name[:1].isdigit() + name  # no SQL word begins with a digit
       if name in found:
         raise UserError(
           f"{found[name]} and {file} would both be the view {name}; give one of their folders "
-          "a name by --in NAME=DIR, "
-          "or rename a file"
+          "a name by --in NAME=DIR, or rename a file"
         )
       found[name] = file
   if not found:
@@ -211,9 +198,10 @@ def query(
     (names of columns, rows).
   """
   if not isinstance(tables, dict):
-    tables = {file.stem: file for file in sorted(pathlib.Path(tables).glob("*.parquet"))} or _none(
-      tables
-    )
+    folder = tables
+    tables = {file.stem: file for file in sorted(pathlib.Path(folder).glob("*.parquet"))}
+    if not tables:
+      raise UserError(f"no .parquet file in {folder}")
   names = ", ".join(list(tables)[:20]) + (
     f" and {len(tables) - 20} more, listed by mjx-cl query without SQL" if len(tables) > 20 else ""
   )
@@ -242,12 +230,9 @@ def query(
       return ["view", "rows", "columns"], [_describe(db, name) for name in tables]
     try:
       statements = duckdb.extract_statements(sql)
-      for statement in statements:
-        if statement.type != duckdb.StatementType.SELECT:
-          kind = {"MULTI": "PIVOT without a list of values"}.get(
-            statement.type.name, statement.type.name
-          )
-          raise UserError(f"query: results are read-only, and {kind} is no select; views: {names}")
+      for kind in (x.type.name for x in statements if x.type != duckdb.StatementType.SELECT):
+        said = "PIVOT without a list of values" if kind == "MULTI" else kind
+        raise UserError(f"query: results are read-only, and {said} is no select; views: {names}")
       if not statements:
         raise UserError(f"query: no statement; views: {names}")
       for statement in statements:
@@ -257,15 +242,8 @@ def query(
       raise UserError(f"query: {str(e).splitlines()[0]}; views: {names}") from None
 
 
-def _none(folder: os.PathLike | str) -> NoReturn:
-  raise UserError(f"no .parquet file in {folder}")
-
-
 def _describe(db: duckdb.DuckDBPyConnection, name: str) -> tuple[str, int, str]:
   quoted = '"' + name.replace('"', '""') + '"'
-  rows = db.execute(f"select count(*) from {quoted}").fetchone()[0]  # type: ignore[index]
-  return (
-    name,
-    rows,
-    ", ".join(c[0] for c in db.execute(f"select * from {quoted} limit 0").description),
-  )
+  [(rows,)] = db.execute(f"select count(*) from {quoted}").fetchall()
+  columns = db.execute(f"select * from {quoted} limit 0").description
+  return name, rows, ", ".join(column[0] for column in columns)

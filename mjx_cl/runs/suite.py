@@ -699,7 +699,7 @@ def collect(
     if part.name not in known:
       known[part.name] = scores(out / part.name)
     value["entries"][part.name] = summary | {"scores": known[part.name]}
-    rows = tables.read_plain(out / part.name / "runs.parquet")
+    rows = tables.read_arrow(out / part.name / "runs.parquet").to_pydict()
     count = len(next(iter(rows.values())))
     before = len(next(iter(columns.values()))) if columns else 0
     for name, cells in (

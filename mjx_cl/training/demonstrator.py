@@ -4,8 +4,6 @@ Used by the `cpu` preset alone (the agent's card names it); `paper` does without
 is kept as a plain .npz of its layers, so that using one needs no brax.
 """
 
-from __future__ import annotations
-
 import argparse
 import functools
 import json
@@ -14,7 +12,8 @@ import pathlib
 import sys
 import time
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,16 +23,15 @@ from mjx_cl import envs
 from mjx_cl.envs.adapters import brax_env, brax_module
 from mjx_cl.errors import FileError
 from mjx_cl.io import arrays, folders, runtime
-
-if TYPE_CHECKING:
-  from mjx_cl.types import EnvState, Model, Step
+from mjx_cl.types import EnvState, Model, Step
 
 
 class Policy(NamedTuple):
   """Deterministic tanh policy: observation normaliser and dense layers.
 
   Attributes:
-    mean, std: float32 (obs,), running statistics of the observation.
+    mean: float32 (obs,), of the observation, running.
+    std: float32 (obs,), alike.
     layers: ((kernel (in, out), bias (out,)), ...); the last layer gives means and raw deviations,
       (2 * act,).
   """
@@ -43,9 +41,7 @@ class Policy(NamedTuple):
   layers: tuple[tuple[jax.Array, jax.Array], ...]
 
   def __call__(self, obs: jax.Array) -> jax.Array:
-    """Action in [-1, 1], float32 (..., act), for obs (..., obs): the mode of the
-    squashed normal.
-    """
+    """Action in [-1, 1], (..., act), for obs (..., obs): the mode of the squashed normal."""
     x = (obs - self.mean) / self.std
     for kernel, bias in self.layers[:-1]:
       x = jax.nn.swish(x @ kernel + bias)
@@ -73,12 +69,10 @@ def load(path: str | os.PathLike) -> Policy:
 
 
 def _to_policy(params: Any) -> Policy:
-  normalizer, network = params[0], params[1]
-  layers = network["params"]
-  names = sorted(layers, key=lambda n: int(n.rsplit("_", 1)[1]))
-  return Policy(
-    normalizer.mean, normalizer.std, tuple((layers[n]["kernel"], layers[n]["bias"]) for n in names)
-  )
+  normalizer, network, *_ = params
+  numbered = sorted(network["params"].items(), key=lambda item: int(item[0].rsplit("_", 1)[1]))
+  layers = tuple((layer["kernel"], layer["bias"]) for _, layer in numbered)
+  return Policy(normalizer.mean, normalizer.std, layers)
 
 
 class Shaped:
@@ -89,8 +83,9 @@ class Shaped:
   by falling.
 
   Args:
-    env: robot with `reward_terms`. weights: term -> factor on its weight. bonus: added to every
-      step's reward.
+    env: robot with `reward_terms`.
+    weights: term -> factor on its weight.
+    bonus: added to every step's reward.
   """
 
   def __init__(self, env: Any, weights: dict[str, float], bonus: float) -> None:
@@ -110,8 +105,6 @@ class Shaped:
 
 
 PPO = {"discounting": 0.995, "entropy_cost": 1e-2, "reward_scaling": 10.0}
-
-
 SIZES = {
   "num_envs": 256,
   "unroll_length": 30,
@@ -126,14 +119,10 @@ HIDDEN = (128,) * 3  # policy and value
 
 def networks_of(env: Any) -> Any:
   """Brax's networks, of the shapes that `train` trains for `env`."""
-  running_statistics, networks = (
-    brax_module("training.acme.running_statistics"),
-    brax_module("training.agents.ppo.networks"),
-  )
-  return networks.make_ppo_networks(
+  return brax_module("training.agents.ppo.networks").make_ppo_networks(
     len(env.spec.obs),
     len(env.spec.act),
-    running_statistics.normalize,
+    brax_module("training.acme.running_statistics").normalize,
     policy_hidden_layer_sizes=HIDDEN,
     value_hidden_layer_sizes=HIDDEN,
   )
@@ -141,13 +130,10 @@ def networks_of(env: Any) -> Any:
 
 def _template(env: Any) -> tuple[Any, Any, Any]:
   """(normaliser, policy, value) of those networks: what `latest.msgpack` is read into."""
-  running_statistics, specs = (
-    brax_module("training.acme.running_statistics"),
-    brax_module("training.acme.specs"),
-  )
   net, key = networks_of(env), jax.random.key(0)
+  seen = brax_module("training.acme.specs").Array((len(env.spec.obs),), jnp.float32)
   return (
-    running_statistics.init_state(specs.Array((len(env.spec.obs),), jnp.float32)),
+    brax_module("training.acme.running_statistics").init_state(seen),
     net.policy_network.init(key),
     net.value_network.init(key),
   )
@@ -166,6 +152,49 @@ def latest(out: pathlib.Path, env: Any) -> tuple[list[dict], tuple]:
       f"{out} holds no demonstrator training that can go on ({e}); leave out --resume to start one"
     ) from None
   return [row for row in rows if row["step"] <= done], params
+
+
+@dataclass
+class Journal:
+  """What a training leaves in its folder: curve.json, the latest networks, a policy each time that
+  it is evaluated.
+
+  Attributes:
+    out: the folder.
+    rows: {step, return, seconds} so far.
+    progress: called with each new row.
+    done: steps of an earlier training that this one goes on from.
+    start: when it began, by time.monotonic() [s].
+  """
+
+  out: pathlib.Path
+  rows: list[dict]
+  progress: Callable[[dict[str, Any]], object]
+  done: int
+  start: float
+
+  def evaluated(self, step: int, metrics: Mapping[str, Any]) -> None:
+    """Brax's `progress_fn`."""
+    if self.done and not int(step):
+      return  # the evaluation that the earlier run ended with
+    self.rows.append(
+      {
+        "step": self.done + int(step),
+        "return": float(metrics["eval/episode_reward"]),
+        "seconds": round(time.monotonic() - self.start, 1),
+      }
+    )
+    text = json.dumps(self.rows, indent=1)
+    folders.atomic(self.out / "curve.json", lambda file: file.write(text.encode()))
+    self.progress(self.rows[-1])
+
+  def kept(self, step: int, _: object, params: Any) -> None:
+    """Brax's `policy_params_fn`."""
+    from flax import serialization
+
+    save(self.out / f"policy_{self.done + int(step):09d}.npz", _to_policy(params))
+    state = serialization.to_bytes(jax.device_get(params))
+    folders.atomic(self.out / "latest.msgpack", lambda file: file.write(state))
 
 
 def train(
@@ -194,54 +223,28 @@ def train(
     shaped reward where there is one.
   """
   own = getattr(env, "demonstration", {})
-  adapter = brax_env(Shaped(env, own["weights"], own["bonus"]) if "bonus" in own else env)
-  networks, ppo = (
-    brax_module("training.agents.ppo.networks"),
-    brax_module("training.agents.ppo.train"),
-  )
   out = pathlib.Path(out)
   out.mkdir(parents=True, exist_ok=True)
   rows, params = latest(out, env) if resume else ([], None)
   done, before = (rows[-1]["step"], rows[-1]["seconds"]) if rows else (0, 0.0)
   if done >= steps:
     return rows
-  start = time.monotonic() - before
-
-  def on_progress(step: int, metrics: Mapping[str, Any]) -> None:
-    if done and not int(step):
-      return  # the evaluation that the earlier run ended with
-    rows.append(
-      {
-        "step": done + int(step),
-        "return": float(metrics["eval/episode_reward"]),
-        "seconds": round(time.monotonic() - start, 1),
-      }
-    )
-    text = json.dumps(rows, indent=1)
-    folders.atomic(out / "curve.json", lambda file: file.write(text.encode()))
-    progress(rows[-1])
-
-  def on_params(step: int, _: object, params: Any) -> None:
-    from flax import serialization
-
-    save(out / f"policy_{done + int(step):09d}.npz", _to_policy(params))
-    state = serialization.to_bytes(jax.device_get(params))
-    folders.atomic(out / "latest.msgpack", lambda file: file.write(state))
-
-  ppo.train(
-    environment=adapter,
+  journal = Journal(out, rows, progress, done, time.monotonic() - before)
+  brax_module("training.agents.ppo.train").train(
+    environment=brax_env(Shaped(env, own["weights"], own["bonus"]) if "bonus" in own else env),
     num_timesteps=steps - done,
     episode_length=env.spec.episode_steps,
     seed=seed + done,
     num_evals=evals,
     restore_params=params,
-    progress_fn=on_progress,
-    policy_params_fn=on_params,
-    max_devices_per_host=1
-    if jax.default_backend() == "cpu"
-    else None,  # several seeds: runtime.setup
+    progress_fn=journal.evaluated,
+    policy_params_fn=journal.kept,
+    # a CPU counts as several devices where several seeds train, see runtime.setup
+    max_devices_per_host=1 if jax.default_backend() == "cpu" else None,
     network_factory=functools.partial(
-      networks.make_ppo_networks, policy_hidden_layer_sizes=HIDDEN, value_hidden_layer_sizes=HIDDEN
+      brax_module("training.agents.ppo.networks").make_ppo_networks,
+      policy_hidden_layer_sizes=HIDDEN,
+      value_hidden_layer_sizes=HIDDEN,
     ),
     **SIZES | PPO | own.get("ppo", {}) | settings,
   )

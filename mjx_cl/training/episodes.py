@@ -1,7 +1,5 @@
 """Returns of episodes, summed on the host from the rows of chunks as the scan gives them."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from mjx_cl.rollout.scan import Row
@@ -43,11 +41,9 @@ class Returns:
 
   def add(self, rows: Row) -> list[tuple[tuple[int, int], float]]:
     """Rows of a chunk -> [((group, member), return)] of the episodes that ended in it."""
-    reward, done = np.asarray(rows.reward), np.asarray(rows.terminated | rows.truncated)
-    ended = []
-    for r, d in zip(reward, done):
-      self.sums += r
-      for at in zip(*np.nonzero(d)):
-        ended.append((tuple(int(i) for i in at), float(self.sums[at])))
-        self.sums[at] = 0.0
-    return ended  # type: ignore[return-value]
+    ended: list[tuple[tuple[int, int], float]] = []
+    for reward, done in zip(np.asarray(rows.reward), np.asarray(rows.terminated | rows.truncated)):
+      self.sums += reward
+      ended += [((g, m), float(self.sums[g, m])) for g, m in np.argwhere(done).tolist()]
+      self.sums[done] = 0.0
+    return ended

@@ -1,7 +1,5 @@
 """Return of an agent on the healthy robot, and the task's own figures."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import jax
@@ -28,18 +26,17 @@ def evaluate(
   Returns:
     episodes, return_mean, return_iqm, return_ci (95 % bootstrap of the IQM over episodes of this
     one agent), returns, terminations, and where the environment measures them (env.measure), means
-    over the steps of all episodes with their bootstrap interval over episodes:
-    quadruped: velocity_error_m_s, fall_rate; car: mean_speed_m_s, collision_rate, and
-      reference_speed_m_s, the reference driver's mean speed from the
-    same starts on the same tracks.
+    over the steps of all episodes with their bootstrap interval over episodes: of the quadruped
+    velocity_error_m_s and fall_rate; of the car mean_speed_m_s, collision_rate and
+    reference_speed_m_s, the reference driver's mean speed from the same starts on the same tracks.
   """
   fault = faults.make("none", env)
   rollout = Rollout(env, agent, fault, repeat, deterministic)
   total, steps, sums, ended = live(env, rollout, agent, params, episodes, seed)
-  counted = lambda name, hits: {
-    name: int(hits.sum()),
-    name + "_ci": (p := intervals.wilson(int(hits.sum()), episodes)) and [x * episodes for x in p],
-  }
+
+  def counted(name: str, hits: np.ndarray) -> dict[str, Any]:
+    share = intervals.wilson(int(hits.sum()), episodes)
+    return {name: int(hits.sum()), name + "_ci": share and [x * episodes for x in share]}
 
   def per_step(name: str, value: np.ndarray, steps: np.ndarray) -> dict[str, Any]:
     """A mean over steps, so that a short episode counts for little; drawn anew by episodes."""

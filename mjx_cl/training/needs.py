@@ -1,7 +1,5 @@
 """Bytes that a training or a run will hold, known before anything is allocated."""
 
-from __future__ import annotations
-
 import bisect
 import functools
 from collections.abc import Callable
@@ -66,24 +64,27 @@ def check(
   """Refuses what would not fit.
 
   Args:
-    records: of one seed. seeds: of all. what: the setting that bounds the records, and the records
-      that a value of it needs (never fewer for more).
+    size: of the learner.
+    obs_size: variables of an observation.
+    act_size: variables of an action.
+    records: of one seed.
+    seeds: of all.
+    what: the setting that bounds the records, and the records that a value of it needs (never fewer
+      for more).
+    bins: classes of the two-hot heads.
     shards: devices over which the seeds are spread.
 
   Raises:
-    UserError that names the number which would fit.
+    UserError: names the number which would fit.
   """
   setting, records_of = what
   wanted = need(size, obs_size, act_size, records, bins)
   here = -(-seeds // shards)
-  space, grown = (
-    int(memory.MARGIN * memory.free()) + memory.held(),
-    memory.resident(wanted.total(here, here if runtime.seeds_by() == "vmap" else 1)),
-  )
+  space = int(memory.MARGIN * memory.free()) + memory.held()
+  grown = memory.resident(wanted.total(here, here if runtime.seeds_by() == "vmap" else 1))
   if grown > space:
-    each = (
-      memory.resident(2**40) - memory.resident(0)
-    ) / 2**40  # bytes of the process for a byte of replay
+    # bytes of the process for a byte of replay
+    each = (memory.resident(2**40) - memory.resident(0)) / 2**40
     room = int((space - grown) / each + here * wanted.replay) // here // wanted.record
     left = bisect.bisect_right(range(1, 2 + max(0, room)), room, key=records_of)
     fits = (
@@ -93,8 +94,7 @@ def check(
     )
     raise UserError(
       f"{seeds} seeds of {size} with {records:,} records each need {grown / 2**30:.1f} GiB a "
-      f"device, {space / 2**30:.1f} GiB may be "
-      f"used; {fits}"
+      f"device, {space / 2**30:.1f} GiB may be used; {fits}"
     )
   return wanted
 
@@ -107,7 +107,6 @@ def table(obs_size: int = 24, act_size: int = 6) -> dict[str, str]:
     trained, _ = parameters(size, obs_size, act_size)
     out[size] = (
       f"{trained:,} parameters; {n.weights / 1e6:,.1f} MB a seed with slow critic and moments; "
-      f"{n.record:,} bytes a record, "
-      f"{n.replay / 1e9:,.1f} GB a million of them"
+      f"{n.record:,} bytes a record, {n.replay / 1e9:,.1f} GB a million of them"
     )
   return out

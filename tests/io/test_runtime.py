@@ -1,8 +1,7 @@
-"""XLA flags, compile cache, and the two programs that have been known to hang: many MJX robots,
+"""Devices, compile cache, and the two programs that have been known to hang: many MJX robots,
 many physics callbacks.
 """
 
-import importlib.metadata
 import os
 import pathlib
 import subprocess
@@ -16,35 +15,6 @@ import pytest
 from mjx_cl.cli import app
 from mjx_cl.io import runtime
 from mjx_cl.physics.native import Native
-
-SCHEDULER = "--xla_cpu_enable_concurrency_optimized_scheduler"
-
-
-@pytest.mark.parametrize("version", ["0.9.2", "0.11", "0.11.0", "0.12.1", "1.10.0"])
-def test_flags_of_sound_versions_are_the_users(version):
-  assert runtime.xla_flags(version, "") == ""
-  assert runtime.xla_flags(version, "--xla_a=1  --xla_b=2") == "--xla_a=1 --xla_b=2"
-
-
-@pytest.mark.parametrize("version", ["0.10.0", "0.10.2", "0.10.2.dev20260101"])
-def test_flags_of_0_10_cure_the_hang_and_keep_the_users(version):
-  assert runtime.xla_flags(version, "") == f"{SCHEDULER}=false"
-  assert (
-    runtime.xla_flags(version, "--xla_b=2 --xla_a=1") == f"--xla_b=2 --xla_a=1 {SCHEDULER}=false"
-  )
-
-
-@pytest.mark.parametrize("own", [f"{SCHEDULER}=true", f"{SCHEDULER}=false", SCHEDULER])
-def test_the_users_own_value_wins(own):
-  assert runtime.xla_flags("0.10.2", f"--xla_a=1 {own}") == f"--xla_a=1 {own}"
-
-
-def test_a_flag_with_the_same_beginning_is_another_flag():
-  assert runtime.xla_flags("0.10.2", f"{SCHEDULER}_other=1").split() == [
-    f"{SCHEDULER}_other=1",
-    f"{SCHEDULER}=false",
-  ]
-
 
 FAULTS_OF_REUSE = """
 import resource
@@ -125,15 +95,12 @@ def test_setup_has_set_cache_and_dispatch():
 
 
 def test_setup_is_idempotent(monkeypatch):
-  monkeypatch.setattr(importlib.metadata, "version", lambda name: {"jaxlib": "0.10.2"}[name])
+  calls = []
+  monkeypatch.setattr(runtime, "keep_memory", lambda: calls.append(1))
   monkeypatch.setattr(runtime, "_done", False)
-  monkeypatch.setenv("XLA_FLAGS", "--xla_a=1")
   for _ in range(2):
     runtime.setup()
-    assert os.environ["XLA_FLAGS"] == f"--xla_a=1 {SCHEDULER}=false"
-  monkeypatch.setenv("XLA_FLAGS", "--xla_a=2")
-  runtime.setup()
-  assert os.environ["XLA_FLAGS"] == "--xla_a=2"  # a second call touches nothing
+  assert calls == [1]  # a second call touches nothing
 
 
 def test_setup_survives_a_home_that_cannot_be_written(monkeypatch, tmp_path):
@@ -143,7 +110,6 @@ def test_setup_survives_a_home_that_cannot_be_written(monkeypatch, tmp_path):
   monkeypatch.setenv(
     "MJX_CL_CACHE", str(tmp_path / "file" / "cache")
   )  # a folder below a file: OSError for every user, root too
-  monkeypatch.setenv("XLA_FLAGS", "")
   runtime.setup()
   assert jax.config.jax_compilation_cache_dir == before
 

@@ -25,7 +25,7 @@ from mjx_cl.dreamer import replay as replay_lib
 from mjx_cl.dreamer.agent import CAUSES
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.io import checkpoints
-from mjx_cl.training import agents, demonstrator
+from mjx_cl.training import agents, demonstrator, files, premises
 from mjx_cl.training import trainer as train
 
 ENVS, BATCH, LENGTH = 4, 4, 8
@@ -316,7 +316,7 @@ def test_the_demonstrator_of_a_resumed_training_may_be_named_in_another_way(tmp_
       }
     )
   )
-  same = lambda name: train.check_same(tmp_path, env, dreamer, config, 0, 1, name, None)
+  same = lambda name: files.check_same(tmp_path, env, dreamer, config, 0, 1, name, None)
   monkeypatch.chdir(tmp_path / "b")
   assert same("../a/policy.npz") == same("elsewhere/policy.npz") == config.updates
   for name in ("policy.npz", None, "elsewhere/other.npz", "reference", "ppo"):
@@ -363,7 +363,7 @@ def test_resume_without_a_checkpoint(short_walker, tmp_path):
   """
   with pytest.raises(FileError, match="no checkpoint"):
     make_trainer(short_walker, tmp_path).resume()
-  build = lambda resume: train.build(
+  build = lambda resume: files.build(
     short_walker,
     DREAMER,
     TrainConfig(envs=4, updates=8, ratio=1.0, capacity=128),
@@ -656,9 +656,9 @@ def test_the_reference_driver_is_a_demonstrator(short_walker):
   env = envs.make("car")
   state, obs = env.init(env.model, jax.random.key(0))
   stream = types.SimpleNamespace(env=state, obs=obs)
-  np.testing.assert_array_equal(train.expert(env, "reference")(stream), env.reference(state))
+  np.testing.assert_array_equal(premises.expert(env, "reference")(stream), env.reference(state))
   with pytest.raises(UserError, match="'walker' has no reference driver"):
-    train.expert(short_walker, "reference")
+    premises.expert(short_walker, "reference")
 
 
 def test_cloning_ends_when_the_agent_is_good_enough(short_walker, tmp_path, expert_path):
@@ -710,38 +710,6 @@ def test_returns_are_sums_over_episodes(short_walker, tmp_path):
   np.testing.assert_allclose(
     row["return"], np.mean([np.sum(r) for e in episodes for r in e]), rtol=1e-5
   )  # float32 rewards
-
-
-def test_training_episodes_may_be_cut(short_walker, tmp_path):
-  """Episodes end after `episode` steps, the robot's own length stands."""
-  trainer = train.Trainer(
-    short_walker,
-    DREAMER,
-    TrainConfig(envs=ENVS, updates=10_000, ratio=1.0, capacity=256, episode=8),
-    tmp_path,
-  )
-  counted(trainer)
-  row = trainer.step()
-  data = jax.tree.map(lambda x: np.asarray(x)[0], trainer.state.replay.data)
-  for e in range(ENVS):
-    assert np.all(
-      np.diff(np.flatnonzero(data.last[e])) == 9
-    )  # 8 decisions and the final observation
-  assert row["episodes"] == ENVS * (train.CHUNK // 8)
-  quiet = np.concatenate(
-    [
-      r[:9]
-      for e in range(ENVS)
-      for r in np.split(data.reward[e], np.flatnonzero(data.last[e]) + 1)[:-1]
-    ]
-  ).sum()
-  np.testing.assert_allclose(row["return"], quiet / row["episodes"], rtol=1e-5)  # float32 rewards
-  np.testing.assert_allclose(
-    row["reward"], quiet / (ENVS * train.CHUNK), rtol=1e-5
-  )  # 64 steps are eight whole episodes
-  assert trainer.env.spec.episode_steps == short_walker.spec.episode_steps == 12
-  with pytest.raises(UserError, match="episode must be above 0"):
-    TrainConfig(episode=0)
 
 
 def test_an_end_for_good_costs_until_the_last_updates(short_walker, tmp_path):
@@ -798,7 +766,7 @@ def test_penalties_are_eased_and_nothing_else(short_walker, tmp_path):
   np.testing.assert_array_equal(robot.model.task["reward_weights"], before)
   for name, leaf in robot.model.task.items():
     assert name == "reward_weights" or at.model.task[name] is leaf
-  assert train.eased(robot, 1.0) is robot
+  assert premises.eased(robot, 1.0) is robot
   with pytest.raises(UserError, match="has no negative weights"):
     make_trainer(short_walker, tmp_path, penalties=0.5)
 

@@ -4,8 +4,6 @@ it was made, what it scores).
 Names of the shipped ones are the folders beside this file; a path to any such folder works too.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import os
@@ -28,8 +26,13 @@ _HALF = "|bfloat16"  # suffix of a moment that is stored as the upper half of it
 
 
 class Trained(NamedTuple):
-  """A loaded agent. `card` is its JSON card: env, preset, repeat, dreamer (config), command,
-  returns, ...
+  """A loaded agent.
+
+  Attributes:
+    agent: its programs.
+    train: weights, moments and counters.
+    card: its JSON card: env, preset, repeat, dreamer (config), command, returns, ...
+    path: the folder.
   """
 
   agent: Agent
@@ -51,11 +54,11 @@ def save(folder: os.PathLike | str, train: TrainState, card: dict) -> None:
   folder.mkdir(parents=True, exist_ok=True)
   stored = {}
   for name, leaf in arrays.named(train).items():
-    leaf = np.asarray(leaf)
-    if name.startswith(".opt") and leaf.dtype == np.float32 and leaf.ndim:
-      stored[name + _HALF] = leaf.astype(ml_dtypes.bfloat16).view(np.uint16)
+    value = np.asarray(leaf)
+    if name.startswith(".opt") and value.dtype == np.float32 and value.ndim:
+      stored[name + _HALF] = value.astype(ml_dtypes.bfloat16).view(np.uint16)
     else:
-      stored[name] = leaf
+      stored[name] = value
   arrays.write(folder / "agent.npz", stored, small=True)
   text = json.dumps(card, indent=1) + "\n"
   folders.atomic(folder / "card.json", lambda file: file.write(text.encode()))
@@ -93,13 +96,16 @@ def load(
   Args:
     path: folder or shipped name; None: the shipped agent named as the environment, or as the one
       whose agents it takes.
-    env_name: robot that it must fit. agents_of: robot with the same observation, action and reward,
-      whose agents fit too; None: that of the class registered under this name.
+    env_name: robot that it must fit.
+    obs_size: variables of its observation.
+    act_size: variables of its action.
+    agents_of: robot with the same observation, action and reward, whose agents fit too; None: that
+      of the class registered under this name.
     departures: fields of its DreamerConfig to go on with otherwise, e.g. lr; None: its own.
 
   Raises:
-    UserError for an agent of another robot or an unknown name; FileError for a broken or foreign
-    file.
+    UserError: an agent of another robot or an unknown name.
+    FileError: a broken or foreign file.
   """
   related = agents_of or getattr(envs.ENVS.data.get(env_name), "agents_of", None)
   name = path or (related if related and env_name not in shipped() else env_name)
@@ -118,10 +124,9 @@ def load(
     raise FileError(f"{folder / 'card.json'} is not an agent's card: {e}") from None
   if card.get("env") not in (env_name, related):
     raise UserError(f"agent {name!r} was trained on {card.get('env')!r}, not on {env_name!r}")
-  config = dataclasses.replace(
-    config, warmup=0
-  )  # whatever goes on from here does so at full learning rate
-  config = dataclasses.replace(config, **{k: v for k, v in departures.items() if v is not None})
+  # whatever goes on from here does so at full learning rate
+  other = {"warmup": 0} | {k: v for k, v in departures.items() if v is not None}
+  config = dataclasses.replace(config, **other)
   agent = Agent(config, obs_size, act_size)
   like = jax.eval_shape(agent.init, jax.random.key(0))
   stored, leaves = arrays.read(folder / "agent.npz"), []
