@@ -23,7 +23,7 @@ CHANNELS = ("opr", "rpr")  # the declared channel: what the single-residual dete
 LIMITS = tuple(
   k + end for k in ("information_nats_per_step", "optimal_delay_steps") for end in ("", "_ci")
 )
-START, HIGHEST, HALVINGS = 40.0, 1e9, 14  # of the search for a threshold [nats]
+START, HALVINGS = 40.0, 14  # of the search for a threshold [nats]
 
 
 class OracleRun(NamedTuple):
@@ -111,16 +111,9 @@ def _thresholds(ratio: np.ndarray, lanes: int, count_from: int, most: float) -> 
     .sum((0, 2))
     <= most
   )
-  low, high = np.zeros(faults), np.full(faults, START)
-  while (
-    not (enough := few(high)).all() and high.max() < HIGHEST
-  ):  # heavy tails: a single healthy step can carry hundreds of nats
-    low, high = np.where(enough, low, high), np.where(enough, high, high * 8)
-  for _ in range(HALVINGS):
-    middle = (low + high) / 2
-    enough = few(middle)
-    low, high = np.where(enough, low, middle), np.where(enough, middle, high)
-  return high
+  # heavy tails: a single healthy step can carry hundreds of nats
+  low, high, _ = healthy.reach(few, np.zeros(faults), np.full(faults, START))
+  return healthy.halve(few, low, high, lambda a, b: (a + b) / 2, HALVINGS)
 
 
 def _ratios(x: np.ndarray, fits: list[limits.Parameters]) -> np.ndarray:

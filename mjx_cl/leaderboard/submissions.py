@@ -4,7 +4,6 @@ scores, and for the latter the streams as plain files.
 
 from __future__ import annotations
 
-import math
 import pathlib
 import time
 from collections.abc import Callable
@@ -26,8 +25,7 @@ if TYPE_CHECKING:
   from collections.abc import Collection
   from typing import Any
 
-HIGHEST = 1e9  # threshold of a plain class above which its alarms must have ceased
-FINE = 1.01  # a plain class's threshold is found to this factor
+HALVINGS = 8  # of a factor of 8, until less than a hundredth is left
 TRIED = (
   2  # streams of each kind on which a plain class must give the same answers when they are cut off
 )
@@ -244,30 +242,24 @@ def from_host(
 
 
 def _least(alarms: Callable[[float], int], target: float, what: str) -> float:
-  """The least value above 0 with at most `target` alarms, to the factor FINE."""
-  high = 1.0
-  while alarms(high) > target:
-    if high > HIGHEST:
-      raise UserError(
-        f"{what}: at {high:g} there are still more than the {target:.0f} alarms asked for; "
-        "larger values must mean fewer alarms"
-      )
-    high *= 8
-  if high == 1.0:
-    while high > 1 / HIGHEST and alarms(high / 8) <= target:
-      high /= 8
-    if high <= 1 / HIGHEST:
-      raise UserError(
-        f"{what}: even at {high:g} there are no more than the {target:.0f} alarms asked for, "
-        "so that nothing is calibrated; its values lie above 0, larger ones mean "
-        "fewer alarms: give the class a setting of that kind (a score that is negative wants "
-        "an offset)"
-      )
-  low = high / 8
-  while high / low > FINE:
-    middle = math.sqrt(low * high)
-    low, high = (low, middle) if alarms(middle) <= target else (middle, high)
-  return high
+  """The least value above 0 with at most `target` alarms, to a hundredth of itself."""
+  few = lambda value: np.asarray(alarms(float(value)) <= target)
+  low, high, enough = thresholds.reach(few, np.asarray(1 / 8), np.asarray(1.0))
+  if not enough:
+    raise UserError(
+      f"{what}: at {float(high):g} there are still more than the {target:.0f} alarms asked for; "
+      "larger values must mean fewer alarms"
+    )
+  while high <= 1 and high > 1 / thresholds.HIGHEST and few(low):
+    low, high = low / 8, low
+  if high <= 1 / thresholds.HIGHEST:
+    raise UserError(
+      f"{what}: even at {float(high):g} there are no more than the {target:.0f} alarms asked for, "
+      "so that nothing is calibrated; its values lie above 0, larger ones mean "
+      "fewer alarms: give the class a setting of that kind (a score that is negative wants "
+      "an offset)"
+    )
+  return float(thresholds.halve(few, low, high, lambda a, b: np.sqrt(a * b), HALVINGS))
 
 
 def export(
