@@ -22,7 +22,7 @@ runtime.setup()
 import jax  # noqa: E402
 
 from mjx_cl import envs, faults  # noqa: E402
-from mjx_cl.leaderboard.record import Behind  # noqa: E402
+from mjx_cl.leaderboard.lives import Behind  # noqa: E402
 from mjx_cl.rollout.frozen import stream_keys  # noqa: E402
 from mjx_cl.rollout.monitor import Monitor  # noqa: E402
 from mjx_cl.rollout.scan import Rollout, nest, start  # noqa: E402

@@ -20,13 +20,21 @@ from mjx_cl import detectors
 from mjx_cl.detectors.python_class import HostDetector
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.io import tables as store
-from mjx_cl.leaderboard import oracle, record, streams, submissions, sweep
+from mjx_cl.leaderboard import (
+  lives,
+  oracle,
+  set_tables,
+  streams,
+  submissions,
+  sweep,
+)
 from mjx_cl.leaderboard import score as leaderboard
+from mjx_cl.leaderboard.suite import Suite
 from mjx_cl.scoring import limits, metrics
 from mjx_cl.scoring import thresholds as healthy
 
 CONTROL_S, SEEDS = 0.5, 4
-SUITE = streams.Suite(
+SUITE = Suite(
   "small",
   400.0,
   200,
@@ -91,24 +99,24 @@ def make_set(folder, suite=SUITE, robots=("walker",)):
     parts = {}
     for split in ("score", "tune"):
       seeds = suite.numbers(split)
-      who = [record.Lane(s) for s in seeds for _ in range(suite.nominal[split])]
+      who = [lives.Lane(s) for s in seeds for _ in range(suite.nominal[split])]
       parts[split, "nominal"] = (
         who,
         np.zeros(len(who), int),
         part(who, np.zeros(len(who), int), suite.nominal["steps"], 1),
       )
-      who = record.lanes(suite, robot, split)
+      who = lives.lanes(suite, robot, split)
       onsets = np.asarray([suite.onset_of(lane.seed) for lane in who])
       parts[split, "fault"] = (
         who,
         onsets,
         part(who, onsets, int(onsets.max()) + suite.after(CONTROL_S), 2),
       )
-    details[robot], fresh = record._write(
+    details[robot], fresh = set_tables.write(
       suite, folder, robot, parts, len(rows), CONTROL_S, ",".join(f"g{k}" for k in range(8))
     )
     rows += fresh
-  record.write_meta(folder, rows + record.healthy_probes(rows))
+  set_tables.write_meta(folder, rows + set_tables.healthy_probes(rows))
   store.write_json(
     folder / "config.json",
     {"version": streams.VERSION, "suite": dataclasses.asdict(suite), "details": details},
@@ -389,9 +397,9 @@ def test_a_longer_stream_changes_no_number(small, tmp_path, monkeypatch):
   """Rows, curves and pages are the same where each fault stream goes on for another 150 steps, in
   which whatever alarms is to count nowhere.
   """
-  kept, after = SUITE.after(CONTROL_S), streams.Suite.after
+  kept, after = SUITE.after(CONTROL_S), Suite.after
   with monkeypatch.context() as patch:
-    patch.setattr(streams.Suite, "after", lambda self, control_s: after(self, control_s) + 150)
+    patch.setattr(Suite, "after", lambda self, control_s: after(self, control_s) + 150)
     make_set(tmp_path / "longer")
   longer = streams.StreamSet(tmp_path / "longer")
   assert (

@@ -19,7 +19,7 @@ from mjx_cl.errors import FileError, UserError
 from mjx_cl.io import tables
 from mjx_cl.io.plugins import Registry
 from mjx_cl.leaderboard import oracle as oracles
-from mjx_cl.leaderboard import record, streams, submissions
+from mjx_cl.leaderboard import record, rounding, streams, submissions
 from mjx_cl.leaderboard import score as leaderboard
 from mjx_cl.scoring import thresholds
 
@@ -159,12 +159,12 @@ def test_a_column_that_hardly_varies_is_kept_as_it_is():
     "latent": np.zeros((50, 2, 16), np.float16),
     "rpr": unknown,
   }
-  grain = record._grain(columns)
-  np.testing.assert_array_equal(record.rounded(constant[:, 0], "group_3", grain), constant[:, 0])
-  np.testing.assert_array_equal(record.rounded(unknown[:, 0], "rpr", grain), unknown[:, 0])
+  grain = rounding.grains(columns)
+  np.testing.assert_array_equal(rounding.rounded(constant[:, 0], "group_3", grain), constant[:, 0])
+  np.testing.assert_array_equal(rounding.rounded(unknown[:, 0], "rpr", grain), unknown[:, 0])
   np.testing.assert_array_equal(
-    record.rounded(np.zeros(3, np.float32), "group_3", grain),
-    np.full(3, record.FLOOR, np.float32),
+    rounding.rounded(np.zeros(3, np.float32), "group_3", grain),
+    np.full(3, rounding.FLOOR, np.float32),
   )
 
 

@@ -16,8 +16,8 @@ from test_run import saved  # noqa: F401  a fixture
 from mjx_cl.cli import app
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.io import tables
+from mjx_cl.leaderboard import lives, set_folder, streams
 from mjx_cl.leaderboard import record as recording
-from mjx_cl.leaderboard import streams
 
 SUITE = """
 name = "mini"
@@ -187,7 +187,7 @@ def two(tmp_path, monkeypatch):
       "target": np.array([lane.target or "all" for lane in who]),
     }
 
-  monkeypatch.setattr(recording, "_record", live)
+  monkeypatch.setattr(lives, "live", live)
 
   def record(name, robots=(), seed=0, **edit):
     draw[0], out, own = seed, tmp_path / name, dataclasses.replace(suite, **edit)
@@ -273,7 +273,8 @@ def test_a_set_that_was_cut_off_between_its_files_is_none(two, tmp_path, monkeyp
 
   def kill(source, target):
     if (
-      pathlib.Path(target).parent == tmp_path / "set" or pathlib.Path(target).name == recording.HELD
+      pathlib.Path(target).parent == tmp_path / "set"
+      or pathlib.Path(target).name == set_folder.HELD
     ):
       moved.append(target)
       if len(moved) == cut:
