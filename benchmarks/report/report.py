@@ -294,10 +294,10 @@ def best(rows: list[dict]) -> str:
 
 def lead(rows: list[dict], overall: list[dict]) -> str:
   """How far the first detector lies above the second; `rows` hold SCORED, `overall` is in order."""
-  from mjx_cl.scoring import metrics
+  from mjx_cl.scoring import comparison
 
   first, second = [r["detector"] for r in overall if "(oracle)" not in r["detector"]][:2]
-  ahead, interval = metrics.difference(rows, first, second)
+  ahead, interval = comparison.difference(rows, first, second)
   return (
     f"`{first}` lies {number(ahead, 1)} {span(interval, 1)} above `{second}` (paired over seeds, "
     "for these faults only)."

@@ -20,6 +20,7 @@ import pathlib
 from collections.abc import Collection, Sequence
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from mjx_cl.errors import FileError, UserError
@@ -303,3 +304,30 @@ class Data(NamedTuple):
   def own(self, key: tuple[str, float]) -> np.ndarray:
     """Columns of `fault` with this fault and severity, seed by seed as in `score`."""
     return np.flatnonzero([one == key for one in zip(self.fault.fault, self.fault.severity)])
+
+
+def load(streams: StreamSet, robot: str) -> Data:
+  """One robot's streams.
+
+  Raises:
+    FileError where its fault streams are not one for each seed that scores.
+  """
+  tune, score = (streams.get(robot, streams.find(robot, "nominal", s)) for s in ("tune", "score"))
+  keys, suite = streams.faults(robot), streams.suite
+  numbers = np.concatenate([streams.find(robot, "fault", "score", *key) for key in keys])
+  fault = streams.get(robot, numbers)
+  data = Data(robot, tune, score, fault, suite.count_from, suite.arl0, suite.horizon_s)
+  seeds = list(dict.fromkeys(score.seed.tolist()))
+  for name, severity in keys:
+    if fault.seed[data.own((name, severity))].tolist() != seeds:
+      raise FileError(
+        f"{streams.folder}: {robot}, {name} {severity:g}: its streams must be those of the "
+        f"seeds {seeds}, in order, one of each"
+      )
+  return data
+
+
+def joined(a: Residual, b: Residual) -> Residual:
+  """Two residuals side by side, cut to the shorter."""
+  steps = min(len(a.opr), len(b.opr))
+  return jax.tree.map(lambda x, y: np.concatenate([x[:steps], y[:steps]], 1), a, b)

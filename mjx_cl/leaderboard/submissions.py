@@ -17,8 +17,8 @@ from mjx_cl.detectors import python_class as host_lib
 from mjx_cl.detectors.combine import read
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.io import tables
-from mjx_cl.leaderboard.score import CURVE, Data, Found, curve, found
-from mjx_cl.leaderboard.streams import COLUMNS, Streams, StreamSet
+from mjx_cl.leaderboard.calibration import CURVE, Found, curve, found
+from mjx_cl.leaderboard.streams import COLUMNS, Data, Streams, StreamSet
 from mjx_cl.scoring import thresholds
 
 if TYPE_CHECKING:

@@ -46,7 +46,7 @@ from mjx_cl.runs import merge, run, settings, workers
 from mjx_cl.runs.doubts import doubts, watching
 from mjx_cl.runs.identity import arm_agents
 from mjx_cl.runs.records import acts
-from mjx_cl.scoring import normalised_recovery, stop_rule, survival
+from mjx_cl.scoring import ablation, normalised_recovery, stop_rule, survival
 from mjx_cl.training import agents, needs
 
 if TYPE_CHECKING:
@@ -636,10 +636,9 @@ def scores(folder: pathlib.Path) -> dict:
     out["against_oracle"] = normalised_recovery.difference(scored, "detector", "oracle")
   if (folder / "signals.parquet").exists():
     try:
-      out["ablation"] = stop_rule.ablated(stop_rule.ablation(folder))
+      out["ablation"] = ablation.ablated(ablation.ablation(folder))
       out["without_floor"] = {
-        str(n): stop_rule.ablated(stop_rule.ablation(folder, least=1, patience=n))
-        for n in PATIENCES
+        str(n): ablation.ablated(ablation.ablation(folder, least=1, patience=n)) for n in PATIENCES
       }
     except UserError as e:
       if isinstance(e, FileError):
