@@ -26,7 +26,7 @@ from mjx_cl.detectors.baselines import REFERENCES  # noqa: E402
 from mjx_cl.io import tables as store  # noqa: E402
 from mjx_cl.leaderboard import calibration, streams, sweep
 from mjx_cl.leaderboard import entries as entries_of
-from mjx_cl.leaderboard import samples as samples_of
+from mjx_cl.leaderboard import program as program_of
 from mjx_cl.scoring import intervals, metrics  # noqa: E402
 
 
@@ -88,7 +88,7 @@ def main(args: argparse.Namespace) -> None:
     one = data[robot][0]
     data[robot] = (
       one,
-      samples_of.samples(
+      program_of.samples(
         streams.joined(one.tune.residual, one.score.residual),
         one.fault.residual,
         one.fault.onset,

@@ -9,7 +9,7 @@ import numpy as np
 
 from mjx_cl.leaderboard import sweep
 from mjx_cl.leaderboard.entries import Entry
-from mjx_cl.leaderboard.samples import Samples
+from mjx_cl.leaderboard.program import Samples
 from mjx_cl.leaderboard.streams import Data
 from mjx_cl.scoring import metrics, thresholds
 

@@ -2,13 +2,16 @@
 split, written as streams.py describes.
 """
 
+import dataclasses
 import functools
 import itertools
 import json
+import os
 import pathlib
+import shutil
 import time
 import zlib
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterable
 from typing import Any
 
 import jax
@@ -18,16 +21,133 @@ import numpy as np
 from mjx_cl import envs
 from mjx_cl import faults as faults_lib
 from mjx_cl.errors import FileError, UserError
-from mjx_cl.io import arrays, runtime, tables
+from mjx_cl.io import arrays, folders, runtime, tables
 from mjx_cl.leaderboard import lives, set_tables
-from mjx_cl.leaderboard.set_folder import HELD, MADE, beside, plain, publish
-from mjx_cl.leaderboard.set_folder import claim as claim
-from mjx_cl.leaderboard.set_folder import clear as clear
 from mjx_cl.leaderboard.streams import META, SCHEMA, VERSION
 from mjx_cl.leaderboard.suite import Suite
 from mjx_cl.rollout.frozen import stream_keys
 from mjx_cl.rollout.monitor import watched
 from mjx_cl.training import agents
+
+MADE = ("command", "versions", "python", "git_commit", "machine")  # of config.json: how it was made
+HELD = "held.json"  # config.json of the set whose files are being replaced
+
+
+def claim(
+  suite: Suite, out: pathlib.Path | str, overwrite: bool, robots: Collection[str] = ()
+) -> None:
+  """Makes sure that `out` may take a recording of the suite; with `overwrite` the set that it holds
+  is removed, and no other file; where it has more than the `robots` named, and is of this very
+  suite, it stays until theirs are recorded, see `record`.
+
+  Raises:
+    UserError for a folder that holds a set, or anything else than parts of one.
+  """
+  out = pathlib.Path(out)
+  if not out.exists():
+    return
+  held = _held(out)
+  if held is not None and not overwrite:
+    raise UserError(f"{out} holds a recorded set; give --overwrite to replace it, or another --out")
+  if held and robots and held - set(robots):
+    _beside(suite, out, robots)
+    return
+  ours = {"config.json", "streams.parquet"} | {
+    f"{r}{end}.parquet" for r in {*suite.robots, *(held or ())} for end in ("", "_latents")
+  }
+  if held is not None:
+    for name in sorted(ours):
+      (out / name).unlink(missing_ok=True)
+    clear(out)
+  elif {p.name.removesuffix(".tmp") for p in out.iterdir()} - ours - {"work"} or _others(out):
+    raise _foreign(out)
+
+
+def _foreign(out: pathlib.Path) -> UserError:
+  return UserError(f"{out} is no folder of a recording; give another --out")
+
+
+def _held(out: pathlib.Path) -> set[str] | None:
+  """Robots of the set in `out`, None where it has no config.json."""
+  if not out.is_dir():
+    raise _foreign(out)
+  if not (out / "config.json").exists():
+    return None
+  try:
+    config = json.loads((out / "config.json").read_text())
+    robots = set(config["suite"]["robots"])
+  except (OSError, ValueError, KeyError, TypeError):
+    raise _foreign(out) from None
+  if not {"meta", "schema", "stream_steps"} <= set(config):
+    raise _foreign(out)
+  return robots
+
+
+def _beside(suite: Suite, out: pathlib.Path, robots: Collection[str]) -> dict | None:
+  """config.json of the set in `out` that holds more than `robots`, whose other streams stay there;
+  None where it holds no more, or is none.
+
+  Raises:
+    UserError where streams of `suite` have no place in it.
+  """
+  try:
+    config = tables.read_json(out / "config.json")
+  except FileError:  # or files were being moved into place when it was cut off
+    try:
+      config = tables.read_json(out / "work" / "set" / HELD)
+    except FileError:
+      return None
+  held = config["suite"]["robots"]
+  if not set(held) - set(robots):
+    return None
+  whole = json.loads(json.dumps(_plain(suite, suite.robots)))
+  same = whole | {"robots": {r: whole["robots"].get(r) for r in held}}
+  differ = (
+    folders.differing(same, config["suite"])
+    + [k for k in MADE if k not in config]
+    + ["version"] * (config["version"] != VERSION)
+    + [k for k in ("details", "stream_steps") if set(config.get(k, ())) != set(held)]
+  )
+  if differ:
+    raise UserError(
+      f"{out} holds a set of another suite (its {', '.join(differ)}), whose other robots' "
+      "streams would be lost; give another --out, or record all robots"
+    )
+  return config
+
+
+def _plain(suite: Suite, robots: Iterable[str]) -> dict:
+  """The suite as config.json has it, with these robots alone."""
+  return dataclasses.asdict(suite) | {"robots": {r: suite.robots[r] for r in robots}}
+
+
+def _others(out: pathlib.Path) -> list[pathlib.Path]:
+  """What in the folder `work` is no part of a recording."""
+  staged = lambda p: (
+    p.name == "set"
+    and p.is_dir()
+    and all(f.suffix in (".parquet", ".json", ".tmp") for f in p.iterdir())
+  )
+  parts = (out / "work").iterdir() if (out / "work").is_dir() else ()
+  return [p for p in parts if not (p.name.removesuffix(".tmp").endswith(".npz") or staged(p))]
+
+
+def clear(out: pathlib.Path | str) -> None:
+  """Removes the parts of a recording."""
+  work = pathlib.Path(out) / "work"
+  if work.is_dir() and not _others(work.parent):
+    shutil.rmtree(work)
+
+
+def _publish(staged: pathlib.Path, out: pathlib.Path) -> None:
+  """Moves a set's files into place. config.json, without which a folder holds no set, leaves first
+  and comes last: no one reads old beside new.
+  """
+  if (out / "config.json").exists():
+    os.replace(out / "config.json", staged / HELD)
+  for p in sorted(staged.glob("*.parquet")):
+    os.replace(p, out / p.name)
+  os.replace(staged / "config.json", out / "config.json")
 
 
 def prepare(
@@ -90,7 +210,7 @@ def record(
     if p.name != HELD:
       p.unlink()
   ready = prepare(suite, robots, physics, agent)
-  old = beside(suite, out, robots) if robots else None
+  old = _beside(suite, out, robots) if robots else None
   table = tables.read_rows(out / "streams.parquet") if old else []
   kind_of = {row["stream"]: row["kind"] for row in table}
   # probes of healthy streams are numbered anew, behind all others
@@ -117,13 +237,13 @@ def record(
     made = {k: {r: old[k][r] for r in kept if r in old.get(k, ())} | made[k] for k in made}
   config = {
     "version": VERSION,
-    "suite": plain(suite, [r for r in suite.robots if r in {*ready, *kept}]),
+    "suite": _plain(suite, [r for r in suite.robots if r in {*ready, *kept}]),
     "command": command,
     "schema": SCHEMA,
     "meta": META,
   }
   tables.write_json(staged / "config.json", config | made | runtime.provenance() | stays)
-  publish(staged, out)
+  _publish(staged, out)
   size = sum(p.stat().st_size for p in out.glob("*.parquet"))
   return {"stream_steps_per_s": speed, "stream_steps": made["stream_steps"], "bytes": size}
 

@@ -21,16 +21,18 @@ import numpy as np
 from mjx_cl.io import tables
 from mjx_cl.leaderboard import calibration, page, sweep
 from mjx_cl.leaderboard import oracle as oracles
-from mjx_cl.leaderboard import samples as stretches
+from mjx_cl.leaderboard import program as programs
 from mjx_cl.leaderboard.calibration import Found
 from mjx_cl.leaderboard.entries import Entry, one_line
 from mjx_cl.leaderboard.entries import chosen as chosen
 from mjx_cl.leaderboard.entries import variants as variants
-from mjx_cl.leaderboard.rows import ORACLES, oracle_rows, rows_of
 from mjx_cl.leaderboard.streams import Data, StreamSet, joined, load
 from mjx_cl.rollout.monitor import CHANNELS
-from mjx_cl.scoring import comparison
+from mjx_cl.scoring import comparison, limits, metrics, thresholds
 
+# rows that are there whatever detectors are chosen
+ORACLES = ("true onset (oracle)", "likelihood_ratio (oracle)")
+EPISODES = ("episode_alarm_probability", "episode_alarm_probability_ci")
 HIDDEN = ("stream_latency_steps", "stream_healthy_alarms", "healthy_steps")  # on the page
 Job = tuple[str, bool, Callable[[Data], Found]]  # name on the board, whether a reference, what runs
 
@@ -74,7 +76,7 @@ def score(
   """
   begin = time.perf_counter()
   robots = streams.choose(robots)
-  room = stretches.room(streams, robots)
+  room = programs.room(streams, robots)
   runners = {e.name: sweep.Runner(e.build, room) for e in entries if not e.own}
   rows: list[dict] = []
   curves: dict[str, dict[str, list[dict]]] = {}
@@ -86,7 +88,7 @@ def score(
     nominal, fault = joined(data.tune.residual, data.score.residual), data.fault
     known: Any = None
     if entries:
-      known = stretches.samples(
+      known = programs.samples(
         nominal, fault.residual, fault.onset, fault.seed, data.horizon, room.samples
       )
     jobs: list[Job] = [
@@ -110,8 +112,8 @@ def score(
 def _examine(
   one: Entry,
   runners: dict[str, sweep.Runner],
-  room: stretches.Room,
-  samples: stretches.Samples,
+  room: programs.Room,
+  samples: programs.Samples,
   data: Data,
 ) -> Found:
   runner = sweep.Runner(one.own(data.robot), room) if one.own else runners[one.name]
@@ -177,6 +179,88 @@ def _workers() -> ThreadPoolExecutor:
   run side by side.
   """
   return ThreadPoolExecutor(min(8, os.cpu_count() or 1), "detector")
+
+
+def rows_of(
+  name: str, reference: bool, result: Found, data: Data, known: dict[tuple, oracles.Oracle]
+) -> list[dict]:
+  """One row per fault and severity, of which `known` tells what its oracle did."""
+  out = []
+  for key, oracle in known.items():
+    own = data.own(key)
+    part = result._replace(fired=result.fired[:, own], score=result.score[:, own])
+    out.append(_row(name, reference, data, key, part, oracle))
+  return out
+
+
+def _row(
+  name: str,
+  reference: bool,
+  data: Data,
+  key: tuple[str, float],
+  result: Found,
+  oracle: oracles.Oracle,
+) -> dict:
+  """One row; fired and score of `result` are of this fault's streams alone."""
+  onset, threshold, arl0 = data.fault.onset[data.own(key)], result.threshold, result.arl0
+  row = metrics.row(
+    result.fired,
+    result.score,
+    onset,
+    result.nominal_fired,
+    result.nominal_score,
+    data.fault.control_s,
+    data.count_from,
+    horizon_s=data.horizon_s,
+  )
+  latency = metrics.latencies(result.fired, onset, data.horizon)
+  best = metrics.latencies(oracle.run.fired, onset, data.horizon) if oracle.run else latency
+  share = limits.efficiency(best, latency, data.horizon)
+  if oracle.run is None:
+    names = ("oracle_delay_steps", "oracle_delay_steps_ci", "efficiency", "efficiency_ci")
+    share |= dict.fromkeys(names)
+  tells = name == ORACLES[1 if oracle.run else 0]  # the row that says why a limit is unknown
+  notes = [n for n in (share["note"], oracle.limits["note"] if tells else None) if n]
+  return {
+    "detector": name,
+    "reference": reference,
+    "robot": data.robot,
+    "fault": key[0],
+    "severity": key[1],
+    "threshold": threshold if threshold is None or math.isfinite(threshold) else None,
+    "arl0": arl0.get("arl0"),
+    "arl0_ci": arl0.get("arl0_ci"),
+    "arl0_alarms": arl0.get("alarms"),
+    "arl0_few": arl0.get("few", False),
+    **{k: result.episode.get(k) for k in EPISODES},
+    **row,
+    "us_per_sample": result.us_per_sample,
+    **{k: oracle.limits[k] for k in oracles.LIMITS},
+    **share,
+    "note": "; ".join(notes) or None,
+  }
+
+
+def oracle_rows(data: Data, known: dict[tuple, oracles.Oracle]) -> list[dict]:
+  """Rows of the two oracles: the true onset, and the likelihood-ratio CUSUM where it could be
+  fitted.
+
+  Their `us_per_sample` is None: the one reads the label, the other is a NumPy loop over all streams
+  of all faults at once, whose time is no detector's.
+  """
+  out = []
+  steps = np.arange(len(data.fault.residual.opr))[:, None]
+  quiet = np.zeros(data.score.episode.shape, bool)
+  nominal = thresholds.by_seed(quiet, data.score.seed, data.count_from)
+  for key, oracle in known.items():
+    if oracle.run:
+      out.append(_row(ORACLES[1], True, data, key, oracle.run, oracle))
+    since = steps - data.fault.onset[data.own(key)]
+    told = Found(
+      None, {}, {}, nominal, nominal.astype(float), since == 0, (since >= 0).astype(float), None, []
+    )
+    out.append(_row(ORACLES[0], True, data, key, told, oracle))
+  return out
 
 
 def _fault(

@@ -20,8 +20,16 @@ from typing import Any
 import jax
 import numpy as np
 
-from mjx_cl.leaderboard.program import Stretch, program, shared
-from mjx_cl.leaderboard.samples import LANES, LANES_SHARED, LEVELS, Room, Samples
+from mjx_cl.leaderboard.program import (
+  LANES,
+  LANES_SHARED,
+  LEVELS,
+  Room,
+  Samples,
+  Stretch,
+  program,
+  shared,
+)
 from mjx_cl.scoring import thresholds as healthy
 
 

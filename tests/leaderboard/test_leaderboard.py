@@ -24,13 +24,13 @@ from mjx_cl.leaderboard import (
   calibration,
   lives,
   oracle,
-  samples,
   set_tables,
   streams,
   submissions,
   sweep,
 )
 from mjx_cl.leaderboard import entries as entries_of
+from mjx_cl.leaderboard import program as program_of
 from mjx_cl.leaderboard import score as leaderboard
 from mjx_cl.leaderboard.suite import Suite
 from mjx_cl.scoring import autoregression, metrics
@@ -572,7 +572,7 @@ def test_passes_equal_whole_streams_at_every_threshold(small, name, settings, to
   )
   one, tune = entries_of.entry(name, settings), len(data.tune.stream)
   build = one.own("quadruped") if one.own else one.build  # whose residuals have a threshold each
-  known = samples.samples(nominal, data.fault.residual, onset, data.fault.seed, horizon)
+  known = program_of.samples(nominal, data.fault.residual, onset, data.fault.seed, horizon)
   runner, plain = sweep.Runner(build), program(build)
   assert len(known.past) == SEEDS  # three faults of a seed share one
   counter = sweep.Counter(runner, known, tune, data.count_from)
@@ -611,7 +611,7 @@ def test_passes_equal_whole_streams_at_every_threshold(small, name, settings, to
 def test_more_pasts_than_lanes(small, monkeypatch):
   """Each batch of pasts keeps rows of its own."""
   data = streams.load(small[0], "walker")
-  known = samples.samples(
+  known = program_of.samples(
     streams.joined(data.tune.residual, data.score.residual),
     data.fault.residual,
     data.fault.onset,
@@ -623,7 +623,7 @@ def test_more_pasts_than_lanes(small, monkeypatch):
   for lanes in (20, 3):
     monkeypatch.setattr(sweep, "LANES_SHARED", lanes)
     found.append(
-      sweep.Runner(one.build, samples.room(small[0], ["walker"])).faults(
+      sweep.Runner(one.build, program_of.room(small[0], ["walker"])).faults(
         np.float32([2.0, 3.0]), known
       )[:3]
     )
@@ -635,8 +635,8 @@ def test_more_pasts_than_lanes(small, monkeypatch):
 @pytest.mark.parametrize(
   "name, settings, lanes",
   [
-    ("cusum", {"warmup": 150}, samples.LANES),
-    ("rolling_sigma_plain", {"window": 150, "warmup": 100}, samples.LANES_SHARED),
+    ("cusum", {"warmup": 150}, program_of.LANES),
+    ("rolling_sigma_plain", {"window": 150, "warmup": 100}, program_of.LANES_SHARED),
   ],
 )
 def test_time_per_sample_counts_an_update_once(small, monkeypatch, name, settings, lanes):
@@ -644,7 +644,7 @@ def test_time_per_sample_counts_an_update_once(small, monkeypatch, name, setting
   score are one update.
   """
   data = streams.load(small[0], "walker")
-  known = samples.samples(
+  known = program_of.samples(
     streams.joined(data.tune.residual, data.score.residual),
     data.fault.residual,
     data.fault.onset,
@@ -661,7 +661,7 @@ def test_other_pasts_are_not_shared(small):
   nominal = streams.joined(data.tune.residual, data.score.residual)
   other = data.fault.residual._replace(opr=data.fault.residual.opr.copy())
   other.opr[100, 0] += 1.0
-  known = samples.samples(nominal, other, data.fault.onset, data.fault.seed, data.horizon)
+  known = program_of.samples(nominal, other, data.fault.onset, data.fault.seed, data.horizon)
   assert len(known.past) == SEEDS + 1 and (known.owner == known.owner[0]).sum() == 1
 
 
@@ -687,7 +687,7 @@ def test_a_threshold_used_otherwise_is_found_out_and_all_is_run(small):
 
   early = lambda t: Detector(lambda: jnp.int32(0), lambda s, x: (s, Alarm(x.opr > t - 0.25, x.opr)))
   data = streams.load(small[0], "walker")
-  known = samples.samples(
+  known = program_of.samples(
     streams.joined(data.tune.residual, data.score.residual),
     data.fault.residual,
     data.fault.onset,

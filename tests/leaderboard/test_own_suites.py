@@ -20,7 +20,7 @@ from mjx_cl.io import tables
 from mjx_cl.io.plugins import Registry
 from mjx_cl.leaderboard import entries as entries_of
 from mjx_cl.leaderboard import oracle as oracles
-from mjx_cl.leaderboard import record, rounding, streams, submissions
+from mjx_cl.leaderboard import record, set_tables, streams, submissions
 from mjx_cl.leaderboard import score as leaderboard
 from mjx_cl.scoring import thresholds
 
@@ -160,12 +160,14 @@ def test_a_column_that_hardly_varies_is_kept_as_it_is():
     "latent": np.zeros((50, 2, 16), np.float16),
     "rpr": unknown,
   }
-  grain = rounding.grains(columns)
-  np.testing.assert_array_equal(rounding.rounded(constant[:, 0], "group_3", grain), constant[:, 0])
-  np.testing.assert_array_equal(rounding.rounded(unknown[:, 0], "rpr", grain), unknown[:, 0])
+  grain = set_tables.grains(columns)
   np.testing.assert_array_equal(
-    rounding.rounded(np.zeros(3, np.float32), "group_3", grain),
-    np.full(3, rounding.FLOOR, np.float32),
+    set_tables.rounded(constant[:, 0], "group_3", grain), constant[:, 0]
+  )
+  np.testing.assert_array_equal(set_tables.rounded(unknown[:, 0], "rpr", grain), unknown[:, 0])
+  np.testing.assert_array_equal(
+    set_tables.rounded(np.zeros(3, np.float32), "group_3", grain),
+    np.full(3, set_tables.FLOOR, np.float32),
   )
 
 

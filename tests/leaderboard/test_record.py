@@ -16,7 +16,7 @@ from test_run import saved  # noqa: F401  a fixture
 from mjx_cl.cli import app
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.io import tables
-from mjx_cl.leaderboard import lives, set_folder, streams
+from mjx_cl.leaderboard import lives, streams
 from mjx_cl.leaderboard import record as recording
 
 SUITE = """
@@ -273,8 +273,7 @@ def test_a_set_that_was_cut_off_between_its_files_is_none(two, tmp_path, monkeyp
 
   def kill(source, target):
     if (
-      pathlib.Path(target).parent == tmp_path / "set"
-      or pathlib.Path(target).name == set_folder.HELD
+      pathlib.Path(target).parent == tmp_path / "set" or pathlib.Path(target).name == recording.HELD
     ):
       moved.append(target)
       if len(moved) == cut:
