@@ -1,9 +1,8 @@
 """Robots of a recording, healthy and faulty, and their lives with a frozen agent."""
 
-from __future__ import annotations
-
+import contextlib
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, NamedTuple
 
@@ -61,31 +60,25 @@ def lanes(suite: Suite, robot: str, split: str) -> list[Lane]:
   return out
 
 
-class Behind:
+@contextlib.contextmanager
+def behind(function: Callable[..., Any]) -> Iterator[Callable[..., None]]:
   """Calls of one function on a thread of its own, in order and at most one behind: a frozen agent
   acts without waiting for what is made of its last chunk.
 
-  with Behind(function) as call: call(...)         an error of the function comes up at the next
+  with behind(function) as call: call(...)         an error of the function comes up at the next
     call, or at the end
   """
+  last: list[Future] = []
 
-  def __init__(self, function: Callable[..., Any]) -> None:
-    self._function, self._pool = function, ThreadPoolExecutor(1, "behind")
-    self._last: Future | None = None
+  def call(*args: Any) -> None:
+    if last:
+      last.pop().result()
+    last.append(pool.submit(function, *args))
 
-  def __enter__(self) -> Behind:
-    return self
-
-  def __call__(self, *args: Any) -> None:
-    """Begins the next one once the last has ended."""
-    if self._last is not None:
-      self._last.result()
-    self._last = self._pool.submit(self._function, *args)
-
-  def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-    self._pool.shutdown()
-    if kind is None and self._last is not None:
-      self._last.result()
+  with ThreadPoolExecutor(1, "behind") as pool:
+    yield call
+  if last:
+    last.pop().result()
 
 
 def _drawn(
@@ -147,7 +140,7 @@ def live(
     parts.append(look(chunk, history, rows))
     progress(min(steps, (chunk + 1) * CHUNK), steps, n)
 
-  with Behind(store) as stored:
+  with behind(store) as stored:
     for chunk in range(-(-steps // CHUNK)):
       state, rows = rollout.chunk(params, state, CHUNK)
       rows = jax.tree.map(lambda x: x[:, :, :n], rows)

@@ -200,6 +200,15 @@ def record(
   stay in it, with the numbers that they have; how they were recorded stands under `kept` of
   config.json then.
 
+  Args:
+    suite: what is recorded.
+    out: the folder.
+    robots: of the suite, all where empty.
+    physics: name of the simulator.
+    agent: of the robots; None: those that ship.
+    command: for config.json.
+    progress: called as progress(part, steps lived, of how many, lanes).
+
   Returns:
     {robot: stream-steps per second of its parts}, plus the size of the files.
   """
@@ -210,11 +219,7 @@ def record(
     if p.name != HELD:
       p.unlink()
   ready = prepare(suite, robots, physics, agent)
-  old = _beside(suite, out, robots) if robots else None
-  table = tables.read_rows(out / "streams.parquet") if old else []
-  kind_of = {row["stream"]: row["kind"] for row in table}
-  # probes of healthy streams are numbered anew, behind all others
-  table = [row for row in table if kind_of.get(row["prefix"]) != "nominal"]
+  old, table = _old(suite, out, robots)
   kept = [r for r in old["suite"]["robots"] if r not in robots] if old else []
   rows = [row for row in table if row["robot"] in kept]
   free, speed = 1 + max((row["stream"] for row in table), default=-1), {}
@@ -231,21 +236,44 @@ def record(
     name, weights = pathlib.Path(trained.path).name, _digest(trained.train.params)
     made["agents"][robot] = {"name": name, "crc32": weights}
   set_tables.write_meta(staged, rows + set_tables.healthy_probes(rows))
+  config = _config(suite, command, made, old, kept)
+  tables.write_json(staged / "config.json", config)
+  _publish(staged, out)
+  size = sum(p.stat().st_size for p in out.glob("*.parquet"))
+  return {"stream_steps_per_s": speed, "stream_steps": config["stream_steps"], "bytes": size}
+
+
+def _config(
+  suite: Suite, command: str, made: dict[str, dict], old: dict | None, kept: list[str]
+) -> dict:
+  """config.json of a set: `made` tells of each robot that was recorded, `old` of those kept."""
   stays: dict[str, dict] = {}
   if old:
     stays = {"kept": {r: old.get("kept", {}).get(r, {k: old[k] for k in MADE}) for r in kept}}
     made = {k: {r: old[k][r] for r in kept if r in old.get(k, ())} | made[k] for k in made}
+  robots = [r for r in suite.robots if r in {*made["details"], *kept}]
   config = {
     "version": VERSION,
-    "suite": _plain(suite, [r for r in suite.robots if r in {*ready, *kept}]),
+    "suite": _plain(suite, robots),
     "command": command,
     "schema": SCHEMA,
     "meta": META,
   }
-  tables.write_json(staged / "config.json", config | made | runtime.provenance() | stays)
-  _publish(staged, out)
-  size = sum(p.stat().st_size for p in out.glob("*.parquet"))
-  return {"stream_steps_per_s": speed, "stream_steps": made["stream_steps"], "bytes": size}
+  return config | made | runtime.provenance() | stays
+
+
+def _old(
+  suite: Suite, out: pathlib.Path, robots: Collection[str]
+) -> tuple[dict | None, list[dict]]:
+  """config.json of the set that stays beside these robots, None where none does, and its rows of
+  META but those of probes of healthy streams, which are numbered anew, behind all others.
+  """
+  old = _beside(suite, out, robots) if robots else None
+  if old is None:
+    return None, []
+  table = tables.read_rows(out / "streams.parquet")
+  kind_of = {row["stream"]: row["kind"] for row in table}
+  return old, [row for row in table if kind_of.get(row["prefix"]) != "nominal"]
 
 
 def _parts(

@@ -134,6 +134,7 @@ def auroc(
     healthy: likewise.
     reps: bootstrap draws.
   """
+  faulty, healthy = ([x[~np.isnan(x)] for x in side] for side in (faulty, healthy))
   sizes = [np.array([len(x) for x in side], float) for side in (faulty, healthy)]
   if not (sizes[0].sum() and sizes[1].sum()):
     return None, None
@@ -199,27 +200,12 @@ def row(
   healthy_steps = len(nominal_alarm) - count_from
   values = per_stream(latency, healthy_alarms, healthy_steps, control_s)
   values |= {f"detected_within_{x:g}s": np.full(streams, np.nan) for x in WITHIN_S if x > horizon_s}
-  known = lambda x: x[~np.isnan(x)]
-  area, area_ci = auroc(
-    [known(score[k : k + horizon, s]) for s, k in enumerate(onset)],
-    [known(x) for x in nominal_score[count_from:].T],
-    reps,
-  )
-  median = bootstrap.finite(_median(latency))
+  faulty = [score[k : k + horizon, s] for s, k in enumerate(onset)]
+  area, area_ci = auroc(faulty, list(nominal_score[count_from:].T), reps)
   hours = streams * healthy_steps * control_s / 3600.0
-  median_ci, intervals = _intervals(latency, values, hours, reps)
-  seconds = lambda x: None if x is None else x * control_s
   return {
     "streams": streams,
-    "latency_median_steps": median,
-    "latency_median_steps_ci": median_ci,
-    "latency_median_s": seconds(median),
-    "latency_median_s_ci": median_ci and [seconds(x) for x in median_ci],
-    **{
-      f"{name}{end}": shown
-      for name, x in values.items()
-      for end, shown in (("", bootstrap.finite(x.mean())), ("_ci", intervals[name]))
-    },
+    **_intervals(latency, values, hours, control_s, reps),
     "auroc": area,
     "auroc_ci": area_ci,
     "stream_latency_steps": [int(x) if np.isfinite(x) else None for x in latency],
@@ -236,29 +222,39 @@ def _median(latency: np.ndarray) -> np.ndarray:
 
 
 def _intervals(
-  latency: np.ndarray, values: dict[str, np.ndarray], hours: float, reps: int
-) -> tuple[list[float | None] | None, dict[str, Any]]:
-  """Intervals of the median latency and of the means of `values`, by name.
+  latency: np.ndarray, values: dict[str, np.ndarray], hours: float, control_s: float, reps: int
+) -> dict[str, Any]:
+  """Median latency and means of `values`, by name, with their intervals.
 
   Args:
     latency: (S,).
     values: of `per_stream`.
     hours: of healthy operation.
+    control_s: control period [s].
     reps: bootstrap draws.
   """
-  streams = len(latency)
-  if streams < 2:
-    return None, dict.fromkeys(values)
-  medians = _median(latency[bootstrap.draws(streams, reps)])
-  means = np.stack(list(values.values())) @ bootstrap.weights(streams, reps).T
-  median, *ends = bootstrap.ends(np.concatenate([medians[None], means]))
-  intervals: dict[str, Any] = dict(zip(values, ends))
-  for name in SHARES:
-    share = values[name].sum()
-    intervals[name] = bootstrap.wilson(round(share), streams) if np.isfinite(share) else None
-  if hours > 0 and not values["false_alarms_per_hour"].any():
-    intervals["false_alarms_per_hour"] = [x / hours for x in bootstrap.poisson(0)]
-  return median, intervals
+  streams, median, median_ci = len(latency), bootstrap.finite(_median(latency)), None
+  intervals: dict[str, Any] = dict.fromkeys(values)
+  if streams > 1:
+    medians = _median(latency[bootstrap.draws(streams, reps)])
+    means = np.stack(list(values.values())) @ bootstrap.weights(streams, reps).T
+    median_ci, *ends = bootstrap.ends(np.concatenate([medians[None], means]))
+    intervals = dict(zip(values, ends))
+    for name in SHARES:
+      hits = values[name].sum()
+      intervals[name] = bootstrap.wilson(round(hits), streams) if np.isfinite(hits) else None
+    if hours > 0 and not values["false_alarms_per_hour"].any():
+      intervals["false_alarms_per_hour"] = [x / hours for x in bootstrap.poisson(0)]
+  seconds = lambda x: None if x is None else x * control_s
+  out = {
+    "latency_median_steps": median,
+    "latency_median_steps_ci": median_ci,
+    "latency_median_s": seconds(median),
+    "latency_median_s_ci": median_ci and [seconds(x) for x in median_ci],
+  }
+  for name, x in values.items():
+    out |= {name: bootstrap.finite(x.mean()), f"{name}_ci": intervals[name]}
+  return out
 
 
 def _demand(
