@@ -13,8 +13,6 @@ groups and latents), of the logarithm where they cannot be negative: a column's 
 0.5 % (2 %), the files shrink to a third. config.json holds the steps.
 """
 
-from __future__ import annotations
-
 import json
 import pathlib
 from collections.abc import Collection, Sequence

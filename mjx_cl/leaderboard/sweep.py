@@ -61,7 +61,7 @@ class Runner:
     shape = rows, 2 + pasts, 1 + faults + pasts, data.residual.opr.shape[0]
     small = any(have < want for have, want in zip(self.shape, shape[:3]))
     if self.compiled is None or small or self.shape[3] != shape[3]:
-      self.shape = shape
+      self.shape, self.compiled = shape, None
       run = program(self.build, rows, shape[1])
       self.compiled = run.lower(self._filled([]), 0, data.residual).compile()
 

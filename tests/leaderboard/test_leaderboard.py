@@ -621,7 +621,8 @@ def test_more_pasts_than_lanes(small, monkeypatch):
   one = entries_of.entry("rolling_sigma_plain", {"window": 150, "warmup": 100})
   found = []
   for lanes in (20, 3):
-    monkeypatch.setattr(sweep, "LANES_SHARED", lanes)
+    for module in (program_of, sweep):
+      monkeypatch.setattr(module, "LANES_SHARED", lanes)
     found.append(
       sweep.Runner(one.build, program_of.room(small[0], ["walker"])).faults(
         np.float32([2.0, 3.0]), known
