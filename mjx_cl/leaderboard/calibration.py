@@ -67,8 +67,8 @@ def examine(one: Entry, data: Data, runner: sweep.Runner, samples: Samples) -> F
     if not one.calibrated or sound and alarms == tried.get(threshold, 0):
       break
   score = np.stack([sweep.strongest(s[0]) for _, s in runs], 1)
-  nearest = lambda arl0: thresholds.nearest(list(tried.items()), counted, arl0)
-  levels = [threshold] + [nearest(arl0) for arl0 in CURVE if tried]
+  known = list(tried.items())
+  levels = [threshold] + [thresholds.nearest(known, counted, a) for a in CURVE if tried]
   late_fired, late_score, before, us = runner.faults(np.asarray(levels, np.float32), samples)
   placed = lambda x, unknown: _placed(x, data.fault.onset, len(data.fault.residual.opr), unknown)
   pairs = [(tried[t], placed(f, False)) for t, f in zip(levels, late_fired) if t in tried]

@@ -54,8 +54,9 @@ def entry(name: str, settings: dict) -> Entry:
   rest = {k: v for k, v in settings.items() if k != "use"}
   factory = detectors_lib.factory(use)
   parameters = inspect.signature(factory).parameters
-  open_ended = any(p.kind is p.VAR_KEYWORD for p in parameters.values())
-  calibrated = "threshold" in parameters or open_ended
+  calibrated = "threshold" in parameters or any(
+    p.kind is p.VAR_KEYWORD for p in parameters.values()
+  )
   build = lambda threshold, **more: detectors_lib.make(
     use, **(more | rest), **({"threshold": threshold} if calibrated else {})
   )

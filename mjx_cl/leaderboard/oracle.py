@@ -37,8 +37,8 @@ class Oracle(NamedTuple):
 
 def channels(residual: Residual, columns: slice | np.ndarray = slice(None)) -> np.ndarray:
   """Ln of the oracle's channels, (T, S, C)."""
-  own = [np.asarray(getattr(residual, c))[:, columns].astype(float) for c in CHANNELS]
-  return np.stack([np.log(np.maximum(x, 1e-9)) for x in own], -1)
+  own = lambda c: np.asarray(getattr(residual, c))[:, columns].astype(float)
+  return np.stack([np.log(np.maximum(own(c), 1e-9)) for c in CHANNELS], -1)
 
 
 def restarted(ratio: np.ndarray, thresholds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -72,8 +72,8 @@ def _known(
   fit, no_fit = _attempt(lambda: autoregression.fit(normal, after))
   information, no_information = _attempt(lambda: limits.information(normal, after))
   form, no_form = _attempt(lambda: limits.closed_form(first, after[..., 0], arl0))
-  note = {"note": no_fit or no_information or no_form}
-  return fit, dict.fromkeys(LIMITS) | note | (information or {}) | (form or {})
+  unknown = {**dict.fromkeys(LIMITS), "note": no_fit or no_information or no_form}
+  return fit, unknown | (information or {}) | (form or {})
 
 
 def _thresholds(ratio: np.ndarray, lanes: int, count_from: int, most: float) -> np.ndarray:
@@ -98,8 +98,7 @@ def _ratios(x: np.ndarray, fits: list[Parameters]) -> np.ndarray:
   known = autoregression.lagged(x, ORDER)
   before = autoregression.log_density(known, fits[0].before)
   ratios = [autoregression.log_density(known, one.after) - before for one in fits]
-  unknown = np.full((ORDER, len(fits) * x.shape[1]), np.nan)
-  return np.concatenate([unknown, np.concatenate(ratios, 1)])
+  return np.pad(np.concatenate(ratios, 1), ((ORDER, 0), (0, 0)), constant_values=np.nan)
 
 
 def episodes(fired: np.ndarray, data: Data) -> dict:

@@ -252,14 +252,16 @@ def _config(
     stays = {"kept": {r: old.get("kept", {}).get(r, {k: old[k] for k in MADE}) for r in kept}}
     made = {k: {r: old[k][r] for r in kept if r in old.get(k, ())} | made[k] for k in made}
   robots = [r for r in suite.robots if r in {*made["details"], *kept}]
-  config = {
+  return {
     "version": VERSION,
     "suite": _plain(suite, robots),
     "command": command,
     "schema": SCHEMA,
     "meta": META,
+    **made,
+    **runtime.provenance(),
+    **stays,
   }
-  return config | made | runtime.provenance() | stays
 
 
 def _old(
@@ -293,8 +295,7 @@ def _parts(
   for split, kind in itertools.product(("score", "tune"), ("nominal", "fault")):
     who, keys, onsets, steps, watch_from = _who(suite, robot, split, kind, env.spec.control_s)
     path = work / f"{robot}-{split}-{kind}.npz"
-    lanes = [list(lane) for lane in who]
-    tag = json.dumps([lanes, steps, trained.card.get("updates"), VERSION])
+    tag = json.dumps([who, steps, trained.card.get("updates"), VERSION])
     of = json.dumps([onsets.tolist(), _digest(trained.train.params), simulator])
     data = _part(path, tag, of)
     if data is None:
@@ -346,5 +347,5 @@ def _part(path: pathlib.Path, tag: str, of: str) -> dict | None:
     part = arrays.read(path)
   except FileError:
     return None
-  same = str(part.pop("tag", None)) == tag and str(part.pop("of", of)) == of
-  return part if same else None
+  told = str(part.pop("tag", None)), str(part.pop("of", of))
+  return part if told == (tag, of) else None

@@ -105,8 +105,7 @@ def score(
     faults += [_fault(data, key, o, alarms) for key, o in oracle.items()]
     lived += len(jobs) * (nominal.opr.size + fault.residual.opr.size)
   drawn = {name: by for name, by in curves.items() if any(by.values())}
-  overall = comparison.overall(rows)
-  return Board(rows, overall, drawn, faults, time.perf_counter() - begin, lived)
+  return Board(rows, comparison.overall(rows), drawn, faults, time.perf_counter() - begin, lived)
 
 
 def _examine(
@@ -217,8 +216,9 @@ def _row(
   best = metrics.latencies(oracle.run.fired, onset, data.horizon) if oracle.run else latency
   share = limits.efficiency(best, latency, data.horizon)
   if oracle.run is None:
-    names = ("oracle_delay_steps", "oracle_delay_steps_ci", "efficiency", "efficiency_ci")
-    share |= dict.fromkeys(names)
+    share |= {
+      f"{k}{end}": None for k in ("oracle_delay_steps", "efficiency") for end in ("", "_ci")
+    }
   tells = name == ORACLES[1 if oracle.run else 0]  # the row that says why a limit is unknown
   notes = [n for n in (share["note"], oracle.limits["note"] if tells else None) if n]
   return {
@@ -250,8 +250,9 @@ def oracle_rows(data: Data, known: dict[tuple, oracles.Oracle]) -> list[dict]:
   """
   out = []
   steps = np.arange(len(data.fault.residual.opr))[:, None]
-  quiet = np.zeros(data.score.episode.shape, bool)
-  nominal = thresholds.by_seed(quiet, data.score.seed, data.count_from)
+  nominal = thresholds.by_seed(
+    np.zeros(data.score.episode.shape, bool), data.score.seed, data.count_from
+  )
   for key, oracle in known.items():
     if oracle.run:
       out.append(_row(ORACLES[1], True, data, key, oracle.run, oracle))
@@ -271,12 +272,17 @@ def _fault(
   """
   lives = []
   for j, k in enumerate(data.own(key).tolist()):
-    lanes = {name: fired[:, k] for name, fired in alarms.items()}
-    if oracle.run:
-      lanes[ORACLES[1]] = oracle.run.fired[:, j]
+    oracles_own = {ORACLES[1]: oracle.run.fired[:, j]} if oracle.run else {}
+    lanes = {name: fired[:, k] for name, fired in alarms.items()} | oracles_own
     lives.append(_life(data, k, lanes, *((150, ".3g") if j else (300, ".4g"))))
-  fault = {"robot": data.robot, "fault": key[0], "severity": key[1]}
-  return fault | {"control_s": data.fault.control_s} | lives[0] | {"others": lives[1:]}
+  return {
+    "robot": data.robot,
+    "fault": key[0],
+    "severity": key[1],
+    "control_s": data.fault.control_s,
+    **lives[0],
+    "others": lives[1:],
+  }
 
 
 def _life(data: Data, k: int, lanes: dict[str, np.ndarray], points: int, digits: str) -> dict:

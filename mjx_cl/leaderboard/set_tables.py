@@ -46,8 +46,8 @@ class Robot:
 
   def add(self, **values: Any) -> None:
     """A stream more in `meta`."""
-    known = self.common | {"stream": self.number, "severity": 0.0, "full": True} | values
-    self.meta.append({k: known.get(k) for k in META})
+    known = {"stream": self.number, "severity": 0.0, "full": True} | self.common | values
+    self.meta.append(dict.fromkeys(META) | known)
     self.number += 1
 
   def fill(
@@ -132,8 +132,7 @@ class Robot:
     for at in rng.choice(len(whole), min(PROBES, len(whole)), replace=False):
       source = whole[at]
       cut = int(rng.integers(source["onset"], source["steps"]))
-      shared = {k: source[k] for k in ("split", "seed")}
-      self.add(**shared, kind="probe", steps=cut, prefix=source["stream"])
+      self.add(split="score", kind="probe", seed=source["seed"], steps=cut, prefix=source["stream"])
 
 
 def write(
@@ -151,7 +150,7 @@ def write(
     (details of config.json: rounding steps, and the number of pasts that differ in the last digits,
     hence later in all, which should be 0; the streams' rows of META).
   """
-  common = dict(robot=robot, control_s=control_s, groups=groups)
+  common = {"robot": robot, "control_s": control_s, "groups": groups}
   own = Robot(suite, common, number, grains(parts["tune", "nominal"][2]))
   for split in ("score", "tune"):
     own.healthy(split, parts[split, "nominal"])
@@ -165,8 +164,7 @@ def write(
     (f"{robot}_latents", own.latents, PROJECTION),
   ):
     table = {k: np.concatenate([block[k] for block in blocks]) for k in blocks[0]}
-    path = out / f"{name}.parquet"
-    tables.write_table(path, table, split=split_up, codec="brotli", level=level)
+    tables.write_table(out / f"{name}.parquet", table, split=split_up, codec="brotli", level=level)
   return {"rounding": own.grain, "pasts_that_differ": own.differ}, own.meta
 
 
@@ -178,7 +176,8 @@ def healthy_probes(rows: list[dict]) -> list[dict]:
   follows from the robot's name.
   """
   rows = sorted(rows, key=lambda row: row["stream"])
-  out, number = [], 1 + max((row["stream"] for row in rows), default=-1)
+  out: list[dict] = []
+  first = rows[-1]["stream"] + 1
   for robot in dict.fromkeys(row["robot"] for row in rows):
     for split in ("score", "tune"):
       kind = robot, split, "nominal"
@@ -187,22 +186,18 @@ def healthy_probes(rows: list[dict]) -> list[dict]:
       for at in rng.choice(len(whole), min(HEALTHY_PROBES, len(whole)), replace=False):
         source = whole[at]
         cut = int(rng.integers(source["steps"] // 4, source["steps"]))
-        own = {"stream": number, "kind": "probe", "steps": cut, "prefix": source["stream"]}
-        out.append(source | own)
-        number += 1
+        own = {"kind": "probe", "steps": cut, "prefix": source["stream"]}
+        out.append(source | own | {"stream": first + len(out)})
   return out
 
 
 def write_meta(out: pathlib.Path, rows: list[dict]) -> None:
   """Writes streams.parquet, a row of META a stream, in the order of their numbers."""
-  whole = dict.fromkeys(("stream", "seed", "steps"), np.int32)
-  types: dict[str, Any] = whole | {"severity": float, "full": bool, "control_s": float}
   rows = sorted(rows, key=lambda row: row["stream"])
-  columns = {k: [row[k] for row in rows] for k in META}
-  tables.write_table(
-    out / "streams.parquet",
-    {k: np.asarray(v, types[k]) if k in types else v for k, v in columns.items()},
-  )
+  columns: dict[str, Any] = {k: [row[k] for row in rows] for k in META}
+  for k in ("stream", "seed", "steps"):
+    columns[k] = np.asarray(columns[k], np.int32)
+  tables.write_table(out / "streams.parquet", columns)
 
 
 def grains(healthy: dict[str, np.ndarray]) -> dict[str, float]:

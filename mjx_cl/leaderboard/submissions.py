@@ -266,10 +266,10 @@ def export(
     parts = []
     for n, steps in streams.scored((robot,)).items():
       one = streams.get(robot, [n])
-      known = {c: read(c, one.residual)[:, 0] for c in COLUMNS}
-      index = {"stream": np.full(steps, n, np.int32), "step": np.arange(steps, dtype=np.int32)}
       ends = {"episode": one.episode[:, 0], "terminated": one.residual.terminated[:, 0]}
-      parts.append(index | ends | known)
+      known = ends | {c: read(c, one.residual)[:, 0] for c in COLUMNS}
+      index = {"stream": np.full(steps, n, np.int32), "step": np.arange(steps, dtype=np.int32)}
+      parts.append(index | known)
     whole = {k: np.concatenate([part[k] for part in parts]) for k in parts[0]}
     tables.write_table(path, whole, level=9)
   return [str(path) for path in paths.values()]

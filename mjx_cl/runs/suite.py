@@ -619,7 +619,7 @@ def scores(folder: pathlib.Path) -> dict:
     recovery: arm -> Kaplan-Meier of the affected streams: n, recovered, median_steps,
       restricted_mean_steps up to HORIZON or to where the first stream is no longer watched, see
       survival.watched, each with _ci; null without affected streams.
-    ablation: the stop rule with each signal left out (scoring.ablation.ablated); only where an arm that
+    ablation: the stop rule with each signal left out (scoring.ablation); only where an arm that
       never stops has adapted.
     without_floor: patience [chunks], as text -> the same without the floor of `least` control
       steps, so that the signals alone decide.

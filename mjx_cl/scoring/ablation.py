@@ -104,12 +104,15 @@ def _row(
   row |= {"outcome": "adapting", "reason": None, "stop": None, "own_stop_steps": None}
   if len(ends):
     code, stop = int(decision[ends[0]]), chunks[ends[0]]["step"]
-    outcome = "converged" if code == STOP else "aborted"
-    row |= {"outcome": outcome, "reason": REASONS[code], "stop": stop}
-    row["own_stop_steps"] = stop + 1 - span["since"]
+    row |= {
+      "outcome": "converged" if code == STOP else "aborted",
+      "reason": REASONS[code],
+      "stop": stop,
+      "own_stop_steps": stop + 1 - span["since"],
+    }
   if curve:
-    judged = stop_rule.against(curve, span["since"], row["stop"])
-    row |= {k: judged.get(k) for k in JUDGED}
+    judged = dict.fromkeys(JUDGED) | stop_rule.against(curve, span["since"], row["stop"])
+    row |= {k: judged[k] for k in JUDGED}
   return row
 
 

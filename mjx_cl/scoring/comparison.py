@@ -142,16 +142,20 @@ def _drawn(rows: list[dict], reps: int) -> np.ndarray | None:
       raise UserError(
         f"the faults of robot {robot!r} must have the same seeds; got {streams} streams"
       )
-    sums = sum(_values(r) for r in mine)
-    drawn = drawn + sums @ bootstrap.weights(streams[0], reps, seed).T / len(rows)
+    weights = bootstrap.weights(streams[0], reps, seed)
+    drawn = drawn + sum(map(_values, mine)) @ weights.T / len(rows)
   return drawn
 
 
 def _values(row: dict) -> np.ndarray:
   """Every measure of each stream of a row, float (MEASURES, S)."""
   latency = [np.inf if x is None else x for x in row["stream_latency_steps"]]
-  alarms = np.array(row["stream_healthy_alarms"])
-  values = per_stream(np.array(latency, float), alarms, row["healthy_steps"], row["control_s"])
+  values = per_stream(
+    np.array(latency, float),
+    np.array(row["stream_healthy_alarms"]),
+    row["healthy_steps"],
+    row["control_s"],
+  )
   return np.stack(list(values.values()))
 
 

@@ -84,8 +84,7 @@ def ends(statistics: np.ndarray, level: float = 0.95) -> list[list[float | None]
   out: list[list[float | None] | None] = []
   for row in np.sort(np.asarray(statistics, float), -1):  # nan comes last
     known = int(np.sum(~np.isnan(row)))
-    at = [round((known - 1) * q) for q in ((1 - level) / 2, (1 + level) / 2)]
-    pair = [finite(row[k]) for k in at]
+    pair = [finite(row[round((known - 1) * q)]) for q in ((1 - level) / 2, (1 + level) / 2)]
     out.append(None if 2 * known < len(row) or pair == [None, None] else pair)
   return out
 

@@ -88,8 +88,8 @@ def spans(happened: list[dict]) -> list[dict]:
   out = []
   for e in happened:
     if e["kind"] == "start":
-      begun = {k: e[k] for k in ("stream", "arm", "seed", "since")}
-      out.append(begun | {"stop": None, "outcome": "adapting", "reason": None})
+      unknown = {"stop": None, "outcome": "adapting", "reason": None}
+      out.append({k: e[k] for k in ("stream", "arm", "seed", "since")} | unknown)
     elif e["kind"] in ("stop", "abort"):
       stopped = "converged" if ARMS[e["arm"]].end.rule else "ended"
       outcome = stopped if e["kind"] == "stop" else "aborted"
