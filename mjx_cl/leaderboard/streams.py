@@ -163,11 +163,8 @@ class StreamSet:
 
   def _hit(self, **values: Any) -> np.ndarray:
     """Which streams have these values in `meta`, None: any."""
-    hit = np.ones(len(self.meta["stream"]), bool)
-    for column, value in values.items():
-      if value is not None:
-        hit &= self.meta[column] == value
-    return hit
+    hits = [self.meta[k] == value for k, value in values.items() if value is not None]
+    return np.logical_and.reduce(hits)
 
   def find(
     self,
@@ -178,8 +175,9 @@ class StreamSet:
     severity: float | None = None,
   ) -> np.ndarray:
     """Stream numbers, in order."""
-    hit = self._hit(robot=robot, kind=kind, split=split, fault=fault, severity=severity)
-    return self.meta["stream"][hit]
+    return self.meta["stream"][
+      self._hit(robot=robot, kind=kind, split=split, fault=fault, severity=severity)
+    ]
 
   def faults(self, robot: str, split: str = "score") -> list[tuple[str, float]]:
     """(fault, severity) of fully kept streams, in the order of the suite."""

@@ -90,8 +90,14 @@ class Runner:
   def healthy(
     self, lanes: list[tuple[int, np.ndarray]], data: Samples
   ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Lanes (stream, thresholds (K,)), K = `together`: yields fired (K, T), scores (K, T, M) of
-    each.
+    """Runs lanes.
+
+    Args:
+      lanes: (stream, thresholds (K,)) of each, K = `together`.
+      data: of the robot.
+
+    Yields:
+      fired (K, T), scores (K, T, M) of each.
     """
     self.prepare(data)
     for now in batched(lanes, self.lanes):
@@ -107,11 +113,16 @@ class Runner:
   def faults(
     self, levels: np.ndarray, data: Samples
   ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """(fired bool (K, H, F), score float32 (K, H, F), before bool (O, F), us): from each onset on,
-    at K = len(levels) <= LEVELS thresholds.
+    """Runs fault streams from each onset on.
 
-    before: alarms at levels[0] ahead of each onset, False from it on; O: the last onset. us:
-    microseconds per sample of a stream, whose thresholds share its computation where they can.
+    Args:
+      levels: K <= LEVELS thresholds.
+      data: of the robot.
+
+    Returns:
+      (fired bool (K, H, F), score float32 (K, H, F), before bool (O, F), us); before: alarms at
+      levels[0] ahead of each onset, False from it on, O the last onset; us: microseconds per sample
+      of a stream, whose thresholds share its computation where they can.
     """
     self.prepare(data)
     last, horizon, faults = int(data.onset.max(initial=0)), data.horizon, len(data.fault)

@@ -112,7 +112,8 @@ class Healthy:
   healthy robot.
 
   Args:
-    streams: float (T,), (T, S) or (T, S, C). order: of the autoregression.
+    streams: float (T,), (T, S) or (T, S, C).
+    order: of the autoregression.
   """
 
   def __init__(self, streams: ArrayLike, order: int = ORDER) -> None:
