@@ -153,7 +153,8 @@ def _run(
     ready = oracle.done()
     return result, rows_of(name, reference, result, data, oracle.result()) if ready else None
 
-  with _workers() as pool:
+  # the program of a detector runs on one core, and several run side by side
+  with ThreadPoolExecutor(min(8, os.cpu_count() or 1), "detector") as pool:
     # one thread's work for a while: detectors run beside it, and are rated once it is there
     oracle = pool.submit(oracles.oracles, streams, data)
     # a long one that begins last would keep one core waiting for another
@@ -171,13 +172,6 @@ def _run(
     finally:  # after an error or Ctrl-C what has not begun never does
       pool.shutdown(wait=False, cancel_futures=True)
   return known, rows, curves, alarms
-
-
-def _workers() -> ThreadPoolExecutor:
-  """A thread per core, eight at the most: the program of a detector runs on one core, and several
-  run side by side.
-  """
-  return ThreadPoolExecutor(min(8, os.cpu_count() or 1), "detector")
 
 
 def rows_of(
