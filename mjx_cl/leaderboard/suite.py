@@ -121,8 +121,10 @@ class Suite:
 
 def of(data: dict) -> Suite:
   """A suite from TOML or JSON, which know no tuples."""
-  seeds = {k: tuple(v) for k, v in data["seeds"].items()}
-  return Suite(**data | {"onset": tuple(data["onset"]), "seeds": seeds})
+  return Suite(
+    **data
+    | {"onset": tuple(data["onset"]), "seeds": {k: tuple(v) for k, v in data["seeds"].items()}}
+  )
 
 
 def suite(name: str) -> Suite:
