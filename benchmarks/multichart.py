@@ -24,12 +24,13 @@ from mjx_cl import detectors
 from mjx_cl.cli import app
 from mjx_cl.detectors.baselines import REFERENCES  # noqa: E402
 from mjx_cl.io import tables as store  # noqa: E402
-from mjx_cl.leaderboard import score as leaderboard
-from mjx_cl.leaderboard import streams, sweep
+from mjx_cl.leaderboard import calibration, streams, sweep
+from mjx_cl.leaderboard import entries as entries_of
+from mjx_cl.leaderboard import program as program_of
 from mjx_cl.scoring import intervals, metrics  # noqa: E402
 
 
-def tuning(held: streams.StreamSet, robot: str) -> leaderboard.Data:
+def tuning(held: streams.StreamSet, robot: str) -> streams.Data:
   """A robot's tuning streams in the place of those that score; faults that score are left out, the
   oracle alone has them.
   """
@@ -40,16 +41,16 @@ def tuning(held: streams.StreamSet, robot: str) -> leaderboard.Data:
     robot,
     [n for fault, severity in keys for n in held.find(robot, "fault", "tune", fault, severity)],
   )
-  return leaderboard.Data(
+  return streams.Data(
     robot, healthy, healthy, faulty, held.suite.count_from, held.suite.arl0, held.suite.horizon_s
   )
 
 
-def standing(entry: leaderboard.Entry, data: leaderboard.Data, samples) -> dict:
+def standing(entry: entries_of.Entry, data: streams.Data, samples) -> dict:
   """threshold, score with its 95 % bootstrap interval over seeds, miss probability, false alarms an
   hour of one detector.
   """
-  found = leaderboard.examine(
+  found = calibration.examine(
     entry, data, sweep.Runner(entry.own(data.robot) if entry.own else entry.build), samples
   )
   seeds = sorted(set(data.fault.seed.tolist()))
@@ -76,7 +77,7 @@ def main(args: argparse.Namespace) -> None:
   held = streams.StreamSet(None)
   known = {
     name: settings
-    for name, settings in leaderboard.variants().items()
+    for name, settings in entries_of.variants().items()
     if settings["use"] != "multichart"
     and name not in REFERENCES
     and all(name in own or settings["use"] in detectors.PAPER for own in detectors.board().values())
@@ -87,8 +88,8 @@ def main(args: argparse.Namespace) -> None:
     one = data[robot][0]
     data[robot] = (
       one,
-      sweep.samples(
-        leaderboard.joined(one.tune.residual, one.score.residual),
+      program_of.samples(
+        streams.joined(one.tune.residual, one.score.residual),
         one.fault.residual,
         one.fault.onset,
         one.fault.seed,
@@ -97,7 +98,7 @@ def main(args: argparse.Namespace) -> None:
     )
 
   def score(name, settings):
-    entry = leaderboard.entry(name, settings)
+    entry = entries_of.entry(name, settings)
     tables[name] = {robot: standing(entry, *data[robot]) for robot in robots}
     print(
       f"{name:60s}"

@@ -22,7 +22,7 @@ runtime.setup()
 import jax  # noqa: E402
 
 from mjx_cl import envs, faults  # noqa: E402
-from mjx_cl.leaderboard.record import Behind  # noqa: E402
+from mjx_cl.leaderboard.lives import behind  # noqa: E402
 from mjx_cl.rollout.frozen import stream_keys  # noqa: E402
 from mjx_cl.rollout.monitor import Monitor  # noqa: E402
 from mjx_cl.rollout.scan import Rollout, nest, start  # noqa: E402
@@ -69,7 +69,7 @@ def main() -> None:
   rounds = max(1, args.steps // (chunk * TOGETHER))
   for k in range(1 + rounds):  # the first round compiles
     begin = time.perf_counter()
-    with Behind(batch[1]) as look:
+    with behind(batch[1]) as look:
       for _ in range(TOGETHER):
         look(batch[0]())
     middle = time.perf_counter()

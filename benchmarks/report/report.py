@@ -257,10 +257,10 @@ def mute(rows) -> dict[str, set]:
   return silent
 
 
-def dagger(marked: dict[str, set]) -> str:
+def never_note(marked: dict[str, set]) -> str:
   """The note under a board on the detectors marked so."""
   return (
-    "† no threshold gives that rate, the detector never alarms: "
+    "§ no threshold gives that rate, the detector never alarms: "
     f"{'; '.join(f'{name} on {joined(sorted(own))}' for name, own in marked.items())}."
   )
 
@@ -294,10 +294,10 @@ def best(rows: list[dict]) -> str:
 
 def lead(rows: list[dict], overall: list[dict]) -> str:
   """How far the first detector lies above the second; `rows` hold SCORED, `overall` is in order."""
-  from mjx_cl.scoring import metrics
+  from mjx_cl.scoring import comparison
 
   first, second = [r["detector"] for r in overall if "(oracle)" not in r["detector"]][:2]
-  ahead, interval = metrics.difference(rows, first, second)
+  ahead, interval = comparison.difference(rows, first, second)
   return (
     f"`{first}` lies {number(ahead, 1)} {span(interval, 1)} above `{second}` (paired over seeds, "
     "for these faults only)."
@@ -345,7 +345,7 @@ def leaderboard(results: pathlib.Path) -> str:
   whole = lambda x: f"{percent(x)}%"
   shown = [
     (
-      r["detector"] + " †" * (r["detector"] in silent),
+      r["detector"] + " §" * (r["detector"] in silent),
       f"{number(r['cost_standard'])} {span((r['cost_standard_low'], r['cost_standard_high']))}",
       whole(r["detected_within_1s"]),
       whole(r["detected_within_5s"]),
@@ -365,7 +365,7 @@ def leaderboard(results: pathlib.Path) -> str:
     rest += f" {words}: {', '.join(names)}." if names else ""
   marked = {name: own for name, own in silent.items() if kind(name) == "shown"}
   if marked:
-    rest = " " + dagger(marked) + rest
+    rest = " " + never_note(marked) + rest
   board = grid(
     (
       "detector",
@@ -420,7 +420,7 @@ def leaderboard_100k(results: pathlib.Path) -> str:
   }
   shown = [
     (
-      r["detector"] + " †" * (r["detector"] in marked),
+      r["detector"] + " §" * (r["detector"] in marked),
       f"{number(r['cost_standard'])} {span((r['cost_standard_low'], r['cost_standard_high']))}",
       number(held[r["detector"]]) if r["detector"] in held else "-",
       whole(r["detected_within_5s"]),
@@ -437,7 +437,7 @@ def leaderboard_100k(results: pathlib.Path) -> str:
       ("detector", "score [95 %]", "at ARL0 10,000", "within 5 s", "missed", "false alarms/h"),
       shown,
     )
-    + (f"\n\n{fill(dagger(marked))}" if marked else "")
+    + (f"\n\n{fill(never_note(marked))}" if marked else "")
   )
 
 

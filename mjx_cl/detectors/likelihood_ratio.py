@@ -70,8 +70,8 @@ def likelihood_ratio(
   detector of the same ARL0 has a smaller worst-case delay (Moustakides 1986).
 
   Args:
-    parameters: scoring.limits.Parameters of the same channels, in the same order and with the same
-      logarithm; may be traced.
+    parameters: scoring.autoregression.Parameters of the same channels, in the same order and with
+      the same logarithm; may be traced.
     threshold: decision level [nats]; may be traced.
     channels: of monitor.CHANNELS.
     log: ln max(x, 1e-9) in place of x, for all channels but the reward.
@@ -83,7 +83,7 @@ def likelihood_ratio(
   Blind to: a fault other than the fitted one; dependence beyond `order`; a reference that drifts.
   Reference: Moustakides 1986, Ann. Statist. 14, 1379-1387; Lai 1998, IEEE Trans. Inf. Theory 44,
   2917-2929 (dependent data).
-  Example: det = likelihood_ratio(limits.fit(nominal, faulty, order=8), threshold=8.0)
+  Example: det = likelihood_ratio(autoregression.fit(nominal, faulty, order=8), threshold=8.0)
   """
   demand(
     "likelihood_ratio",

@@ -2,19 +2,14 @@
 by assets/leaderboard.js.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import pathlib
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Iterable
+from typing import Any, NamedTuple
 
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.io import folders
-
-if TYPE_CHECKING:
-  from collections.abc import Iterable
-  from typing import Any
 
 ASSETS = pathlib.Path(__file__).parent / "assets"
 REFERENCES = ("never", "always", "periodic", "random", "oracle")  # drawn in grey and not ranked
@@ -29,12 +24,15 @@ class Column(NamedTuple):
   """One column of the tables.
 
   Attributes:
-    key: of a row. label, help: of the header and its tooltip. kind: text, number, integer, share
-      (shown in per cent), ratio or score.
+    key: of a row.
+    label: of the header.
+    kind: text, number, integer, share (shown in per cent), ratio or score.
     better: 1 where a higher figure is better, -1 where a lower one is, 0 where neither; the first
       click sorts the best to the top.
-    core: shown before `all columns` is chosen. tables: `rows`, `overall` or both. few: flag of a
-      row that marks the figure.
+    help: tooltip of the header.
+    core: shown before `all columns` is chosen.
+    tables: `rows`, `overall` or both.
+    few: flag of a row that marks the figure.
     noted: a figure above it is marked, and the row's note told at the mark.
   """
 
@@ -238,6 +236,7 @@ def write(
   dash; infinity is refused.
 
   Args:
+    path: of the file.
     rows: one dict per detector x robot x fault x severity, with every key of COLUMNS for `rows`;
       key_ci [low, high] or None is optional, and so is arl0_few, which marks figures that rest on
       fewer than 50 alarms; a figure above Column.noted needs a note.
@@ -255,25 +254,7 @@ def write(
     UserError where a key or a note is missing or a figure is infinite; FileError where the file
     cannot be written.
   """
-  for name, table, keys in (
-    ("row", rows, _keys("rows")),
-    ("overall", overall, _keys("overall")),
-    ("fault", faults, FAULT_KEYS),
-  ):
-    for i, row in enumerate(table):
-      _demand(f"{name} {i}", row, keys)
-      for c in COLUMNS if name == "row" else ():
-        if c.noted is not None and (row[c.key] or 0) > c.noted and not row["note"]:
-          raise UserError(
-            f"page: row {i} of {row['detector']}: its {c.key} is above {c.noted:g}, and no "
-            "note says why"
-          )
-      for j, life in enumerate(row.get("others", ()) if name == "fault" else ()):
-        _demand(f"{name} {i}, other stream {j}", life, LIFE_KEYS)
-  for detector, robots in curves.items():
-    for robot, points in robots.items():
-      for i, point in enumerate(points):
-        _demand(f"curve of {detector} on {robot}, point {i}", point, POINT_KEYS)
+  _check(rows, overall, curves, faults)
   keys = list(dict.fromkeys(key for row in rows for key in row))
   data = {
     "columns": [c._asdict() for c in COLUMNS],
@@ -286,15 +267,36 @@ def write(
     "faults": faults,
     "meta": {k: v for k, v in meta.items() if k != "references"},
   }
-  parts = {
-    "@CSS@": _asset("leaderboard.css"),
-    "@JS@": _asset("leaderboard.js"),
-    "@DATA@": embed(data),
-  }
   text = _asset("leaderboard.html")
-  for mark, part in parts.items():  # the data last, since a name may hold a mark
+  for mark, part in (
+    ("@CSS@", _asset("leaderboard.css")),
+    ("@JS@", _asset("leaderboard.js")),
+    ("@DATA@", embed(data)),  # the last, since a name may hold a mark
+  ):
     text = text.replace(mark, part)
   folders.atomic(path, lambda file: file.write(text.encode()))
+
+
+def _check(rows: list[dict], overall: list[dict], curves: dict, faults: list[dict]) -> None:
+  """Refuses tables that lack a key or a note."""
+  for i, row in enumerate(rows):
+    _demand(f"row {i}", row, _keys("rows"))
+    for c in COLUMNS:
+      if c.noted is not None and (row[c.key] or 0) > c.noted and not row["note"]:
+        raise UserError(
+          f"page: row {i} of {row['detector']}: its {c.key} is above {c.noted:g}, and no "
+          "note says why"
+        )
+  for i, row in enumerate(overall):
+    _demand(f"overall {i}", row, _keys("overall"))
+  for i, row in enumerate(faults):
+    _demand(f"fault {i}", row, FAULT_KEYS)
+    for j, life in enumerate(row.get("others", ())):
+      _demand(f"fault {i}, other stream {j}", life, LIFE_KEYS)
+  for detector, robots in curves.items():
+    for robot, points in robots.items():
+      for i, point in enumerate(points):
+        _demand(f"curve of {detector} on {robot}, point {i}", point, POINT_KEYS)
 
 
 def embed(value: object) -> str:

@@ -13,28 +13,26 @@ groups and latents), of the logarithm where they cannot be negative: a column's 
 0.5 % (2 %), the files shrink to a third. config.json holds the steps.
 """
 
-from __future__ import annotations
-
-import dataclasses
 import json
 import pathlib
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Collection, Sequence
+from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.io import tables
+from mjx_cl.leaderboard import suite as suites
+from mjx_cl.leaderboard.suite import about as about
+from mjx_cl.leaderboard.suite import suite as suite
 from mjx_cl.rollout.monitor import CHANNELS, LATENT, Residual
 from mjx_cl.scoring import metrics
 
-if TYPE_CHECKING:
-  from collections.abc import Collection, Sequence
-  from typing import Any
-
 VERSION = 1
-HERE = pathlib.Path(__file__).parent
-SUITES, RECORDINGS = HERE / "suites", HERE / "recordings"
+RECORDINGS = pathlib.Path(__file__).parent / "recordings"
 COLUMNS = tuple(CHANNELS)
+PROJECTION = tuple(f"z{k}" for k in range(LATENT))  # of the latent
 SCHEMA = {
   "stream": "int32, number of the stream",
   "step": "int32, control step since the stream began",
@@ -66,178 +64,19 @@ META = {
 }
 
 
-# ---- suites --------------------------------------------------------------------------------------
-
-
-@dataclasses.dataclass(frozen=True)
-class Suite:
-  """What is recorded and how it is scored; read from TOML.
-
-  Attributes:
-    name, arl0 [control steps], count_from [control steps], onset (low, high) [control steps],
-    horizon_s: as in suites/leaderboard.toml.
-    seeds: split -> (first, last). nominal: steps, and split -> streams per seed. latents: nominal
-      (streams), after_s.
-    robots: robot -> split -> {fault or fault:target: severities}.
-  """
-
-  name: str
-  arl0: float
-  count_from: int
-  onset: tuple[int, int]
-  horizon_s: float
-  seeds: dict[str, tuple[int, int]]
-  nominal: dict[str, int]
-  latents: dict[str, float]
-  robots: dict[str, dict[str, dict[str, tuple[float, ...]]]]
-
-  def __post_init__(self) -> None:
-    def need(holds: object, text: str) -> None:
-      if not holds:
-        raise UserError(f"suite {self.name!r}: {text}")
-
-    table: Any
-    whole: dict[str, list[Any]] = {
-      "count_from": [self.count_from],
-      "onset": list(self.onset),
-      **{f"[seeds] {k}": list(v) for k, v in self.seeds.items()},
-      **{f"[nominal] {k}": [v] for k, v in self.nominal.items()},
-      "[latents] nominal": [self.latents.get("nominal", 0)],
-    }
-    for name, values in whole.items():
-      need(
-        all(type(v) is int for v in values),
-        f"{name} must be made of whole numbers; got {', '.join(map(str, values))}",
-      )
-    need(all(len(v) == 2 for v in self.seeds.values()), "[seeds] are [first, last]")
-    need(self.arl0 > 0 and self.horizon_s > 0, "arl0 and horizon_s must be above 0")
-    need(
-      len(self.onset) == 2 and 0 <= self.count_from <= self.onset[0] < self.onset[1],
-      "onset must be [low, high] with count_from <= low < high",
-    )
-    for table, keys in (
-      ("seeds", {"score", "tune"}),
-      ("nominal", {"steps", "score", "tune"}),
-      ("latents", {"nominal", "after_s"}),
-    ):
-      need(set(getattr(self, table)) == keys, f"[{table}] needs {', '.join(sorted(keys))}")
-    need(self.nominal["steps"] > self.count_from, "nominal steps must exceed count_from")
-    need(
-      min(self.nominal["score"], self.nominal["tune"]) >= 1,
-      "[nominal] needs one or more streams per seed of either split",
-    )
-    (a, b), (c, d) = (self.seeds[s] for s in ("score", "tune"))
-    apart = min(a, c) >= 0 and a <= b and c <= d and (b < c or d < a)
-    need(
-      apart, "the seeds that score and the seeds that tune must be two ranges without a common seed"
-    )
-    need(bool(self.robots), "no [robots.NAME]")
-    for robot, splits in self.robots.items():
-      need(
-        set(splits) <= {"score", "tune"} and splits.get("score"),
-        f"robot {robot!r} needs a table `score`, and may have `tune`",
-      )
-      both = {k.split(":")[0] for k in splits["score"]} & {
-        k.split(":")[0] for k in splits.get("tune", {})
-      }
-      need(
-        not both,
-        (
-          f"robot {robot!r}: {', '.join(sorted(both))} is to tune and to score; take different "
-          "faults"
-        ),
-      )
-      for key, severities in ((k, v) for s in splits.values() for k, v in s.items()):
-        sound = bool(severities) and all(
-          isinstance(x, (int, float)) and 0 < x <= 1 for x in severities
-        )
-        need(sound, f"robot {robot!r}, {key}: severities in (0, 1]")
-      for table in splits.values():
-        named = [
-          (key.split(":")[0], float(x)) for key, severities in table.items() for x in severities
-        ]
-        twice = sorted({f"{fault} {x:g}" for fault, x in named if named.count((fault, x)) > 1})
-        need(
-          not twice,
-          (
-            f"robot {robot!r}: {', '.join(twice)} is there twice; a line of the board is one "
-            "fault at one severity, with one target"
-          ),
-        )
-
-  def numbers(self, split: str) -> list[int]:
-    """Seeds of a split."""
-    first, last = self.seeds[split]
-    return list(range(first, last + 1))
-
-  def onset_of(self, seed: int) -> int:
-    """First faulty control step of a seed's streams."""
-    return int(np.random.default_rng([seed, 7]).integers(*self.onset))
-
-  def after(self, control_s: float) -> int:
-    """Control steps that are kept from the onset on."""
-    return int(np.ceil(self.horizon_s / control_s)) + 1
-
-
-def _suite(data: dict) -> Suite:
-  """A suite from TOML or JSON, which know no tuples."""
-  return Suite(
-    **data
-    | {"onset": tuple(data["onset"]), "seeds": {k: tuple(v) for k, v in data["seeds"].items()}}
-  )
-
-
-def suite(name: str) -> Suite:
-  """A suite by name (`mjx-cl list suites`) or from a TOML file. `base` in a file names a suite that
-  ships: what the file leaves out is as there.
-
-  Raises:
-    UserError for an unknown name or a value out of range; FileError for a file that is no TOML.
-  """
-  path, data = tables.read_suite(name, SUITES)
-  if "base" in data:
-    base = data.pop("base")
-    names = sorted(p.stem for p in SUITES.glob("*.toml"))
-    if base not in names:
-      raise UserError(f"suite {path.name}: unknown base {base!r}; choose from: {', '.join(names)}")
-    data = tables.read_suite(base, SUITES)[1] | data
-  fields = {f.name for f in dataclasses.fields(Suite)}
-  if set(data) != fields:
-    wrong = [f"unknown {k!r}" for k in sorted(set(data) - fields)] + [
-      f"missing {k!r}" for k in sorted(fields - set(data))
-    ]
-    raise UserError(f"suite {path.name}: {', '.join(wrong)}; it takes: {', '.join(sorted(fields))}")
-  try:
-    return _suite(data)
-  except (TypeError, AttributeError, ValueError) as e:
-    raise UserError(f"suite {path.name}: a value of the wrong kind ({e})") from None
-
-
-def about() -> dict[str, str]:
-  """Name -> what a shipped suite holds, in one line."""
-  out = {}
-  for path in sorted(SUITES.glob("*.toml")):
-    s = suite(path.stem)
-    out[s.name] = ", ".join(
-      (
-        f"{r}: {sum(map(len, t['score'].values()))} faults that score, "
-        f"{sum(map(len, t.get('tune', {}).values()))} that tune"
-      )
-      for r, t in s.robots.items()
-    )
-  return out
-
-
-# ---- reading -------------------------------------------------------------------------------------
-
-
 class Streams(NamedTuple):
   """Streams side by side, time-major NumPy arrays; unknown values are nan.
 
   Attributes:
-    residual: monitor.Residual with leading (T, S); `variables` is empty. episode: int16 (T, S).
-    stream, seed, onset: int (S,); onset is T for a healthy stream. fault, target: lists of S.
-      severity: float (S,). control_s: [s].
+    residual: monitor.Residual with leading (T, S); `variables` is empty.
+    episode: int16 (T, S).
+    stream: number, int (S,).
+    seed: int (S,).
+    onset: int (S,), T for a healthy stream.
+    fault: names or None, of S.
+    target: names or None, of S.
+    severity: float (S,).
+    control_s: control period [s].
   """
 
   residual: Residual
@@ -249,6 +88,25 @@ class Streams(NamedTuple):
   target: list
   severity: np.ndarray
   control_s: float
+
+
+class Rows:
+  """A table whose rows lie stream by stream."""
+
+  def __init__(self, path: pathlib.Path) -> None:
+    self.columns = tables.read_table(path)
+    numbers = np.unique(self.columns["stream"], return_index=True, return_counts=True)
+    self.at = {n: slice(first, first + count) for n, first, count in zip(*numbers)}
+
+  def put(self, number: int, limit: int, column: int, out: dict[str, np.ndarray]) -> None:
+    """Writes the rows of stream `number` before step `limit` into column `column` of arrays by
+    name.
+    """
+    own = self.at.get(number, slice(0, 0))
+    step = self.columns["step"][own]
+    keep = step < limit
+    for name, array in out.items():
+      array[step[keep], column] = self.columns[name][own][keep]
 
 
 class StreamSet:
@@ -263,36 +121,33 @@ class StreamSet:
 
   def __init__(self, folder: pathlib.Path | str | None = None) -> None:
     self.folder = pathlib.Path(folder) if folder else RECORDINGS / "leaderboard"
+    none = f"{self.folder} holds no recorded streams"
+    make = "make some with `mjx-cl record`"
     try:
       self.config = json.loads((self.folder / "config.json").read_text())
     except (OSError, ValueError):
-      raise FileError(
-        f"{self.folder} holds no recorded streams (no readable config.json); make some with "
-        "`mjx-cl record`"
-      ) from None
+      raise FileError(f"{none} (no readable config.json); {make}") from None
     version = self.config.get("version") if isinstance(self.config, dict) else None
     if version is None:
-      raise FileError(
-        f"{self.folder} holds no recorded streams: its config.json is of something else; make "
-        "some with `mjx-cl record`"
-      )
+      raise FileError(f"{none}: its config.json is of something else; {make}")
     if version != VERSION:
       raise FileError(
         f"{self.folder}: streams of version {version}, this release reads version {VERSION}; "
         "record them anew"
       )
     try:
-      self.suite = _suite(self.config["suite"])
+      self.suite = suites.of(self.config["suite"])
     except (KeyError, TypeError, AttributeError, ValueError) as e:
       raise FileError(
         f"{self.folder / 'config.json'} names no suite ({type(e).__name__}: {e})"
       ) from None
     self.meta = tables.read_table(self.folder / "streams.parquet")
-    if set(self.meta) != set(META):
-      raise FileError(
-        f"{self.folder / 'streams.parquet'} is not of this schema: it has {', '.join(self.meta)}"
-      )
-    self._rows: dict[str, dict] = {}
+    self._demand("streams.parquet", self.meta, META)
+    self._held: dict[str, tuple[Rows, Rows]] = {}
+
+  def _demand(self, file: str, table: dict[str, np.ndarray], schema: dict[str, str]) -> None:
+    if set(table) != set(schema):
+      raise FileError(f"{self.folder / file} is not of this schema: it has {', '.join(table)}")
 
   @property
   def robots(self) -> list[str]:
@@ -306,6 +161,11 @@ class StreamSet:
         raise UserError(f"this set has no robot {robot!r}; choose from: {', '.join(self.robots)}")
     return list(dict.fromkeys(robots)) or self.robots
 
+  def _hit(self, **values: Any) -> np.ndarray:
+    """Which streams have these values in `meta`, None: any."""
+    hits = [self.meta[k] == value for k, value in values.items() if value is not None]
+    return np.logical_and.reduce(hits)
+
   def find(
     self,
     robot: str,
@@ -315,141 +175,113 @@ class StreamSet:
     severity: float | None = None,
   ) -> np.ndarray:
     """Stream numbers, in order."""
-    m = self.meta
-    hit = (m["robot"] == robot) & (m["kind"] == kind)
-    for column, value in (("split", split), ("fault", fault), ("severity", severity)):
-      if value is not None:
-        hit &= m[column] == value
-    return m["stream"][hit]
+    return self.meta["stream"][
+      self._hit(robot=robot, kind=kind, split=split, fault=fault, severity=severity)
+    ]
 
   def faults(self, robot: str, split: str = "score") -> list[tuple[str, float]]:
     """(fault, severity) of fully kept streams, in the order of the suite."""
-    m = self.meta
-    hit = (m["robot"] == robot) & (m["kind"] == "fault") & (m["split"] == split) & m["full"]
-    return list(dict.fromkeys(zip(m["fault"][hit].tolist(), m["severity"][hit].tolist())))
+    hit = self._hit(robot=robot, kind="fault", split=split, full=True)
+    fault, severity = (self.meta[k][hit].tolist() for k in ("fault", "severity"))
+    return list(dict.fromkeys(zip(fault, severity)))
 
   def extent(self, robot: str) -> tuple[int, int]:
     """(most control steps, number) of the fault streams that score."""
-    numbers = np.isin(self.meta["stream"], self.find(robot, "fault", "score"))
-    return int(self.meta["steps"][numbers].max()), int(numbers.sum())
+    steps = self.meta["steps"][self._hit(robot=robot, kind="fault", split="score")]
+    return int(steps.max()), len(steps)
 
   def scored(self, robots: Collection[str] = ()) -> dict[int, int]:
     """{stream: control steps} of all that a file of scores must hold: nominal, fault and probe
     streams; all robots where none is named.
     """
     m = self.meta
-    return {
-      int(n): int(steps)
-      for n, steps, kind, full, robot in zip(
-        m["stream"], m["steps"], m["kind"], m["full"], m["robot"]
-      )
-      if kind != "past" and full and (not robots or robot in robots)
-    }
+    hit = (m["kind"] != "past") & self._hit(full=True)
+    if robots:
+      hit &= np.isin(m["robot"].astype(str), list(robots))
+    return dict(zip(m["stream"][hit].tolist(), m["steps"][hit].tolist()))
 
-  def _load(self, robot: str) -> dict:
-    if robot not in self._rows:
-      self._rows.clear()  # one robot at a time: a set may be larger than the memory
-      rows = tables.read_table(self.folder / f"{robot}.parquet")
-      if set(rows) != set(SCHEMA):
-        raise FileError(
-          f"{self.folder / f'{robot}.parquet'} is not of this schema: it has {', '.join(rows)}"
-        )
-      latents = tables.read_table(self.folder / f"{robot}_latents.parquet")
-      starts = lambda t: dict(zip(*np.unique(t["stream"], return_index=True)))
-      ends = lambda t: dict(zip(*np.unique(t["stream"], return_counts=True)))
-      self._rows[robot] = {
-        "rows": rows,
-        "at": starts(rows),
-        "n": ends(rows),
-        "latents": latents,
-        "lat": starts(latents),
-        "latn": ends(latents),
-      }
-    return self._rows[robot]
+  def _load(self, robot: str) -> tuple[Rows, Rows]:
+    """Rows and latents of a robot."""
+    if robot not in self._held:
+      self._held.clear()  # one robot at a time: a set may be larger than the memory
+      rows = Rows(self.folder / f"{robot}.parquet")
+      self._demand(f"{robot}.parquet", rows.columns, SCHEMA)
+      self._held[robot] = rows, Rows(self.folder / f"{robot}_latents.parquet")
+    return self._held[robot]
 
   def _fill(
     self,
     robot: str,
     number: int,
     limit: int,
-    out: dict[str, np.ndarray],
-    z: np.ndarray | None,
     column: int,
+    out: dict[str, np.ndarray],
+    z: dict[str, np.ndarray],
   ) -> None:
-    """Writes the rows of stream `number` before step `limit` into column `column` of the arrays,
-    its past first.
+    """Writes what is known of stream `number` before step `limit` into column `column` of the
+    arrays, its past first.
     """
     m = self.meta
-    at = int(np.flatnonzero(m["stream"] == number)[0])
-    held = self._load(robot)
+    at = self._at(number)
     if m["prefix"][at] is not None and np.isfinite(m["prefix"][at]):
       cut = m["onset"][at] if m["kind"][at] == "fault" else m["steps"][at]
-      self._fill(robot, int(m["prefix"][at]), min(limit, int(cut)), out, z, column)
-    for rows, first, count, into in (
-      (held["rows"], held["at"], held["n"], out),
-      (held["latents"], held["lat"], held["latn"], None),
-    ):
-      if number not in first:
-        continue
-      own = slice(first[number], first[number] + count[number])
-      step = rows["step"][own]
-      keep = step < limit
-      if into is not None:
-        for name, array in into.items():
-          array[step[keep], column] = rows[name][own][keep]
-      elif z is not None:
-        z[step[keep], column] = np.stack([rows[f"z{k}"][own][keep] for k in range(LATENT)], -1)
+      self._fill(robot, int(m["prefix"][at]), min(limit, int(cut)), column, out, z)
+    rows, latents = self._load(robot)
+    rows.put(number, limit, column, out)
+    latents.put(number, limit, column, z)
+
+  def _at(self, number: int) -> int:
+    return int(np.flatnonzero(self.meta["stream"] == number)[0])
 
   def get(self, robot: str, numbers: Sequence[int] | np.ndarray) -> Streams:
     """Streams of one robot, the shorter ones filled up with unknown values to the longest."""
-    m = self.meta
-    at = [int(np.flatnonzero(m["stream"] == n)[0]) for n in numbers]
+    at = [self._at(n) for n in numbers]
     if not at:
       raise UserError(
         f"no such stream of robot {robot!r}; robots of this set: {', '.join(self.robots)}"
       )
-    steps = int(max(m["steps"][at]))
-    shape = (steps, len(at))
-    out = {c: np.full(shape, np.nan, np.float32) for c in COLUMNS} | {
-      "episode": np.zeros(shape, np.int16),
-      "terminated": np.zeros(shape, bool),
-    }
+    m = {k: v[at] for k, v in self.meta.items()}
+    shape = int(max(m["steps"])), len(at)
+    known: dict[str, Any] = {c: np.full(shape, np.nan, np.float32) for c in COLUMNS}
+    known |= {"episode": np.zeros(shape, np.int16), "terminated": np.zeros(shape, bool)}
     z = np.full(shape + (LATENT,), np.nan, np.float32)
-    for column, number in enumerate(numbers):
-      self._fill(robot, int(number), int(m["steps"][at[column]]), out, z, column)
-    groups = np.stack([x for name, x in out.items() if name.startswith("group_")], -1)
-    valid = np.isfinite(out["opr"])
-    none = np.zeros(shape + (0,), np.float32)
+    latents = {name: z[..., k] for k, name in enumerate(PROJECTION)}
+    for column, (number, steps) in enumerate(zip(numbers, m["steps"])):
+      self._fill(robot, int(number), int(steps), column, known, latents)
+    episode = known.pop("episode")
+    groups = [known.pop(c) for c in COLUMNS if c.startswith("group_")]
     residual = Residual(
-      out["opr"],
-      out["rpr"],
-      none,  # type: ignore[arg-type]
-      valid,
-      groups,  # type: ignore[arg-type]
-      out["reward"],
-      out["terminated"],
-      out["surprise"],
-      z,  # type: ignore[arg-type]
+      **known,
+      variables=np.zeros(shape + (0,), np.float32),  # type: ignore[arg-type]
+      valid=np.isfinite(known["opr"]),
+      groups=np.stack(groups, -1),  # type: ignore[arg-type]
+      latent=z,  # type: ignore[arg-type]
     )
-    onset = np.where(
-      m["kind"][at] == "fault", np.nan_to_num(m["onset"][at].astype(float), nan=steps), steps
-    ).astype(int)
+    onset = np.nan_to_num(m["onset"].astype(float), nan=shape[0])
     return Streams(
       residual,
-      out["episode"],
-      m["stream"][at].astype(int),
-      m["seed"][at].astype(int),
-      onset,
-      m["fault"][at].tolist(),
-      m["target"][at].tolist(),
-      m["severity"][at].astype(float),
-      float(m["control_s"][at[0]]),
+      episode,
+      m["stream"].astype(int),
+      m["seed"].astype(int),
+      np.where(m["kind"] == "fault", onset, shape[0]).astype(int),
+      m["fault"].tolist(),
+      m["target"].tolist(),
+      m["severity"].astype(float),
+      float(m["control_s"][0]),
     )
 
 
 class Data(NamedTuple):
-  """The streams of one robot. tune, score: healthy ones of either split. fault: of the seeds that
-  score; its labels are per stream.
+  """The streams of one robot.
+
+  Attributes:
+    robot: its name.
+    tune: healthy streams of the seeds that tune.
+    score: healthy streams of the seeds that score.
+    fault: of the seeds that score; its labels are per stream.
+    count_from: of the suite, and so are the next two [control steps].
+    arl0: [control steps].
+    horizon_s: [s].
   """
 
   robot: str
@@ -467,6 +299,31 @@ class Data(NamedTuple):
 
   def own(self, key: tuple[str, float]) -> np.ndarray:
     """Columns of `fault` with this fault and severity, seed by seed as in `score`."""
-    return np.flatnonzero(
-      [f == key[0] and s == key[1] for f, s in zip(self.fault.fault, self.fault.severity)]
-    )
+    return np.flatnonzero([one == key for one in zip(self.fault.fault, self.fault.severity)])
+
+
+def load(streams: StreamSet, robot: str) -> Data:
+  """One robot's streams.
+
+  Raises:
+    FileError where its fault streams are not one for each seed that scores.
+  """
+  tune, score = (streams.get(robot, streams.find(robot, "nominal", s)) for s in ("tune", "score"))
+  keys, suite = streams.faults(robot), streams.suite
+  numbers = np.concatenate([streams.find(robot, "fault", "score", *key) for key in keys])
+  fault = streams.get(robot, numbers)
+  data = Data(robot, tune, score, fault, suite.count_from, suite.arl0, suite.horizon_s)
+  seeds = list(dict.fromkeys(score.seed.tolist()))
+  for name, severity in keys:
+    if fault.seed[data.own((name, severity))].tolist() != seeds:
+      raise FileError(
+        f"{streams.folder}: {robot}, {name} {severity:g}: its streams must be those of the "
+        f"seeds {seeds}, in order, one of each"
+      )
+  return data
+
+
+def joined(a: Residual, b: Residual) -> Residual:
+  """Two residuals side by side, cut to the shorter."""
+  steps = min(len(a.opr), len(b.opr))
+  return jax.tree.map(lambda x, y: np.concatenate([x[:steps], y[:steps]], 1), a, b)

@@ -21,6 +21,7 @@ from mjx_cl.logs.columns import choose_columns
 from mjx_cl.logs.programs import LEVELS, Program, joint, table
 from mjx_cl.logs.read import Log, read
 from mjx_cl.logs.results import Detection, watched
+from mjx_cl.scoring import thresholds
 
 EXPECTED = 3  # nominal alarms below which the wanted ARL0 cannot be read off the nominal log
 FEW = 50  # alarms below which a measured run length is marked
@@ -57,18 +58,16 @@ def calibrate(
   top, wanted = float(scores.max()), _counted(nominal, begin) / arl0
   if wanted < EXPECTED:
     return top + MARGIN * max(top - float(np.median(scores)), 1e-3), False
+  count = lambda levels: program(levels, program.start, nominal)[1][begin:].sum(0)
+
+  def finer(tried: dict[float, int]) -> np.ndarray | None:
+    if min(abs(alarms - wanted) for alarms in tried.values()) <= 0.5:
+      return None
+    under, high = thresholds.passed({t: n for t, n in tried.items() if t < max(tried)}, wanted)
+    return None if under == -np.inf else np.linspace(under, min(high, max(tried)), LEVELS + 2)[1:-1]
+
   levels = np.quantile(scores, [0, 0.25, 0.5, 0.75, 0.9, 0.97, 0.99, 1])
-  tried: dict[float, int] = {}
-  for _ in range(6):  # 9^5 intervals between two quantiles
-    counts = program(levels, program.start, nominal)[1][begin:].sum(0)
-    tried |= {float(level): int(count) for level, count in zip(levels, counts)}
-    if min(abs(count - wanted) for count in tried.values()) <= 0.5:
-      break
-    ladder = sorted(tried)
-    above = [k for k, level in enumerate(ladder[:-1]) if tried[level] >= wanted]
-    if not above:
-      break
-    levels = np.linspace(ladder[above[-1]], ladder[above[-1] + 1], LEVELS + 2)[1:-1]
+  tried = thresholds.refine(count, levels, finer, 6)  # 9^5 intervals between two quantiles
   return min(tried, key=lambda level: (abs(tried[level] - wanted), -level)), True
 
 

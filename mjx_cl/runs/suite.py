@@ -46,7 +46,7 @@ from mjx_cl.runs import merge, run, settings, workers
 from mjx_cl.runs.doubts import doubts, watching
 from mjx_cl.runs.identity import arm_agents
 from mjx_cl.runs.records import acts
-from mjx_cl.scoring import normalised_recovery, stop_rule, survival
+from mjx_cl.scoring import ablation, normalised_recovery, stop_rule, survival
 from mjx_cl.training import agents, needs
 
 if TYPE_CHECKING:
@@ -619,7 +619,7 @@ def scores(folder: pathlib.Path) -> dict:
     recovery: arm -> Kaplan-Meier of the affected streams: n, recovered, median_steps,
       restricted_mean_steps up to HORIZON or to where the first stream is no longer watched, see
       survival.watched, each with _ci; null without affected streams.
-    ablation: the stop rule with each signal left out (scoring.stop.ablated); only where an arm that
+    ablation: the stop rule with each signal left out (scoring.ablation); only where an arm that
       never stops has adapted.
     without_floor: patience [chunks], as text -> the same without the floor of `least` control
       steps, so that the signals alone decide.
@@ -636,10 +636,9 @@ def scores(folder: pathlib.Path) -> dict:
     out["against_oracle"] = normalised_recovery.difference(scored, "detector", "oracle")
   if (folder / "signals.parquet").exists():
     try:
-      out["ablation"] = stop_rule.ablated(stop_rule.ablation(folder))
+      out["ablation"] = ablation.ablated(ablation.ablation(folder))
       out["without_floor"] = {
-        str(n): stop_rule.ablated(stop_rule.ablation(folder, least=1, patience=n))
-        for n in PATIENCES
+        str(n): ablation.ablated(ablation.ablation(folder, least=1, patience=n)) for n in PATIENCES
       }
     except UserError as e:
       if isinstance(e, FileError):

@@ -7,8 +7,6 @@ control step of what began the adaptation that it starts or ends, `chunk` the nu
 that `step` lies in. `reason` is for people.
 """
 
-from __future__ import annotations
-
 import os
 import pathlib
 

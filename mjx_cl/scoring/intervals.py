@@ -2,17 +2,13 @@
 and percentile bootstrap.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy import special, stats
-
-if TYPE_CHECKING:
-  from numpy.typing import ArrayLike
 
 REPS = 20_000
 
@@ -36,6 +32,8 @@ def interval(
     x: values of the runs (n,); with strata, (n, strata): each column is resampled by itself
       (rliable's stratified bootstrap).
     statistic: called as statistic(values, axis=-1) on (REPS, values).
+    seed: of the draws.
+    level: of the interval.
 
   Returns:
     [low, high], or None for fewer than two values.
@@ -43,15 +41,11 @@ def interval(
   x = np.asarray(x, float)
   if len(x) < 2:
     return None
-  rng = np.random.default_rng(seed)
-  if x.ndim == 1:
-    draws = x[rng.integers(0, len(x), (REPS, len(x)))]
-  else:
-    rows = rng.integers(0, len(x), (REPS,) + x.shape)
-    draws = np.take_along_axis(np.broadcast_to(x, (REPS,) + x.shape), rows, 1).reshape(REPS, -1)
-  found = statistic(draws, axis=-1)
-  low, high = np.quantile(found, [(1 - level) / 2, (1 + level) / 2], method="nearest")
-  return [finite(low), finite(high)]  # type: ignore[list-item]
+  rows = np.random.default_rng(seed).integers(0, len(x), (REPS,) + x.shape)
+  drawn = np.take_along_axis(x[None], rows, 1).reshape(REPS, -1)
+  found = statistic(drawn, axis=-1)
+  ends = np.quantile(found, [(1 - level) / 2, (1 + level) / 2], method="nearest")
+  return [finite(x) for x in ends]  # type: ignore[misc]
 
 
 @functools.lru_cache(maxsize=64)
@@ -81,20 +75,17 @@ def ends(statistics: np.ndarray, level: float = 0.95) -> list[list[float | None]
   Args:
     statistics: float (k, reps). nan: undefined in that draw, left out; inf: a censored time, an end
       that falls on one is None.
+    level: of the intervals.
 
   Returns:
     k times [low, high], None where fewer than half of the draws define the statistic or both ends
     are undefined.
   """
-  out = []
+  out: list[list[float | None] | None] = []
   for row in np.sort(np.asarray(statistics, float), -1):  # nan comes last
-    known = len(row) - int(np.sum(np.isnan(row)))
-    pair = (
-      [finite(row[int(round((known - 1) * q))]) for q in ((1 - level) / 2, (1 + level) / 2)]
-      if 2 * known >= len(row) and known
-      else None
-    )
-    out.append(None if pair in (None, [None, None]) else pair)
+    known = int(np.sum(~np.isnan(row)))
+    pair = [finite(row[round((known - 1) * q)]) for q in ((1 - level) / 2, (1 + level) / 2)]
+    out.append(None if 2 * known < len(row) or pair == [None, None] else pair)
   return out
 
 
@@ -104,11 +95,6 @@ def censored_median(x: ArrayLike, axis: int = -1) -> np.ndarray:
   """
   x = np.sort(np.asarray(x, float), axis)
   return np.take(x, (x.shape[axis] - 1) // 2, axis)
-
-
-def share(x: ArrayLike, axis: int = -1) -> np.ndarray:
-  """Mean of zeros and ones."""
-  return np.mean(np.asarray(x, float), axis)
 
 
 def wilson(hits: int, n: int) -> list[float] | None:

@@ -2,8 +2,6 @@
 1 as good as a reference.
 """
 
-from __future__ import annotations
-
 from mjx_cl.adapt.arms import ARMS, NEVER
 from mjx_cl.scoring import intervals
 
@@ -22,19 +20,17 @@ def normalise(
   """(final - none) / (reference - none), None where that means little.
 
   Args:
-    final, none, reference: mean reward of the last 2,000 steps of the arm, of arm `none`, of the
-      reference, in the same seed.
+    final: mean reward of the last 2,000 steps of the arm.
+    none: of arm `none` in the same seed, likewise.
+    reference: of the reference in the same seed, likewise.
     pre: mean reward before the change.
     least: None is returned unless reference - none is at least this share of pre; neither is
       anything made of a pre of 0 or less.
   """
-  if (
-    None in (final, none, reference, pre)
-    or pre <= 0  # type: ignore[operator]
-    or reference - none < least * pre  # type: ignore[operator]
-  ):
+  if final is None or none is None or reference is None or pre is None or pre <= 0:
     return None
-  return (final - none) / (reference - none)  # type: ignore[operator]
+  gain = reference - none
+  return None if gain < least * pre else (final - none) / gain
 
 
 def rows(runs: list[dict], expert: list[dict] | None = None, least: float = LEAST) -> list[dict]:
@@ -45,6 +41,7 @@ def rows(runs: list[dict], expert: list[dict] | None = None, least: float = LEAS
       adaptation shares their past.
     expert: rows of the run that holds the expert, one arm of true-onset trigger: its reward_final
       is the reference. None: reward_pre is.
+    least: see `normalise`.
 
   Returns:
     {stream, arm, seed, reward_final, reward_none, reward_pre, reward_reference, reference (`expert`
@@ -57,27 +54,21 @@ def rows(runs: list[dict], expert: list[dict] | None = None, least: float = LEAS
   }
   word, reference = "reward_pre", {seed: r["reward_pre"] for seed, r in none.items()}
   if expert is not None:
-    word, reference = (
-      "expert",
-      {r["seed"]: r["reward_final"] for r in expert if not r.get("change")},
-    )
+    word = "expert"
+    reference = {r["seed"]: r["reward_final"] for r in expert if not r.get("change")}
   out = []
   for r in first:
-    if r["seed"] in none and r["seed"] in reference and r["onset"] is not None:
-      base = none[r["seed"]]
+    seed = r["seed"]
+    if seed in none and seed in reference and r["onset"] is not None:
+      final, pre = none[seed]["reward_final"], none[seed]["reward_pre"]
       out.append(
-        {
-          "stream": r["stream"],
-          "arm": r["arm"],
-          "seed": r["seed"],
-          "reward_final": r["reward_final"],
-          "reward_none": base["reward_final"],
-          "reward_pre": base["reward_pre"],
-          "reward_reference": reference[r["seed"]],
+        {k: r[k] for k in ("stream", "arm", "seed", "reward_final")}
+        | {
+          "reward_none": final,
+          "reward_pre": pre,
+          "reward_reference": reference[seed],
           "reference": word,
-          "normalised": normalise(
-            r["reward_final"], base["reward_final"], reference[r["seed"]], base["reward_pre"], least
-          ),
+          "normalised": normalise(r["reward_final"], final, reference[seed], pre, least),
         }
       )
   return out

@@ -2,15 +2,12 @@
 steps, reward per step.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 TRAIL = 1000  # steps of the trailing mean
 HOLD = 2000  # steps for which it must stay
-SHARE = (
-  0.9  # of reward_pre; where that is negative, as much below it as 90 % are below a positive one
-)
+# of reward_pre; where that is negative, as much below it as 90 % are below a positive one
+SHARE = 0.9
 DROP = 2000  # steps after onset over which the drop is taken
 FINAL = 2000  # last steps of the run
 
@@ -30,11 +27,9 @@ def reward_pre(
 
 def reward_drop(reward: np.ndarray, onset: int, pre: float | None) -> float | None:
   """(reward_pre - mean(onset .. onset + 2,000)) / |reward_pre|, of arm `none`."""
-  return (
-    None
-    if not pre
-    else float(np.copysign(1.0, pre) * (1.0 - np.mean(reward[onset : onset + DROP]) / pre))
-  )
+  if not pre:
+    return None
+  return float(np.copysign(1.0, pre) * (1.0 - np.mean(reward[onset : onset + DROP]) / pre))
 
 
 def recovery_step(reward: np.ndarray, onset: int, pre: float | None) -> int | None:
@@ -97,8 +92,10 @@ def return_lost_healthy(
   adaptation to the onset.
 
   Args:
-    onset: the number of steps for a robot that never breaks. start: control step of the alarm, or
-      of whatever else started adaptation; None: nothing.
+    reward: (steps,).
+    onset: the number of steps for a robot that never breaks.
+    pre: reward_pre.
+    start: control step of the alarm, or of whatever else started adaptation; None: nothing.
 
   Returns:
     0 where nothing started before onset; None where there is no reward_pre to compare with.

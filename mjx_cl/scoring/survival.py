@@ -2,8 +2,6 @@
 and what follows from it.
 """
 
-from __future__ import annotations
-
 import math
 import warnings
 from typing import NamedTuple
@@ -22,10 +20,11 @@ class Curve(NamedTuple):
 
   Attributes:
     time: float (k,), distinct times at which something happened, rising.
-    survival, low, high: float (k,), the estimate and its pointwise 95 % interval; nan where the
-      interval is undefined.
-    at_risk, events: int (k,), streams under observation just before time[i], and those of them that
-      recovered at it.
+    survival: float (k,), the estimate.
+    low: float (k,), lower end of its pointwise 95 % interval; nan where that is undefined.
+    high: float (k,), upper end, likewise.
+    at_risk: int (k,), streams under observation just before time[i].
+    events: int (k,), those of them that recovered at it.
     last: longest time under observation.
   """
 
@@ -83,9 +82,8 @@ def quantile(curve: Curve, share: float = 0.5) -> tuple[float | None, list[float
   """
 
   def first(x: np.ndarray) -> float | None:
-    hit = np.flatnonzero(
-      x <= 1 - share + 1e-12
-    )  # products of fractions: S may be 0.5 to the last bit but one
+    # products of fractions: S may be 0.5 to the last bit but one
+    hit = np.flatnonzero(x <= 1 - share + 1e-12)
     return float(curve.time[hit[0]]) if len(hit) else None
 
   gone = curve.survival == 0  # the pointwise interval is undefined there; no stream is left

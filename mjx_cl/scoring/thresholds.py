@@ -2,8 +2,6 @@
 together.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 
@@ -11,6 +9,41 @@ import numpy as np
 
 TOGETHER = 8  # thresholds counted in one call
 ROUNDS = 8  # calls at the most
+HIGHEST = 1e9  # threshold above which alarms must have ceased
+
+
+def refine(
+  count: Callable[[np.ndarray], np.ndarray],
+  grid: np.ndarray,
+  finer: Callable[[dict[float, int]], np.ndarray | None],
+  rounds: int = ROUNDS,
+) -> dict[float, int]:
+  """Alarms at a grid of thresholds and, round by round, at finer ones inside it.
+
+  Args:
+    count: thresholds (TOGETHER,) -> alarms (TOGETHER,).
+    grid: the first thresholds, at most TOGETHER.
+    finer: {threshold: alarms} so far -> the next thresholds; None: enough is known.
+    rounds: calls of `count` at the most.
+
+  Returns:
+    {threshold: alarms}.
+  """
+  tried: dict[float, int] = {}
+  following: np.ndarray | None = grid
+  while following is not None and rounds:
+    levels = np.append(following, [following[-1]] * (TOGETHER - len(following)))
+    tried |= {float(t): int(c) for t, c in zip(levels, count(levels))}
+    following, rounds = finer(tried), rounds - 1
+  return tried
+
+
+def passed(tried: dict[float, int], target: float) -> tuple[float, float]:
+  """The highest threshold with more than `target` alarms and the next one above it, infinite where
+  there is none.
+  """
+  under = max((t for t, alarms in tried.items() if alarms > target), default=-math.inf)
+  return under, min((t for t in tried if t > under), default=math.inf)
 
 
 def narrow(
@@ -23,8 +56,9 @@ def narrow(
   many alarms is none.
 
   Args:
-    count: thresholds (TOGETHER,) -> alarms (TOGETHER,). scores: of the healthy streams without
-      restarts, nan unknown. target: alarms.
+    count: thresholds (TOGETHER,) -> alarms (TOGETHER,).
+    scores: of the healthy streams without restarts, nan unknown.
+    target: alarms.
 
   Returns:
     (threshold, [(threshold, alarms)] of all that were tried); infinity where no score is known, or
@@ -33,32 +67,70 @@ def narrow(
   known = scores[np.isfinite(scores)]
   if not len(known):
     return math.inf, []
-  top = float(known.max())
+  low, top = float(known.min()), float(known.max())
   top += max(abs(top) * 1e-3, 1e-6)
-  grid = np.unique(np.append(np.quantile(known, 1 - np.geomspace(0.3, 1e-5, TOGETHER - 1)), top))
-  tried: dict[float, int]
-  low, high, tried = float(known.min()), math.inf, {}
-  for _ in range(ROUNDS):
-    grid = np.append(grid, [grid[-1]] * (TOGETHER - len(grid)))
-    tried |= {float(t): int(c) for t, c in zip(grid, count(grid))}
-    bad = [t for t, c in tried.items() if c > target]
-    good = [t for t in tried if not bad or t > max(bad)]
-    if not good:
-      return math.inf, list(tried.items())
-    high = min(good)
-    under = max(bad) if bad else low if low < high else high - max(1.0, abs(high))
-    if high - under <= 1e-6 * max(abs(high), abs(under)) or bad and tried[under] - tried[high] <= 1:
-      break
-    if (
-      under >= 0 and high > 8 * under
-    ):  # evidence that grows without restarts leaves the threshold far below the scores
-      grid = np.geomspace(max(under, 1e-4 * high), high, TOGETHER + 2)[1:-1]
-    else:
-      grid = np.linspace(under, high, TOGETHER + 2)[1:-1]
-  if not bad:
+
+  def finer(tried: dict[float, int]) -> np.ndarray | None:
+    under, high = passed(tried, target)
+    if high == math.inf or under in tried and tried[under] - tried[high] <= 1:
+      return None
+    if under == -math.inf:
+      under = low if low < high else high - max(1.0, abs(high))
+    if high - under <= 1e-6 * max(abs(high), abs(under)):
+      return None
+    if under >= 0 and high > 8 * under:
+      # evidence that grows without restarts leaves the threshold far below the scores
+      return np.geomspace(max(under, 1e-4 * high), high, TOGETHER + 2)[1:-1]
+    return np.linspace(under, high, TOGETHER + 2)[1:-1]
+
+  shares = 1 - np.geomspace(0.3, 1e-5, TOGETHER - 1)
+  tried = refine(count, np.unique(np.append(np.quantile(known, shares), top)), finer)
+  under, high = passed(tried, target)
+  if under == -math.inf:
     most = max(tried.values())
     high = (min if most else max)(t for t, c in tried.items() if c == most)
   return high, list(tried.items())
+
+
+def reach(
+  few: Callable[[np.ndarray], np.ndarray], low: np.ndarray, high: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+  """Raises thresholds eightfold until each gives few enough alarms, or HIGHEST is passed.
+
+  Args:
+    few: thresholds (N,) -> whether their alarms are few enough, bool (N,).
+    low: (N,), below the first thresholds.
+    high: (N,), the first thresholds.
+
+  Returns:
+    (low, high, few at high); a threshold that was raised lies in (low, high].
+  """
+  while not (known := few(high)).all() and high.max() < HIGHEST:
+    low, high = np.where(known, low, high), np.where(known, high, high * 8)
+  return low, high, known
+
+
+def halve(
+  few: Callable[[np.ndarray], np.ndarray],
+  low: np.ndarray,
+  high: np.ndarray,
+  middle: Callable[[np.ndarray, np.ndarray], np.ndarray],
+  times: int,
+) -> np.ndarray:
+  """The least thresholds with few enough alarms, (N,), by halving what `reach` gives.
+
+  Args:
+    few: see `reach`.
+    low: (N,), thresholds with too many alarms.
+    high: (N,), thresholds with few enough.
+    middle: (low, high) -> what lies half-way, (N,).
+    times: halvings.
+  """
+  for _ in range(times):
+    between = middle(low, high)
+    known = few(between)
+    low, high = np.where(known, low, between), np.where(known, between, high)
+  return high
 
 
 def nearest(tried: list[tuple[float, int]], steps: float, arl0: float) -> float:
@@ -84,21 +156,17 @@ def by_seed(
   front: (steps, seeds).
 
   Args:
-    x: (T, S). seeds: (S,). seen: bool (S,), see `seeing`; where it is not true of all, the others
-      are cut into equal stretches, one for each seed.
+    x: (T, S).
+    seeds: (S,).
+    count_from: steps of each stream that come once.
+    seen: bool (S,), see `seeing`; where it is not true of all, the others are cut into equal
+      stretches, one for each seed.
   """
   owners = dict.fromkeys(seeds.tolist())
   if seen is not None and not seen.all():
     rest = x[count_from:, seen].T.reshape(-1)
     each = len(rest) // len(owners)
-    return np.concatenate(
-      [
-        np.broadcast_to(x[:count_from, :1], (count_from, len(owners))),
-        rest[: each * len(owners)].reshape(len(owners), each).T,
-      ]
-    )
-  columns = []
-  for seed in owners:
-    own = np.flatnonzero(seeds == seed)
-    columns.append(np.concatenate([x[:count_from, own[0]]] + [x[count_from:, k] for k in own]))
-  return np.stack(columns, -1)
+    front = np.broadcast_to(x[:count_from, :1], (count_from, len(owners)))
+    return np.concatenate([front, rest[: each * len(owners)].reshape(len(owners), each).T])
+  own = [np.flatnonzero(seeds == seed) for seed in owners]
+  return np.stack([np.append(x[:count_from, k[0]], x[count_from:, k].T) for k in own], -1)

@@ -740,14 +740,14 @@ def test_the_board_is_sorted_and_whole(results):
     shown
   ) > 10
   rest = text[text.rindex("\n\n") :].replace("\n", " ")
-  assert {r["detector"] for r in overall} == {d.removesuffix(" †") for d, _ in shown} | {
+  assert {r["detector"] for r in overall} == {d.removesuffix(" §") for d, _ in shown} | {
     r["detector"] for r in overall if f" {r['detector']} " in rest
   }
   assert "-0 " not in text and "-0]" not in text and "-0.0" not in text
   rows = parquet.read_table(results / "leaderboard.parquet").to_pylist()
   mute = {r["detector"] for r in rows if r["arl0_alarms"] == 0 and not r["reference"]}
-  assert {d.removesuffix(" †") for d, _ in shown if d.endswith("†")} == mute & {
-    d.removesuffix(" †") for d, _ in shown
+  assert {d.removesuffix(" §") for d, _ in shown if d.endswith("§")} == mute & {
+    d.removesuffix(" §") for d, _ in shown
   } and mute
   best = max(
     {r["detector"] for r in rows if not r["reference"]},

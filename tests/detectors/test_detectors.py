@@ -19,8 +19,8 @@ import scipy.stats
 from mjx_cl import detectors
 from mjx_cl.detectors import Alarm, Detector, any_of, on, rolling_sigma
 from mjx_cl.errors import UserError
-from mjx_cl.leaderboard import score as leaderboard
-from mjx_cl.leaderboard import sweep
+from mjx_cl.leaderboard import entries as entries_of
+from mjx_cl.leaderboard import program as program_of
 from mjx_cl.rollout.monitor import GROUPS, LATENT, Residual, unknown
 
 # one detector a file, named as the file; a map over one float32
@@ -587,7 +587,7 @@ def test_rpr_may_have_its_own_threshold():
   assert (fired() != fired(threshold_rpr=2.5)).any()
 
 
-@pytest.mark.parametrize("name", sorted(leaderboard.variants()))
+@pytest.mark.parametrize("name", sorted(entries_of.variants()))
 def test_pure_detectors_do_not_look_ahead(name):
   """Every entry of the board on a stream and on the same stream with another end: equal up to
   there, in alarms and scores, which are known by then.
@@ -605,9 +605,9 @@ def test_pure_detectors_do_not_look_ahead(name):
   end = lambda a, b: jnp.stack(
     [a, jnp.concatenate([a[:cut], b[cut:] * 2 if a.dtype != bool else b[cut:]])]
   )
-  detector = leaderboard.entry(name, leaderboard.variants()[name]).build(3.0)
+  detector = entries_of.entry(name, entries_of.variants()[name]).build(3.0)
   run = quick.jit(
-    jax.vmap(lambda xs: jax.lax.scan(sweep.updates(detector), detector.init(), xs)[1])
+    jax.vmap(lambda xs: jax.lax.scan(program_of.updates(detector), detector.init(), xs)[1])
   )
   fired, scores = (np.asarray(r) for r in run(jax.tree.map(end, x, other)))
   np.testing.assert_array_equal(fired[0, :cut], fired[1, :cut])

@@ -20,13 +20,24 @@ from mjx_cl import detectors
 from mjx_cl.detectors.python_class import HostDetector
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.io import tables as store
-from mjx_cl.leaderboard import oracle, record, streams, submissions, sweep
+from mjx_cl.leaderboard import (
+  calibration,
+  lives,
+  oracle,
+  set_tables,
+  streams,
+  submissions,
+  sweep,
+)
+from mjx_cl.leaderboard import entries as entries_of
+from mjx_cl.leaderboard import program as program_of
 from mjx_cl.leaderboard import score as leaderboard
-from mjx_cl.scoring import limits, metrics
+from mjx_cl.leaderboard.suite import Suite
+from mjx_cl.scoring import autoregression, metrics
 from mjx_cl.scoring import thresholds as healthy
 
 CONTROL_S, SEEDS = 0.5, 4
-SUITE = streams.Suite(
+SUITE = Suite(
   "small",
   400.0,
   200,
@@ -91,24 +102,24 @@ def make_set(folder, suite=SUITE, robots=("walker",)):
     parts = {}
     for split in ("score", "tune"):
       seeds = suite.numbers(split)
-      who = [record.Lane(s) for s in seeds for _ in range(suite.nominal[split])]
+      who = [lives.Lane(s) for s in seeds for _ in range(suite.nominal[split])]
       parts[split, "nominal"] = (
         who,
         np.zeros(len(who), int),
         part(who, np.zeros(len(who), int), suite.nominal["steps"], 1),
       )
-      who = record.lanes(suite, robot, split)
+      who = lives.lanes(suite, robot, split)
       onsets = np.asarray([suite.onset_of(lane.seed) for lane in who])
       parts[split, "fault"] = (
         who,
         onsets,
         part(who, onsets, int(onsets.max()) + suite.after(CONTROL_S), 2),
       )
-    details[robot], fresh = record._write(
+    details[robot], fresh = set_tables.write(
       suite, folder, robot, parts, len(rows), CONTROL_S, ",".join(f"g{k}" for k in range(8))
     )
     rows += fresh
-  record.write_meta(folder, rows + record.healthy_probes(rows))
+  set_tables.write_meta(folder, rows + set_tables.healthy_probes(rows))
   store.write_json(
     folder / "config.json",
     {"version": streams.VERSION, "suite": dataclasses.asdict(suite), "details": details},
@@ -292,8 +303,8 @@ def test_narrow_goes_below_the_scores_where_evidence_restarts():
 
 @pytest.fixture(scope="module")
 def board(small):
-  entries = [leaderboard.entry("cusum", {"warmup": 150})] + [
-    leaderboard.entry(n, {"use": n}) for n in ("never", "always")
+  entries = [entries_of.entry("cusum", {"warmup": 150})] + [
+    entries_of.entry(n, {"use": n}) for n in ("never", "always")
   ]
   return leaderboard.score(small[0], entries)
 
@@ -337,7 +348,7 @@ def test_pages_hold_the_stream_of_every_seed_and_its_alarms(small, board):
   """Alarms of a detector that always alarms stand at each stream's own onset; missed and found ones
   are as many as the row counts.
   """
-  data = leaderboard.load(small[0], "walker")
+  data = streams.load(small[0], "walker")
   assert {(p["fault"], p["severity"]) for p in board.faults} == set(small[0].faults("walker"))
   for found in board.faults:
     lives, own = [found] + found["others"], data.own((found["fault"], found["severity"]))
@@ -368,8 +379,8 @@ def test_pages_hold_the_alarms_before_the_onset(small, board):
   """Those of a threshold so low that some streams have one, against the plain scan over whole
   streams.
   """
-  data = leaderboard.load(small[0], "walker")
-  one = leaderboard.entry("cusum", {"warmup": 150})
+  data = streams.load(small[0], "walker")
+  one = entries_of.entry("cusum", {"warmup": 150})
   low = one._replace(build=lambda threshold: one.build(3.5), calibrated=False)
   fired = np.asarray(program(low.build)(np.float32([0]), data.fault.residual)[0])[0]
   early = {}
@@ -389,23 +400,23 @@ def test_a_longer_stream_changes_no_number(small, tmp_path, monkeypatch):
   """Rows, curves and pages are the same where each fault stream goes on for another 150 steps, in
   which whatever alarms is to count nowhere.
   """
-  kept, after = SUITE.after(CONTROL_S), streams.Suite.after
+  kept, after = SUITE.after(CONTROL_S), Suite.after
   with monkeypatch.context() as patch:
-    patch.setattr(streams.Suite, "after", lambda self, control_s: after(self, control_s) + 150)
+    patch.setattr(Suite, "after", lambda self, control_s: after(self, control_s) + 150)
     make_set(tmp_path / "longer")
   longer = streams.StreamSet(tmp_path / "longer")
   assert (
     longer.extent("walker") == (small[0].extent("walker")[0] + 150, small[0].extent("walker")[1])
     and SUITE.after(CONTROL_S) == kept
   )
-  a, b = (leaderboard.load(held, "walker").fault for held in (small[0], longer))
+  a, b = (streams.load(held, "walker").fault for held in (small[0], longer))
   np.testing.assert_array_equal(
     b.residual.opr[: a.onset.min() + kept], a.residual.opr[: a.onset.min() + kept]
   )
   assert np.isfinite(b.residual.opr[a.onset.max() + kept :]).any()
   entries = [
-    leaderboard.entry("cusum", {"warmup": 150}),
-    leaderboard.entry("rolling_sigma_plain", {"window": 150, "warmup": 100}),
+    entries_of.entry("cusum", {"warmup": 150}),
+    entries_of.entry("rolling_sigma_plain", {"window": 150, "warmup": 100}),
   ]
   extra = [
     ("above", submissions.from_host(HostDetector(lambda: Above(2.5), "above", "opr", False)))
@@ -428,7 +439,7 @@ def test_the_oracles_episodes_are_those_of_its_healthy_runs(board):
   )
   want = metrics.episode_alarm_probability(fired, episode, 20)
   assert (
-    leaderboard._episodes(healthy.by_seed(fired, seeds, 20), data) == want
+    oracle.episodes(healthy.by_seed(fired, seeds, 20), data) == want
     and 0.2 < want["episode_alarm_probability"] < 0.8
   )
   for row in pick(board, detector="likelihood_ratio (oracle)"):
@@ -466,7 +477,7 @@ def test_a_fault_more_changes_no_other_number(small, board, tmp_path):
   )
   make_set(tmp_path / "more", more)
   other = leaderboard.score(
-    streams.StreamSet(tmp_path / "more"), [leaderboard.entry("cusum", {"warmup": 150})]
+    streams.StreamSet(tmp_path / "more"), [entries_of.entry("cusum", {"warmup": 150})]
   )
   for f, s in (("gear", 0.5), ("bias", 1.0)):
     a, b = (
@@ -483,7 +494,7 @@ def test_restarted_cusum_equals_the_detector(small):
   from mjx_cl.detectors.likelihood_ratio import likelihood_ratio
 
   held = small[0]
-  data = leaderboard.load(held, "walker")
+  data = streams.load(held, "walker")
   healthy = oracle.channels(data.tune.residual, slice(0, 4))[200:]
   own = np.flatnonzero(np.asarray(data.fault.fault) == "gear")[-SEEDS:]
   after = np.stack(
@@ -493,7 +504,7 @@ def test_restarted_cusum_equals_the_detector(small):
     ],
     1,
   )
-  p = limits.fit(healthy, after, 2)
+  p = autoregression.fit(healthy, after, 2)
   x = jax.tree.map(lambda a: jnp.asarray(a[:200, own]), data.fault.residual)
   x = x._replace(
     opr=jnp.nan_to_num(x.opr, nan=1.0),
@@ -506,7 +517,7 @@ def test_restarted_cusum_equals_the_detector(small):
   ratio = np.concatenate(
     [
       np.full((2, SEEDS), np.nan),
-      limits.log_ratio(oracle.channels(jax.tree.map(np.asarray, x)), p),
+      autoregression.log_ratio(oracle.channels(jax.tree.map(np.asarray, x)), p),
     ]
   )
   fired, score = oracle.restarted(ratio, np.full(SEEDS, 3.0))
@@ -553,15 +564,15 @@ def program(build):
 )
 def test_passes_equal_whole_streams_at_every_threshold(small, name, settings, together):
   """Shared pasts, reused runs and unused lanes against the plain scan over whole streams."""
-  data = leaderboard.load(small[0], "walker")
+  data = streams.load(small[0], "walker")
   nominal, onset, horizon = (
-    leaderboard.joined(data.tune.residual, data.score.residual),
+    streams.joined(data.tune.residual, data.score.residual),
     data.fault.onset,
     data.horizon,
   )
-  one, tune = leaderboard.entry(name, settings), len(data.tune.stream)
+  one, tune = entries_of.entry(name, settings), len(data.tune.stream)
   build = one.own("quadruped") if one.own else one.build  # whose residuals have a threshold each
-  known = sweep.samples(nominal, data.fault.residual, onset, data.fault.seed, horizon)
+  known = program_of.samples(nominal, data.fault.residual, onset, data.fault.seed, horizon)
   runner, plain = sweep.Runner(build), program(build)
   assert len(known.past) == SEEDS  # three faults of a seed share one
   counter = sweep.Counter(runner, known, tune, data.count_from)
@@ -599,20 +610,21 @@ def test_passes_equal_whole_streams_at_every_threshold(small, name, settings, to
 
 def test_more_pasts_than_lanes(small, monkeypatch):
   """Each batch of pasts keeps rows of its own."""
-  data = leaderboard.load(small[0], "walker")
-  known = sweep.samples(
-    leaderboard.joined(data.tune.residual, data.score.residual),
+  data = streams.load(small[0], "walker")
+  known = program_of.samples(
+    streams.joined(data.tune.residual, data.score.residual),
     data.fault.residual,
     data.fault.onset,
     data.fault.seed,
     data.horizon,
   )
-  one = leaderboard.entry("rolling_sigma_plain", {"window": 150, "warmup": 100})
+  one = entries_of.entry("rolling_sigma_plain", {"window": 150, "warmup": 100})
   found = []
   for lanes in (20, 3):
-    monkeypatch.setattr(sweep, "LANES_SHARED", lanes)
+    for module in (program_of, sweep):
+      monkeypatch.setattr(module, "LANES_SHARED", lanes)
     found.append(
-      sweep.Runner(one.build, sweep.room(small[0], ["walker"])).faults(
+      sweep.Runner(one.build, program_of.room(small[0], ["walker"])).faults(
         np.float32([2.0, 3.0]), known
       )[:3]
     )
@@ -624,33 +636,33 @@ def test_more_pasts_than_lanes(small, monkeypatch):
 @pytest.mark.parametrize(
   "name, settings, lanes",
   [
-    ("cusum", {"warmup": 150}, sweep.LANES),
-    ("rolling_sigma_plain", {"window": 150, "warmup": 100}, sweep.LANES_SHARED),
+    ("cusum", {"warmup": 150}, program_of.LANES),
+    ("rolling_sigma_plain", {"window": 150, "warmup": 100}, program_of.LANES_SHARED),
   ],
 )
 def test_time_per_sample_counts_an_update_once(small, monkeypatch, name, settings, lanes):
   """One second for all lanes of the longest past and of one horizon; eight thresholds that share a
   score are one update.
   """
-  data = leaderboard.load(small[0], "walker")
-  known = sweep.samples(
-    leaderboard.joined(data.tune.residual, data.score.residual),
+  data = streams.load(small[0], "walker")
+  known = program_of.samples(
+    streams.joined(data.tune.residual, data.score.residual),
     data.fault.residual,
     data.fault.onset,
     data.fault.seed,
     data.horizon,
   )
   monkeypatch.setattr(sweep, "time", types.SimpleNamespace(perf_counter=iter([5.0, 6.0]).__next__))
-  us = sweep.Runner(leaderboard.entry(name, settings).build).faults(np.float32([3.0]), known)[-1]
+  us = sweep.Runner(entries_of.entry(name, settings).build).faults(np.float32([3.0]), known)[-1]
   assert us == pytest.approx(1e6 / (lanes * (data.fault.onset.max() + data.horizon)))
 
 
 def test_other_pasts_are_not_shared(small):
-  data = leaderboard.load(small[0], "walker")
-  nominal = leaderboard.joined(data.tune.residual, data.score.residual)
+  data = streams.load(small[0], "walker")
+  nominal = streams.joined(data.tune.residual, data.score.residual)
   other = data.fault.residual._replace(opr=data.fault.residual.opr.copy())
   other.opr[100, 0] += 1.0
-  known = sweep.samples(nominal, other, data.fault.onset, data.fault.seed, data.horizon)
+  known = program_of.samples(nominal, other, data.fault.onset, data.fault.seed, data.horizon)
   assert len(known.past) == SEEDS + 1 and (known.owner == known.owner[0]).sum() == 1
 
 
@@ -675,16 +687,16 @@ def test_a_threshold_used_otherwise_is_found_out_and_all_is_run(small):
   from mjx_cl.detectors.base import Alarm, Detector
 
   early = lambda t: Detector(lambda: jnp.int32(0), lambda s, x: (s, Alarm(x.opr > t - 0.25, x.opr)))
-  data = leaderboard.load(small[0], "walker")
-  known = sweep.samples(
-    leaderboard.joined(data.tune.residual, data.score.residual),
+  data = streams.load(small[0], "walker")
+  known = program_of.samples(
+    streams.joined(data.tune.residual, data.score.residual),
     data.fault.residual,
     data.fault.onset,
     data.fault.seed,
     data.horizon,
   )
-  got = leaderboard.examine(
-    leaderboard.Entry("early", early, True, False, ""), data, sweep.Runner(early), known
+  got = calibration.examine(
+    entries_of.Entry("early", early, True, False), data, sweep.Runner(early), known
   )
   opr = data.tune.residual.opr[data.count_from :]
   want, _ = healthy.narrow(
@@ -851,17 +863,17 @@ def test_detectors_by_channel_and_from_files_stand_beside_the_others(late, tmp_p
   pathlib.Path("level.py").write_text(example("level.py"))
   names = [
     e.name
-    for e in leaderboard.chosen(
+    for e in entries_of.chosen(
       ("level.py:level@opr", "never", "cusum@opr+reward", "cusum@opr", "never", "cusum@opr+reward"),
       "walker",
     )
   ]
   assert names == ["never", "cusum@opr", "level.py:level@opr", "cusum@opr+reward"]
-  assert leaderboard.chosen(("none",), "walker") == [] and [
-    e.name for e in leaderboard.chosen((), "walker")
-  ] == list(leaderboard.variants())
-  one = leaderboard.chosen(("level.py:level@opr",), "walker")[0]
-  assert one.calibrated and not one.reference and one.about.startswith("A sample more than")
+  assert entries_of.chosen(("none",), "walker") == [] and [
+    e.name for e in entries_of.chosen((), "walker")
+  ] == list(entries_of.variants())
+  one = entries_of.chosen(("level.py:level@opr",), "walker")[0]
+  assert one.calibrated and not one.reference
 
 
 def test_what_is_no_detector_gets_one_line(refused, late, tmp_path, monkeypatch):  # noqa: F811
@@ -993,6 +1005,6 @@ def test_files(small, board, tmp_path):
 
 
 def test_every_entry_of_the_default_board_is_built():
-  for name, settings in leaderboard.variants().items():
-    one = leaderboard.entry(name, settings)
-    assert isinstance(one.build(3.0), detectors.Detector) and one.about
+  for name, settings in entries_of.variants().items():
+    one = entries_of.entry(name, settings)
+    assert isinstance(one.build(3.0), detectors.Detector)

@@ -18,12 +18,13 @@ from mjx_cl.detectors.python_class import HostDetector
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.io import tables
 from mjx_cl.io.plugins import Registry
+from mjx_cl.leaderboard import entries as entries_of
 from mjx_cl.leaderboard import oracle as oracles
-from mjx_cl.leaderboard import record, streams, submissions
+from mjx_cl.leaderboard import record, set_tables, streams, submissions
 from mjx_cl.leaderboard import score as leaderboard
 from mjx_cl.scoring import thresholds
 
-NEVER = [leaderboard.entry("never", {})]
+NEVER = [entries_of.entry("never", {})]
 
 
 def one_line(error):
@@ -60,7 +61,7 @@ def test_one_seed_and_nothing_to_tune_on(tmp_path):
   )
   make_set(tmp_path / "set", suite)
   board = leaderboard.score(
-    streams.StreamSet(tmp_path / "set"), [leaderboard.entry("cusum", {"warmup": 150})]
+    streams.StreamSet(tmp_path / "set"), [entries_of.entry("cusum", {"warmup": 150})]
   )
   (row,) = pick(board, detector="cusum")
   assert (
@@ -159,12 +160,14 @@ def test_a_column_that_hardly_varies_is_kept_as_it_is():
     "latent": np.zeros((50, 2, 16), np.float16),
     "rpr": unknown,
   }
-  grain = record._grain(columns)
-  np.testing.assert_array_equal(record.rounded(constant[:, 0], "group_3", grain), constant[:, 0])
-  np.testing.assert_array_equal(record.rounded(unknown[:, 0], "rpr", grain), unknown[:, 0])
+  grain = set_tables.grains(columns)
   np.testing.assert_array_equal(
-    record.rounded(np.zeros(3, np.float32), "group_3", grain),
-    np.full(3, record.FLOOR, np.float32),
+    set_tables.rounded(constant[:, 0], "group_3", grain), constant[:, 0]
+  )
+  np.testing.assert_array_equal(set_tables.rounded(unknown[:, 0], "rpr", grain), unknown[:, 0])
+  np.testing.assert_array_equal(
+    set_tables.rounded(np.zeros(3, np.float32), "group_3", grain),
+    np.full(3, set_tables.FLOOR, np.float32),
   )
 
 
@@ -241,10 +244,10 @@ def test_a_broken_set_gets_one_line(tmp_path):
   swapped[np.flatnonzero((meta["kind"] == "fault") & (meta["split"] == "score"))[:2]] = [1, 0]
   tables.write_table(tmp_path / "streams.parquet", meta | {"seed": swapped})
   with pytest.raises(FileError, match="walker, gear 0.5: its streams must be those of the seeds"):
-    leaderboard.load(streams.StreamSet(tmp_path), "walker")
+    streams.load(streams.StreamSet(tmp_path), "walker")
   tables.write_table(tmp_path / "walker.parquet", {"stream": np.arange(3)})
   with pytest.raises(FileError, match="is not of this schema"):
-    leaderboard.load(streams.StreamSet(tmp_path), "walker")
+    streams.load(streams.StreamSet(tmp_path), "walker")
 
 
 # ---- thresholds ----------------------------------------------------------------------------------
@@ -308,7 +311,7 @@ def test_an_oracle_of_heavy_tails_keeps_the_asked_rate():
 def test_what_a_detector_cannot_see_is_no_healthy_operation(small):  # noqa: F811
   """knn looks at latents, which are kept for 6 of 16 healthy streams that tune and of 8 that score."""
   board = leaderboard.score(
-    small[0], [leaderboard.entry("knn", {"warmup": 150, "references": 50, "smooth": 10})]
+    small[0], [entries_of.entry("knn", {"warmup": 150, "references": 50, "smooth": 10})]
   )
   row = pick(board, detector="knn", fault="bias")[0]
   assert 1 <= row["arl0_alarms"] <= 6 * 824 / 400 and row["arl0"] == 6 * 824 / row["arl0_alarms"]
@@ -337,7 +340,7 @@ def test_streams_of_a_seed_are_put_together():
 
 
 def bare(build):
-  return leaderboard.Entry("mine", build, True, False, "")
+  return entries_of.Entry("mine", build, True, False)
 
 
 def step(decide):
@@ -375,9 +378,9 @@ def test_a_plug_in_is_scored(small, monkeypatch):  # noqa: F811
     )
 
   monkeypatch.setitem(detectors.DETECTORS, "mine", mine)
-  assert leaderboard.variants()["mine"] == {"use": "mine"}
+  assert entries_of.variants()["mine"] == {"use": "mine"}
   row = pick(
-    leaderboard.score(small[0], [leaderboard.entry("mine", {})]), detector="mine", fault="bias"
+    leaderboard.score(small[0], [entries_of.entry("mine", {})]), detector="mine", fault="bias"
   )[0]
   host = submissions.from_host(lambda v: HostDetector(lambda: Above(v), "above"), "threshold")
   other = pick(

@@ -665,7 +665,7 @@ def test_an_efficiency_above_one_is_marked(browser, file, board, tmp_path):
     "=> [n.textContent, n.title])"
   )
   assert (
-    marks == [["‡", "above 1: it was luckier"]]
+    marks == [["*", "above 1: it was luckier"]]
     and "efficiency above 1" in browser.one("#full-foot").text
   )
   browser.open(file)

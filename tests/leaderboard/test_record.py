@@ -16,8 +16,8 @@ from test_run import saved  # noqa: F401  a fixture
 from mjx_cl.cli import app
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.io import tables
+from mjx_cl.leaderboard import lives, streams
 from mjx_cl.leaderboard import record as recording
-from mjx_cl.leaderboard import streams
 
 SUITE = """
 name = "mini"
@@ -187,7 +187,7 @@ def two(tmp_path, monkeypatch):
       "target": np.array([lane.target or "all" for lane in who]),
     }
 
-  monkeypatch.setattr(recording, "_record", live)
+  monkeypatch.setattr(lives, "live", live)
 
   def record(name, robots=(), seed=0, **edit):
     draw[0], out, own = seed, tmp_path / name, dataclasses.replace(suite, **edit)

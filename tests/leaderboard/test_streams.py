@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mjx_cl import envs
-from mjx_cl.leaderboard import record, streams
+from mjx_cl.leaderboard import lives, record, streams
 from mjx_cl.rollout.frozen import stream_keys
 from mjx_cl.training import agents
 
@@ -77,8 +77,8 @@ def test_recorded_again_it_begins_alike(shipped, robot):
   keys = stream_keys(seeds, each + 1)[
     np.flatnonzero(np.arange(len(seeds) * (each + 1)) % (each + 1))
   ]
-  lanes = [record.Lane(seed) for seed in seeds for _ in range(each)]
-  got = record._record(
+  lanes = [lives.Lane(seed) for seed in seeds for _ in range(each)]
+  got = lives.live(
     env, agents.of(env), lanes, keys, np.zeros(len(lanes), int), 64, 0, lambda *_: None
   )
   want = shipped.get(robot, shipped.find(robot, "nominal", "score")[: len(lanes)]).residual

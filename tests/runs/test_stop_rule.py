@@ -23,7 +23,7 @@ from mjx_cl.keys import OfSeed
 from mjx_cl.rollout.scan import Rollout, nest, start
 from mjx_cl.runs import run, settings, snapshots, suite
 from mjx_cl.runs.snapshots import Snapshots
-from mjx_cl.scoring import stop_rule
+from mjx_cl.scoring import ablation, stop_rule
 from mjx_cl.training import agents
 
 # ---- by hand -------------------------------------------------------------------------------------
@@ -522,7 +522,7 @@ def test_the_rule_without_a_signal(lived):
   out, _ = lived
   trace = tables.read_table(out / "trace.parquet")["reward"].reshape(4, LIFE)
   assert trace[2, :576].tobytes() == trace[3, :576].tobytes()
-  rows = stop_rule.ablation(out)
+  rows = ablation.ablation(out)
   assert [r["left_out"] for r in rows] == [
     "",
     "opr",
@@ -547,8 +547,8 @@ def test_the_rule_without_a_signal(lived):
     "lost_share",
   )
   assert {k: rows[0][k] for k in shared} == {k: judged[k] for k in shared}
-  assert suite.scores(out)["ablation"] == stop_rule.ablated(rows) and list(
-    stop_rule.ablated(rows)
+  assert suite.scores(out)["ablation"] == ablation.ablated(rows) and list(
+    ablation.ablated(rows)
   ) == [r["left_out"] for r in rows]
 
 
@@ -570,7 +570,7 @@ def test_aggregates_of_the_ablation_by_hand():
     row("aborted", 500, True, 0.1),
     row("adapting", None, None, None),
   ]
-  got = stop_rule.ablated(rows + [dict(rows[0], left_out="")])
+  got = ablation.ablated(rows + [dict(rows[0], left_out="")])
   assert (
     list(got) == ["reward", ""]
     and got["reward"]["adaptations"] == 4
@@ -585,7 +585,7 @@ def test_aggregates_of_the_ablation_by_hand():
   ] == pytest.approx(0.1)
   assert (
     got[""]["lost_share"] == 0.2
-    and stop_rule.ablated([dict(rows[3], left_out="")])[""]["lost_share"] is None
+    and ablation.ablated([dict(rows[3], left_out="")])[""]["lost_share"] is None
   )
 
 
@@ -666,7 +666,7 @@ def test_leaving_out_the_signal_that_holds_up_the_stop(tmp_path):
     "least_posture": np.full(180, np.nan),
   }
   tables.write_table(tmp_path / "signals.parquet", columns)
-  rows = {(r["seed"], r["left_out"]): r for r in stop_rule.ablation(tmp_path)}
+  rows = {(r["seed"], r["left_out"]): r for r in ablation.ablation(tmp_path)}
   assert len(rows) == 14
   # the start falls into chunk 5; the ring of four is full with chunk 9
   late = rows[0, ""]["stop"]
@@ -680,14 +680,14 @@ def test_leaving_out_the_signal_that_holds_up_the_stop(tmp_path):
   }
   other = {
     (r["seed"], r["left_out"]): r["stop"]
-    for r in stop_rule.ablation(tmp_path, patience=8, least=20 * 64)
+    for r in ablation.ablation(tmp_path, patience=8, least=20 * 64)
   }
   assert (
     other[0, "value_loss"] == 26 * 64 - 1
   )  # the first chunk whose end lies `least` after the start in step 330
   assert other[0, ""] > late
   with pytest.raises(UserError, match="no budget; choose from: patience, trend"):
-    stop_rule.ablation(tmp_path, budget=5)
+    ablation.ablation(tmp_path, budget=5)
   assert all(r["outcome"] == "converged" for (seed, _), r in rows.items() if seed == 0)
   assert all(
     r["outcome"] == "aborted" for (seed, _), r in rows.items() if seed == 1
@@ -696,7 +696,7 @@ def test_leaving_out_the_signal_that_holds_up_the_stop(tmp_path):
   assert reasons == dict.fromkeys(reasons, "no settling in sight") | {"value_loss": BELOW}
   with pytest.raises(FileError, match="signals"):
     (tmp_path / "signals.parquet").unlink()
-    stop_rule.ablation(tmp_path)
+    ablation.ablation(tmp_path)
 
 
 # ---- what is refused -----------------------------------------------------------------------------

@@ -16,7 +16,7 @@ import scipy.stats
 from mjx_cl.detectors.likelihood_ratio import likelihood_ratio
 from mjx_cl.errors import UserError
 from mjx_cl.rollout.monitor import unknown
-from mjx_cl.scoring import limits
+from mjx_cl.scoring import autoregression, limits
 
 
 def residual(x, reward=None):
@@ -34,10 +34,10 @@ def ar1(rng, phi, shape):
 
 def gaussian(shift):
   """Parameters of a mean shift in independent standard normal values."""
-  model = lambda mean: limits.Conditional(
+  model = lambda mean: autoregression.Conditional(
     np.array([mean]), np.zeros((0, 1, 1)), np.eye(1), np.array(0.0)
   )
-  return limits.Parameters(model(0.0), model(shift))
+  return autoregression.Parameters(model(0.0), model(shift))
 
 
 @jax.jit
@@ -160,7 +160,7 @@ def test_oracle_beats_a_plain_cusum_on_correlated_data_at_equal_arl0(phi, shift,
   """
   onset, target = 100, 2000.0
   rng = np.random.default_rng(1)
-  fitted = limits.fit(ar1(rng, phi, (2000, 10)), shift + ar1(rng, phi, (2000, 10)), order=1)
+  fitted = autoregression.fit(ar1(rng, phi, (2000, 10)), shift + ar1(rng, phi, (2000, 10)), order=1)
   nominal, faulty = ar1(rng, phi, (3000, 150)), ar1(rng, phi, (400, 1000))
   faulty[onset:] += shift
   delays = []
@@ -188,13 +188,13 @@ def test_oracle_score_is_a_numpy_cusum_of_the_log_ratio():
   x = np.stack([np.exp(ar1(rng, 0.5, (300, 4))), ar1(rng, 0.7, (300, 4))], -1)
   x[150:] += [0.5, -0.5]
   y = np.stack([np.log(x[..., 0]), x[..., 1]], -1)
-  parameters = limits.fit(y[:150], y[150:], order=2)
+  parameters = autoregression.fit(y[:150], y[150:], order=2)
   detector = likelihood_ratio(parameters, 3.0, ("opr", "reward"))
   out = jax.jit(jax.vmap(lambda r: jax.lax.scan(detector.update, detector.init(), r)[1], 1, 1))
   got = jax.device_get(
     out(residual(jnp.asarray(x[..., 0], jnp.float32), jnp.asarray(x[..., 1], jnp.float32)))
   )
-  ratio, evidence = limits.log_ratio(y, parameters), np.zeros(4)
+  ratio, evidence = autoregression.log_ratio(y, parameters), np.zeros(4)
   assert np.isnan(got.score[:2]).all() and not got.fired[:2].any()
   for t in range(298):
     evidence = np.maximum(0, evidence + ratio[t])
@@ -299,7 +299,9 @@ def test_information_is_measured_on_other_seeds_than_it_was_fitted_on():
     other.append(limits.information(nominal, faulty, order=20, reps=2)["information_nats_per_step"])
     own.append(
       np.nanmean(
-        limits.log_ratio(faulty[:, :1], limits.fit(nominal[:, 1:], faulty[:, :1], order=20))
+        autoregression.log_ratio(
+          faulty[:, :1], autoregression.fit(nominal[:, 1:], faulty[:, :1], order=20)
+        )
       )
     )
   error = np.std(other) / math.sqrt(len(other))
@@ -319,14 +321,14 @@ def test_fit_recovers_an_autoregression_and_leaves_unknown_steps_out():
     x[t] = x[t - 1] @ matrix.T + rng.standard_normal((8, 2)) @ factor.T
   x += mean
   x[rng.random((5000, 8)) < 0.05] = np.nan
-  model = limits.fit(x, x, order=1).before
+  model = autoregression.fit(x, x, order=1).before
   # four errors: 36,000 steps, coefficients' errors are about 1 / sqrt(36,000) of the deviations'
   # ratio
   np.testing.assert_allclose(model.lags[0], matrix, atol=0.03)
   np.testing.assert_allclose(model.intercept, mean - matrix @ mean, atol=0.05)
   np.testing.assert_allclose(np.linalg.inv(model.whitener), factor, atol=0.03)
   assert model.log_det == pytest.approx(2 * math.log(0.8), abs=0.04)
-  e = limits.innovations(x, model)
+  e = autoregression.innovations(x, model)
   np.testing.assert_allclose(
     np.nanmean(e[..., None] * e[..., None, :], (0, 1)), np.eye(2), atol=1e-5
   )  # the floor adds a millionth
@@ -334,9 +336,9 @@ def test_fit_recovers_an_autoregression_and_leaves_unknown_steps_out():
 
 def test_a_frozen_channel_is_finite():
   rng = np.random.default_rng(8)
-  ratio = limits.log_ratio(
+  ratio = autoregression.log_ratio(
     np.full((50, 2), 3.0),
-    limits.fit(rng.standard_normal((500, 2)), np.full((500, 2), 3.0), order=2),
+    autoregression.fit(rng.standard_normal((500, 2)), np.full((500, 2), 3.0), order=2),
   )
   assert np.isfinite(ratio).all() and (ratio > 5).all()
 
@@ -344,9 +346,9 @@ def test_a_frozen_channel_is_finite():
 def test_fits_refuse_too_little():
   x = np.zeros((10, 2))
   for call in (
-    lambda: limits.fit(x, x, order=20),
-    lambda: limits.fit(x, x, order=8),
-    lambda: limits.fit(x, np.zeros((10, 2, 2))),
+    lambda: autoregression.fit(x, x, order=20),
+    lambda: autoregression.fit(x, x, order=8),
+    lambda: autoregression.fit(x, np.zeros((10, 2, 2))),
     lambda: limits.information(np.zeros((99, 1)), np.zeros((99, 1))),
     lambda: limits.information(np.zeros((99, 2)), np.zeros((99, 3))),
   ):
@@ -357,6 +359,12 @@ def test_fits_refuse_too_little():
 # ---- whitening and the closed form ---------------------------------------------------------------
 
 
+def whitened(x):
+  """Innovations under a fit of order 2, and the fit."""
+  model = autoregression.fit(x, x, 2).before
+  return autoregression.innovations(x, model)[..., 0], model
+
+
 def test_ljung_box_by_hand_and_its_level():
   """Q against a plain loop with SciPy's chi-square; on white streams p is uniform, after a fit too."""
   rng = np.random.default_rng(9)
@@ -364,16 +372,17 @@ def test_ljung_box_by_hand_and_its_level():
   q = 0.0
   for e in (x - x.mean(0)).T:
     q += sum(200 * 202 * (e[k:] @ e[:-k] / (e @ e)) ** 2 / (200 - k) for k in range(1, 6))
-  got = limits.ljung_box(x, lags=5, fitted=1)
+  got = autoregression.ljung_box(x, lags=5, fitted=1)
   assert got == pytest.approx((q, scipy.stats.chi2.sf(q, 14)))
 
-  p = [limits.ljung_box(limits.whiten(ar1(rng, 0.8, 1000), 2)[0], fitted=2)[1] for _ in range(200)]
+  p = [autoregression.ljung_box(whitened(ar1(rng, 0.8, 1000))[0], fitted=2)[1] for _ in range(200)]
   assert scipy.stats.kstest(p, "uniform").pvalue > 1e-3
-  assert limits.ljung_box(ar1(rng, 0.2, (1000, 2)))[1] < 1e-6
+  assert autoregression.ljung_box(ar1(rng, 0.2, (1000, 2)))[1] < 1e-6
 
 
-def test_whiten_gives_unit_innovations():
-  white, model = limits.whiten(5 + 3 * ar1(np.random.default_rng(10), 0.9, (4000, 5)), order=2)
+def test_innovations_of_its_own_fit_have_unit_deviation():
+  x = 5 + 3 * ar1(np.random.default_rng(10), 0.9, (4000, 5))
+  white, model = whitened(x)
   assert white.shape == (3998, 5) and np.std(white) == pytest.approx(1, abs=1e-3)
   np.testing.assert_allclose(
     model.lags.ravel(), [0.9, 0.0], atol=0.03

@@ -10,7 +10,7 @@ import pytest
 import scipy.stats
 
 from mjx_cl.errors import UserError
-from mjx_cl.scoring import intervals, metrics
+from mjx_cl.scoring import comparison, intervals, metrics
 
 STEPS, HEALTHY, SEEDS, ONSET, WARM, CONTROL = 1200, 1500, 6, 300, 100, 0.05
 HORIZON = 400  # 20 s
@@ -215,7 +215,7 @@ def test_more_faults_change_a_mean_by_their_share_alone():
   ]
   new = random_row(7) | {"robot": "walker", "fault": "new", "severity": 1.0}
   before, after = (
-    metrics.overall(x).rows for x in (rows, rows + [new | {"detector": d} for d in "ab"])
+    comparison.overall(x).rows for x in (rows, rows + [new | {"detector": d} for d in "ab"])
   )
   for old in before:
     own = next(r for r in after if r["detector"] == old["detector"])
@@ -294,12 +294,12 @@ def test_difference_of_two_detectors_is_paired_over_seeds():
         k: float(np.mean(v))
         for k, v in metrics.per_stream(latency.astype(float), false_alarms, 5000, CONTROL).items()
       }
-  value, (low, high) = metrics.difference(rows, "b", "a", reps=400)
+  value, (low, high) = comparison.difference(rows, "b", "a", reps=400)
   assert value > 0 and low == pytest.approx(value) == high
   rows[-1]["stream_latency_steps"] = rows[-1]["stream_latency_steps"][
     ::-1
   ]  # no longer the same lead in every stream
-  value, interval = metrics.difference(rows, "b", "a", reps=400)
+  value, interval = comparison.difference(rows, "b", "a", reps=400)
   cost = lambda r: metrics.per_stream(
     np.array(r["stream_latency_steps"], float), np.array(r["stream_healthy_alarms"]), 5000, CONTROL
   )["cost_standard"]
@@ -312,9 +312,9 @@ def test_difference_of_two_detectors_is_paired_over_seeds():
     )
   assert interval == pytest.approx(intervals.ends([loop])[0]) and interval[0] < value < interval[1]
   with pytest.raises(UserError, match="same faults; got 3 and 2"):
-    metrics.difference(rows[:5], "a", "b")
+    comparison.difference(rows[:5], "a", "b")
   with pytest.raises(UserError, match="no streams"):
-    metrics.difference(
+    comparison.difference(
       [{k: v for k, v in r.items() if k != "stream_latency_steps"} for r in rows], "a", "b"
     )
 
@@ -453,8 +453,8 @@ def test_a_reference_takes_no_rank_and_makes_none():
   told = [r | {"reference": True} for r in suite({"oracle": 0})]
   told[0]["cost_standard"] = None  # nor does a fault without it cost the others their ranks
   want, got = (
-    metrics.overall(rivals),
-    metrics.overall([r | {"reference": False} for r in rivals] + told),
+    comparison.overall(rivals),
+    comparison.overall([r | {"reference": False} for r in rivals] + told),
   )
   ranks = lambda o: {r["detector"]: r["mean_rank"] for r in o.rows}
   assert (
@@ -466,7 +466,7 @@ def test_a_reference_takes_no_rank_and_makes_none():
 
 def test_overall_means_ranks_and_order():
   rows = suite({"slow": 200, "quick": 5, "middle": 100})
-  got = metrics.overall(rows)
+  got = comparison.overall(rows)
   assert (
     [r["detector"] for r in got.rows] == ["quick", "middle", "slow"]
     and [r["mean_rank"] for r in got.rows] == [1, 2, 3]
@@ -484,13 +484,13 @@ def test_overall_means_ranks_and_order():
       assert r[name] == pytest.approx(np.mean([x[name] for x in mine]))
     low, high = r["cost_standard_ci"]
     assert low < r["cost_standard"] < high < low + 10
-  again = metrics.overall(rows[::-1])
+  again = comparison.overall(rows[::-1])
   assert [r["detector"] for r in again.rows] == ["quick", "middle", "slow"]
   assert again.rows[0]["cost_standard_ci"] == pytest.approx(
     got.rows[0]["cost_standard_ci"]
   )  # sums in another order
   # all are found within 20 s, without false alarms: no interval of width zero
-  none = metrics.overall(
+  none = comparison.overall(
     [r | {"stream_healthy_alarms": [0] * SEEDS, "false_alarms_per_hour": 0.0} for r in rows]
   ).rows[0]
   assert none["detected_within_20s_ci"] == intervals.wilson(12, 12)
@@ -507,12 +507,12 @@ def test_overall_interval_draws_a_seed_with_all_faults_of_its_robot():
   same = [
     r | {"detector": "a", "robot": "walker", "fault": f"f{k}", "severity": 0.5} for k in range(9)
   ]
-  one, nine = metrics.overall(same[:1]).rows[0], metrics.overall(same).rows[0]
+  one, nine = comparison.overall(same[:1]).rows[0], comparison.overall(same).rows[0]
   assert nine["cost_standard_ci"] == pytest.approx(one["cost_standard_ci"]) and one[
     "cost_standard_ci"
   ] == pytest.approx(r["cost_standard_ci"])
   width = lambda x: x["cost_standard_ci"][1] - x["cost_standard_ci"][0]
-  robots = metrics.overall([x | {"robot": f"r{k}"} for k, x in enumerate(same)]).rows[0]
+  robots = comparison.overall([x | {"robot": f"r{k}"} for k, x in enumerate(same)]).rows[0]
   assert width(robots) == pytest.approx(
     width(one) / 3, rel=0.2
   )  # nine robots are independent; 2,000 draws and six seeds' skew
@@ -521,13 +521,13 @@ def test_overall_interval_draws_a_seed_with_all_faults_of_its_robot():
 def test_overall_of_rows_without_streams_and_with_gaps():
   rows = suite({"a": 0, "b": 50}, faults=2)
   bare = [{k: v for k, v in r.items() if not k.startswith("stream_")} for r in rows]
-  got = metrics.overall(bare)
+  got = comparison.overall(bare)
   assert (
-    got.rows[0]["cost_standard"] == pytest.approx(metrics.overall(rows).rows[0]["cost_standard"])
+    got.rows[0]["cost_standard"] == pytest.approx(comparison.overall(rows).rows[0]["cost_standard"])
     and got.rows[0]["cost_standard_ci"] is None
   )
-  assert metrics.overall(rows[:-1]).blocks == 3  # the block that one detector lacks has no ranks
-  gap = metrics.overall([rows[0] | {"cost_standard": None}] + rows[1:])
+  assert comparison.overall(rows[:-1]).blocks == 3  # the block that one detector lacks has no ranks
+  gap = comparison.overall([rows[0] | {"cost_standard": None}] + rows[1:])
   a = next(r for r in gap.rows if r["detector"] == "a")
   assert (
     a["cost_standard"] is None
@@ -535,14 +535,14 @@ def test_overall_of_rows_without_streams_and_with_gaps():
     and gap.blocks == 3
     and gap.rows[-1] is a
   )
-  assert metrics.overall(rows[:1])[1:] == (None, None, 1) and metrics.overall([]) == (
+  assert comparison.overall(rows[:1])[1:] == (None, None, 1) and comparison.overall([]) == (
     [],
     None,
     None,
     0,
   )
   with pytest.raises(UserError, match="two rows"):
-    metrics.overall(rows + rows[:1])
+    comparison.overall(rows + rows[:1])
 
 
 @pytest.mark.parametrize("detectors, q", [(2, 1.960), (3, 2.343), (5, 2.728), (10, 3.164)])
@@ -554,7 +554,7 @@ def test_critical_difference_equals_demsars_table(detectors, q):
     for d in range(detectors)
     for k in range(12)
   ]
-  got = metrics.overall(rows, reps=2)
+  got = comparison.overall(rows, reps=2)
   assert got.critical_difference == pytest.approx(
     q * math.sqrt(detectors * (detectors + 1) / 72), rel=3e-4
   )
@@ -579,7 +579,7 @@ def test_friedman_equals_scipy_with_ties():
       }
       for k in range(9)
     ]
-  got = metrics.overall(rows, reps=2)
+  got = comparison.overall(rows, reps=2)
   assert (
     got.friedman_p == pytest.approx(scipy.stats.friedmanchisquare(*scores).pvalue)
     and 1e-6 < got.friedman_p < 0.5

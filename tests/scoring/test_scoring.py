@@ -34,14 +34,6 @@ def test_a_run_without_a_fault_has_false_alarms_alone():
   assert alarms.score(fired(100, 0, 99), onset=100) == (None, None, 2)
 
 
-def test_false_alarms_per_hour():
-  assert alarms.false_alarms_per_hour(3, 7200, 0.025) == pytest.approx(
-    60.0
-  )  # 7,200 steps of 0.025 s are 3 minutes
-  assert alarms.false_alarms_per_hour(0, 10, 0.025) == 0.0
-  assert alarms.false_alarms_per_hour(0, 0, 0.025) is None
-
-
 # ---- windows of the reward -----------------------------------------------------------------------
 
 
@@ -204,7 +196,7 @@ def test_interval_of_a_mean_is_near_the_normal_one():
   # 20,000 resamples place a 2.5 % quantile to about 0.02 standard errors; 5 % of the width leaves
   # room for skew
   np.testing.assert_allclose(
-    intervals.interval(x, intervals.share), [x.mean() - half, x.mean() + half], atol=0.1 * half
+    intervals.interval(x, np.mean), [x.mean() - half, x.mean() + half], atol=0.1 * half
   )
 
 
@@ -220,9 +212,9 @@ def test_strata_are_resampled_each_by_itself():
   x = np.stack(
     [np.random.default_rng(2).normal(0, 1, 10), np.random.default_rng(3).normal(1000, 1, 10)], 1
   )
-  low, high = intervals.interval(x, intervals.share)
+  low, high = intervals.interval(x, np.mean)
   assert low < x.mean() < high and high - low < 2.0
-  pooled = intervals.interval(x.reshape(-1), intervals.share)
+  pooled = intervals.interval(x.reshape(-1), np.mean)
   assert pooled[1] - pooled[0] > 200.0
 
 

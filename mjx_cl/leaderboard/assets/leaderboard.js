@@ -5,7 +5,7 @@
   const data = JSON.parse(document.getElementById("data").textContent);
   const SVG = document.querySelector("svg").namespaceURI;  // not spelled out, so that the file names no address at all
   const DASH = "\u2013";
-  const FEW = "\u2020", NOTED = "\u2021";
+  const FEW = "\u2020", NOTED = "*";
   const FIRST_ROWS = 100;  // a long table is drawn in full on request only
   const BEST = 7;          // curves shown at first: as many as there are colours
   const SHAPES = 4;

@@ -1,0 +1,113 @@
+"""What may stand on the board: registered detectors, their variants, and those of one's own."""
+
+import inspect
+from collections.abc import Callable, Collection
+from typing import Any, NamedTuple
+
+import jax
+
+from mjx_cl import detectors as detectors_lib
+from mjx_cl.errors import UserError, choose
+from mjx_cl.rollout.monitor import CHANNELS
+from mjx_cl.scoring.autoregression import ORDER
+
+Build = Callable[[Any], Any]  # threshold -> Detector
+
+
+class Entry(NamedTuple):
+  """A detector on the board.
+
+  Attributes:
+    name: on the board.
+    build: threshold -> Detector.
+    calibrated: has a threshold.
+    reference: looks at nothing.
+    own: robot -> build where the settings are a robot's own, which is compiled for each robot;
+      None: `build` serves all.
+  """
+
+  name: str
+  build: Build
+  calibrated: bool
+  reference: bool
+  own: Callable[[str], Build] | None = None
+
+
+def variants() -> dict[str, dict]:
+  """Settings by name on the board: every registered detector at its defaults, and the usual other
+  channels and a whitened form.
+  """
+  own: dict[str, dict[str, Any]] = {name: {"use": name} for name in detectors_lib.DETECTORS}
+  scalar = lambda n: getattr(detectors_lib.DETECTORS.get(n), "takes", "") == "scalar"
+  white = filter(scalar, ("cusum", "ewma", "glr", "conformal"))
+  own |= {f"{name} white": {"use": name, "whiten": ORDER} for name in white}
+  if scalar("cusum"):
+    groups = [c for c in CHANNELS if c.startswith("group_")]
+    own |= {f"cusum@{c}": {"use": f"cusum@{c}"} for c in CHANNELS if c not in groups}
+    own["cusum@groups"] = {"use": f"cusum@{'+'.join(groups)}"}
+  return own
+
+
+def entry(name: str, settings: dict) -> Entry:
+  """An Entry from settings {use, ...}."""
+  use = settings.get("use", name)
+  rest = {k: v for k, v in settings.items() if k != "use"}
+  factory = detectors_lib.factory(use)
+  parameters = inspect.signature(factory).parameters
+  calibrated = "threshold" in parameters or any(
+    p.kind is p.VAR_KEYWORD for p in parameters.values()
+  )
+  build = lambda threshold, **more: detectors_lib.make(
+    use, **(more | rest), **({"threshold": threshold} if calibrated else {})
+  )
+  own = None
+  if use == "rolling_sigma" or "robot" in parameters:
+    more = {"shared": True} if use == "rolling_sigma" else {}
+    own = lambda robot: lambda threshold: build(threshold, robot=robot, **more)
+  return Entry(name, build, calibrated, bool(getattr(factory, "reference", False)), own)
+
+
+def chosen(names: Collection[str], robot: str) -> list[Entry]:
+  """Entries of these names on the board, in its order, all where there is none; behind them those
+  that `detectors.make` takes beside: name@channel, path/to/file.py:factory, module:factory. The
+  name `none` stands for no detector.
+
+  Args:
+    names: on the board.
+    robot: on which the latter are built once, since what is wrong with one is to be said before
+      others are run.
+
+  Raises:
+    UserError, one line: no such detector, file, factory or channel.
+  """
+  known, more = variants(), []
+  for name in dict.fromkeys(names):
+    if name == "none" or name in known:
+      continue
+    if name == detectors_lib.split(name)[0] and ":" not in name:
+      choose("detector", name, known)
+    one = entry(name, {"use": name})
+    build = one.own(robot) if one.own else one.build
+    one_line(name, lambda: build(1.0).init())
+    more.append(one)
+  return [entry(n, s) for n, s in known.items() if not names or n in names] + more
+
+
+def one_line(name: str, run: Callable[[], Any]) -> Any:
+  """run(); whatever goes wrong inside a detector, which may be anybody's, becomes one line that
+  names it.
+  """
+  try:
+    return run()
+  except UserError:
+    raise
+  except jax.errors.ConcretizationTypeError as e:
+    raise UserError(
+      f"detector {name!r} cannot be calibrated: its threshold is traced, several run side "
+      "by side, so no Python `if` may look at it or at a sample (jnp.where does)"
+    ) from e
+  except (Exception, SystemExit) as e:
+    raise UserError(
+      f"detector {name!r} failed: {type(e).__name__}: "
+      f"{(str(e).strip() or 'without a message').splitlines()[0]}"
+    ) from e

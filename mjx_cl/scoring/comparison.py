@@ -1,0 +1,179 @@
+"""Detectors against each other: means over all faults of all robots, ranks, paired differences."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy import special, stats
+
+from mjx_cl.errors import UserError
+from mjx_cl.scoring import intervals as bootstrap
+from mjx_cl.scoring.metrics import REPS, SHARES, per_stream
+
+# every metric that is a mean over streams
+MEASURES = tuple(per_stream(np.zeros(1), np.zeros(1), 1, 1.0))
+
+
+class Overall(NamedTuple):
+  """Detectors against each other.
+
+  Attributes:
+    rows: a dict for each detector, best `cost_standard` first.
+    critical_difference: mean ranks further apart differ at 5 % (Nemenyi); None for fewer than two
+      detectors or blocks.
+    friedman_p: chance of ranks this uneven if all detectors were alike (Friedman's chi-square, ties
+      corrected).
+    blocks: robot x fault x severity in which every detector has a score; ranks are over these.
+  """
+
+  rows: list[dict]
+  critical_difference: float | None
+  friedman_p: float | None
+  blocks: int
+
+
+def overall(rows: list[dict], reps: int = REPS) -> Overall:
+  """Means of each detector over all of its robots x faults x severities, equal weight for each, and
+  ranks.
+
+    mean rank: rank by cost_standard within a block, 1 = best, ties share; critical difference = q
+    sqrt(k (k + 1) / (6 n)), q = studentised range / sqrt(2), k detectors, n blocks; what a row
+    calls a reference takes no rank and makes none
+
+  Intervals: bootstrap over seeds, stratified by robot. The faults of one robot share their seeds'
+  healthy streams, so a seed is drawn with all of its faults; a share of 0 or 1 and a rate of 0 have
+  Wilson's and Poisson's over the seeds of all robots. They say how far another set of seeds would
+  move the mean on these faults, not what other faults would do. Blocks that share seeds are not
+  independent either: the critical difference is somewhat too small.
+
+  Args:
+    rows: of metrics.row, with detector, robot, fault, severity, and perhaps reference.
+    reps: bootstrap draws.
+
+  Returns:
+    Overall; each row has detector, blocks, and for every mean over streams its value and its _ci,
+    None where any of its rows has none; mean_rank.
+  Reference: Demsar 2006, Journal of Machine Learning Research 7, 1-30.
+  """
+  table: dict[str, dict[tuple, dict]] = {}
+  for r in rows:
+    own = table.setdefault(r["detector"], {})
+    if _block(r) in own:
+      raise UserError(f"two rows of detector {r['detector']!r} on {_block(r)}")
+    own[_block(r)] = r
+  rivals = {name: t for name, t in table.items() if not any(r.get("reference") for r in t.values())}
+  blocks = next(iter(rivals.values()), {})
+  scored = lambda t, b: b in t and t[b]["cost_standard"] is not None
+  shared = [b for b in blocks if all(scored(t, b) for t in rivals.values())]
+  ranks = stats.rankdata(
+    [[-t[b]["cost_standard"] for t in rivals.values()] for b in shared], axis=-1
+  )
+  mean = dict(zip(rivals, ranks.mean(0))) if shared else {}
+  out = [
+    {"detector": name, "blocks": len(own)}
+    | _means(list(own.values()), reps)
+    | {"mean_rank": bootstrap.finite(mean.get(name))}
+    for name, own in table.items()
+  ]
+  worst_if_none = lambda r: -np.inf if r["cost_standard"] is None else r["cost_standard"]
+  out.sort(key=worst_if_none, reverse=True)
+  n, k = len(shared), len(rivals)
+  if n < 2 or k < 2:
+    return Overall(out, None, None, n)
+  spread = (ranks - (k + 1) / 2).sum(0)
+  within = ((ranks - (k + 1) / 2) ** 2).sum() / (k - 1)
+  p = float(special.chdtrc(k - 1, (spread**2).sum() / within)) if within else 1.0
+  q = float(stats.studentized_range.ppf(0.95, k, np.inf)) / 2**0.5
+  return Overall(out, q * (k * (k + 1) / (6 * n)) ** 0.5, p, n)
+
+
+def _block(row: dict) -> tuple[str, str, float]:
+  return row["robot"], row["fault"], row["severity"]
+
+
+def difference(
+  rows: list[dict], first: str, second: str, measure: str = "cost_standard", reps: int = REPS
+) -> tuple[float, list[float | None] | None]:
+  """How far detector `first` lies above `second` in the mean over all robots x faults x severities,
+  and its 95 % interval.
+
+  Paired: both detectors saw the same streams, and a drawn seed counts for both with all of its
+  faults (`overall`).
+
+  Args:
+    rows: as `overall` takes them.
+    first: name of a detector.
+    second: of another.
+    measure: one of the means over streams.
+    reps: bootstrap draws.
+
+  Returns:
+    (mean difference, [low, high]).
+
+  Raises:
+    UserError where the two were not scored on the same faults, or rows lack their streams.
+  """
+  one, other = ({_block(r): r for r in rows if r["detector"] == n} for n in (first, second))
+  if one.keys() != other.keys() or not one:
+    raise UserError(
+      f"detectors {first!r} and {second!r} must be scored on the same faults; got "
+      f"{len(one)} and {len(other)} rows"
+    )
+  drawn = [_drawn(list(own.values()), reps) for own in (one, other)]
+  if drawn[0] is None or drawn[1] is None:
+    raise UserError(f"detectors {first!r} and {second!r}: the rows hold no streams to draw from")
+  k = MEASURES.index(measure)
+  means = [np.mean([r[measure] for r in own.values()]) for own in (one, other)]
+  return float(means[0] - means[1]), bootstrap.ends((drawn[0] - drawn[1])[k : k + 1])[0]
+
+
+def _drawn(rows: list[dict], reps: int) -> np.ndarray | None:
+  """Means over one detector's rows on seeds drawn anew, float (MEASURES, reps), the same draw for
+  every detector; None without streams.
+  """
+  if not all("stream_latency_steps" in r and r["streams"] > 1 for r in rows):
+    return None
+  strata: dict[str, list[dict]] = {}
+  for r in rows:
+    strata.setdefault(r["robot"], []).append(r)
+  drawn: Any = 0.0  # a number until the first robot is added
+  for seed, (robot, mine) in enumerate(sorted(strata.items())):
+    streams = sorted({r["streams"] for r in mine})
+    if len(streams) > 1:
+      raise UserError(
+        f"the faults of robot {robot!r} must have the same seeds; got {streams} streams"
+      )
+    weights = bootstrap.weights(streams[0], reps, seed)
+    drawn = drawn + sum(map(_values, mine)) @ weights.T / len(rows)
+  return drawn
+
+
+def _values(row: dict) -> np.ndarray:
+  """Every measure of each stream of a row, float (MEASURES, S)."""
+  latency = [np.inf if x is None else x for x in row["stream_latency_steps"]]
+  values = per_stream(
+    np.array(latency, float),
+    np.array(row["stream_healthy_alarms"]),
+    row["healthy_steps"],
+    row["control_s"],
+  )
+  return np.stack(list(values.values()))
+
+
+def _means(rows: list[dict], reps: int) -> dict:
+  """Means over rows of one detector, and their intervals from the rows' streams."""
+  drawn = _drawn(rows, reps)
+  ends = [None] * len(MEASURES) if drawn is None else bootstrap.ends(drawn)
+  strata = {r["robot"]: r for r in rows}.values()
+  out: dict[str, Any] = {}
+  for name, pair in zip(MEASURES, ends):
+    interval: Any = pair
+    values = [r[name] for r in rows]
+    value = None if None in values else float(np.mean(values))
+    if drawn is not None and name in SHARES and value in (0.0, 1.0):
+      seeds = sum(r["streams"] for r in strata)
+      interval = bootstrap.wilson(int(value) * seeds, seeds)
+    elif drawn is not None and name == "false_alarms_per_hour" and value == 0:
+      steps = sum(r["streams"] * r["healthy_steps"] * r["control_s"] for r in strata)
+      interval = [x / (steps / 3600.0) for x in bootstrap.poisson(0)]
+    out |= {name: value, f"{name}_ci": None if value is None else interval}
+  return out
