@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from mjx_cl.detectors.base import Detector
-from mjx_cl.dreamer.agent import Agent, Batch, TrainState
+from mjx_cl.dreamer.agent import Agent, Record, TrainState
 from mjx_cl.rollout.monitor import History, Monitor, Residual
 from mjx_cl.rollout.scan import Row
 from mjx_cl.types import Spec
@@ -99,7 +99,7 @@ def evaluate(
   terminal = jnp.concatenate(
     [jnp.zeros_like(first[:, :, :1]), jnp.zeros_like(done[:, :, 0].T[:, None])], 2
   )
-  batch = Batch(
+  batch = Record(
     obs,
     action,
     reward,
@@ -113,7 +113,7 @@ def evaluate(
   )
 
   def one(
-    train: TrainState, batch: Batch, key: jax.Array
+    train: TrainState, batch: Record, key: jax.Array
   ) -> tuple[jax.Array, jax.Array, jax.Array]:
     metrics = agent.loss(train.params, train.slow, train.range, batch, key)[1][0]
     return metrics["loss/dyn"], metrics["adv_mag"], metrics["loss/value"]

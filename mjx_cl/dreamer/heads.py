@@ -1,16 +1,18 @@
 """Encoder, decoder and the four heads. Features of a state: [deter, stoch], for the decoder [stoch,
 deter].
-
-`pre` in place of the features: the output of the first linear layer, where the caller has it
-already (behaviour.py).
 """
 
 from __future__ import annotations
 
+from typing import Any
+
 import flax.linen as nn
 import jax
+from jaxtyping import Array, Float
 
-from mjx_cl.dreamer.nets import MLP, Linear, symlog
+from mjx_cl.dreamer.nets import MLP, Linear, given, symlog
+
+FIRST = ("mlp", "hidden0", "linear")  # where a head keeps its first layer
 
 
 class Encoder(nn.Module):
@@ -47,11 +49,10 @@ class Head(nn.Module):
   outscale: float
 
   @nn.compact
-  def __call__(self, *features: jax.Array, pre: jax.Array | None = None) -> jax.Array:
-    """Output of the head; `pre`: what its first layer gives, where that is known already."""
-    return Linear(self.out, self.outscale, name="out")(
-      MLP(self.layers, self.units, name="mlp")(*features, pre=pre)
-    )
+  def __call__(self, deter: jax.Array, stoch: jax.Array) -> jax.Array:
+    """Output of the head, (..., out)."""
+    x = MLP(self.layers, self.units, name="mlp")(deter, stoch)
+    return Linear(self.out, self.outscale, name="out")(x)
 
 
 class PolicyHead(nn.Module):
@@ -61,9 +62,19 @@ class PolicyHead(nn.Module):
   act: int
 
   @nn.compact
-  def __call__(
-    self, *features: jax.Array, pre: jax.Array | None = None
-  ) -> tuple[jax.Array, jax.Array]:
-    """Mean and deviation before they are bounded, (..., act) each; `pre` as of the other heads."""
-    x = MLP(3, self.units, name="mlp")(*features, pre=pre)
+  def __call__(self, deter: jax.Array, stoch: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Mean and deviation before they are bounded, (..., act) each."""
+    x = MLP(3, self.units, name="mlp")(deter, stoch)
     return Linear(self.act, 0.01, name="mean")(x), Linear(self.act, 0.01, name="std")(x)
+
+
+def read(
+  head: Head | PolicyHead,
+  params: Any,
+  deter: Float[Array, "*lead deter"],
+  stoch: Float[Array, "*lead stoch"],
+  first: Float[Array, "*lead units"] | None = None,
+) -> Any:
+  """What `head` says of states; `first`: what its first layer gives, where that is known."""
+  with given({} if first is None else {FIRST: first}):
+    return head.apply({"params": params}, deter, stoch)

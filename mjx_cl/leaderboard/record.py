@@ -27,9 +27,8 @@ from mjx_cl.io import arrays, folders, runtime
 from mjx_cl.io import tables as store
 from mjx_cl.keys import OfSeed
 from mjx_cl.leaderboard.streams import COLUMNS, LATENT, META, SCHEMA, VERSION, Suite
-from mjx_cl.rollout.frozen import stream_keys
 from mjx_cl.rollout.monitor import Monitor, watched
-from mjx_cl.rollout.scan import Rollout, nest, start
+from mjx_cl.rollout.scan import Rollout, nest, start, stream_keys
 from mjx_cl.training import agents
 
 if TYPE_CHECKING:
