@@ -63,7 +63,8 @@ class Spec(NamedTuple):
   Attributes:
     name: what tables and agents' cards call it; of a registered robot the name that it is
       registered by.
-    obs, act: one Var per scalar, in the order of the arrays.
+    obs: one Var per scalar, in the order of the array.
+    act: likewise.
     control_s: control period [s].
     episode_steps: control steps until truncation.
     acceptance: mean reward per control step from which the task counts as done well enough

@@ -112,7 +112,7 @@ def start(
   severity: ArrayLike | Sequence[float] = 0.0,
   onset: ArrayLike | Sequence[float] = 0,
   duration: ArrayLike | Sequence[float] = faults_lib.FOREVER,
-  target: ArrayLike = -1,
+  target: Any = -1,
   plan: faults_lib.Plan | None = None,
 ) -> Stream:
   """A fresh stream; its robot, fault target and every later draw come from `key`.

@@ -138,7 +138,7 @@ class Transfer:
     self._part, self._merge = jax.jit(part), jax.jit(merge)
 
   def start(
-    self, key: Key[Array, ""], target: ArrayLike, plan: faults_lib.Plan, due: ArrayLike
+    self, key: Key[Array, ""], target: Any, plan: faults_lib.Plan, due: ArrayLike
   ) -> Moving:
     """A fresh stream.
 
