@@ -99,10 +99,9 @@ def imagine(
   )
   _, last, _ = look(agent, params, slow, layers, end)
   shift = lambda x, final: jnp.concatenate([x[1:], final[None]])
-  after = [shift(x, final) for x, final in zip((rew, con, val), last)]
-  return Imagined(
-    States(deters, stochs, first, actions), *after, con0=con[0], val0=val, slow=slow_val
-  )
+  states = States(deters, stochs, first, actions)
+  after = shift(rew, last[0]), shift(con, last[1]), shift(val, last[2])
+  return Imagined(states, *after, con[0], val, slow_val)
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0,))

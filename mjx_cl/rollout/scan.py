@@ -109,9 +109,9 @@ def start(
   agent: Any,
   fault: faults_lib.Fault | tuple[faults_lib.Fault, ...],
   key: Key[Array, ""],
-  severity: ArrayLike | Sequence[float] = 0.0,
-  onset: ArrayLike | Sequence[float] = 0,
-  duration: ArrayLike | Sequence[float] = faults_lib.FOREVER,
+  severity: ArrayLike | Sequence[Any] = 0.0,
+  onset: ArrayLike | Sequence[Any] = 0,
+  duration: ArrayLike | Sequence[Any] = faults_lib.FOREVER,
   target: Any = -1,
   plan: faults_lib.Plan | None = None,
 ) -> Stream:
@@ -190,7 +190,7 @@ class Rollout:
   def _decide(
     self,
     params: Any,
-    stream: Stream,
+    stream: Any,
     drive: Bool[Array, ""],
     shake: Float[Array, ""] | None,
   ) -> tuple[Carry, Float[Array, "act"], Float[Array, "act"], Bool[Array, ""]]:
