@@ -4,9 +4,13 @@ callers vmap.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
+import numpy as np
+
+# of annotations whose shapes are checked in tests: NumPy's arrays are taken as JAX's
+Array = jax.Array if TYPE_CHECKING else jax.Array | np.ndarray
 
 
 class Model(NamedTuple):

@@ -11,12 +11,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Float, Int, Key
+from jaxtyping import Float, Int, Key
 
 from mjx_cl.config import DreamerConfig
 from mjx_cl.dreamer import behaviour, losses, nets, optim, rssm, stepwise
 from mjx_cl.dreamer.networks import Networks, later, parameter_count, sg
 from mjx_cl.dreamer.state import Carry, Record, TrainState, Weights
+from mjx_cl.types import Array
 
 __all__ = ["Agent", "Carry", "Record", "TrainState", "Weights", "culprit", "parameter_count"]
 

@@ -16,11 +16,12 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Key
+from jaxtyping import Float, Key
 
 from mjx_cl.dreamer import heads, nets
 from mjx_cl.dreamer.losses import lambda_return, update_range
 from mjx_cl.dreamer.networks import Networks, sg
+from mjx_cl.types import Array
 
 Sums = tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]  # of policy, value, entropy
 

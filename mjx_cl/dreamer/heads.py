@@ -7,10 +7,10 @@ from __future__ import annotations
 from typing import Any
 
 import flax.linen as nn
-import jax
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from mjx_cl.dreamer.nets import MLP, Linear, given, symlog
+from mjx_cl.types import Array
 
 FIRST = ("mlp", "hidden0", "linear")  # where a head keeps its first layer
 
@@ -21,7 +21,7 @@ class Encoder(nn.Module):
   units: int
 
   @nn.compact
-  def __call__(self, obs: jax.Array) -> jax.Array:
+  def __call__(self, obs: Array) -> Array:
     """Tokens of an observation, from symlog(obs)."""
     return MLP(3, self.units, name="mlp")(symlog(obs))
 
@@ -33,7 +33,7 @@ class Decoder(nn.Module):
   obs: int
 
   @nn.compact
-  def __call__(self, deter: jax.Array, stoch: jax.Array) -> jax.Array:
+  def __call__(self, deter: Array, stoch: Array) -> Array:
     """Observation in symlog units, from both parts of the latent."""
     return Linear(self.obs, name="out")(MLP(3, self.units, name="mlp")(stoch, deter))
 
@@ -49,7 +49,7 @@ class Head(nn.Module):
   outscale: float
 
   @nn.compact
-  def __call__(self, deter: jax.Array, stoch: jax.Array) -> jax.Array:
+  def __call__(self, deter: Array, stoch: Array) -> Array:
     """Output of the head, (..., out)."""
     x = MLP(self.layers, self.units, name="mlp")(deter, stoch)
     return Linear(self.out, self.outscale, name="out")(x)
@@ -62,7 +62,7 @@ class PolicyHead(nn.Module):
   act: int
 
   @nn.compact
-  def __call__(self, deter: jax.Array, stoch: jax.Array) -> tuple[jax.Array, jax.Array]:
+  def __call__(self, deter: Array, stoch: Array) -> tuple[Array, Array]:
     """Mean and deviation before they are bounded, (..., act) each."""
     x = MLP(3, self.units, name="mlp")(deter, stoch)
     return Linear(self.act, 0.01, name="mean")(x), Linear(self.act, 0.01, name="std")(x)

@@ -6,7 +6,9 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
+
+from mjx_cl.types import Array
 
 
 def lambda_return(

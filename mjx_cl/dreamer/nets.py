@@ -17,7 +17,9 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Key
+from jaxtyping import Float, Key
+
+from mjx_cl.types import Array
 
 
 def symlog(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
@@ -40,7 +42,7 @@ def in_a_row(draw: Callable, key: Key[Array, ""], shape: tuple[int, ...]) -> Flo
 def kernel_init(fan_in: int, outscale: float = 1.0) -> Callable:
   """Initialiser with the deviation outscale sqrt(1 / fan_in); outscale 0 gives exact zeros."""
 
-  def init(key: jax.Array, shape: tuple[int, ...], dtype: Any = jnp.float32) -> jax.Array:
+  def init(key: Array, shape: tuple[int, ...], dtype: Any = jnp.float32) -> Array:
     if outscale == 0.0:
       return jnp.zeros(shape, dtype)
     scale = 1.1368 * outscale * np.sqrt(1.0 / fan_in)
@@ -49,13 +51,13 @@ def kernel_init(fan_in: int, outscale: float = 1.0) -> Callable:
   return init
 
 
-def parameter(module: nn.Module, name: str, init: Callable, shape: tuple[int, ...]) -> jax.Array:
+def parameter(module: nn.Module, name: str, init: Callable, shape: tuple[int, ...]) -> Array:
   """`module.param(name, init, shape)`. Flax traces the initialiser at every use, to compare shapes;
   here they are compared as they are.
   """
   if not module.has_variable("params", name):
     return module.param(name, init, shape)
-  value: jax.Array = module.get_variable("params", name)
+  value: Array = module.get_variable("params", name)
   if value.shape != shape:
     raise flax.errors.ScopeParamShapeError(name, module.scope.path_text, shape, value.shape)  # type: ignore[union-attr]
   return value
@@ -70,7 +72,7 @@ class Linear(nn.Module):
   outscale: float = 1.0
 
   @nn.compact
-  def __call__(self, *xs: jax.Array) -> jax.Array:
+  def __call__(self, *xs: Array) -> Array:
     """Kernel times the inputs side by side, plus bias."""
     fan_in = sum(x.shape[-1] for x in xs)
     kernel = parameter(self, "kernel", kernel_init(fan_in, self.outscale), (fan_in, self.units))
@@ -93,13 +95,13 @@ class Norm(nn.Module):
   """RMSNorm over the last axis: x g / sqrt(mean(x^2) + 1e-4), g initially 1."""
 
   @nn.compact
-  def __call__(self, x: jax.Array) -> jax.Array:
+  def __call__(self, x: Array) -> Array:
     """The input over its root mean square, times the gain."""
     gain = parameter(self, "gain", nn.initializers.ones, (x.shape[-1],))
     return x * jax.lax.rsqrt(mean_square(x) + 1e-4) * gain
 
 
-def given(outputs: dict[tuple[str, ...], jax.Array]) -> contextlib.AbstractContextManager:
+def given(outputs: dict[tuple[str, ...], Array]) -> contextlib.AbstractContextManager:
   """Within it a linear layer gives `outputs[its path in the module that is applied]`, where a
   caller has that already, in place of its product.
   """
@@ -117,7 +119,7 @@ class Hidden(nn.Module):
   units: int
 
   @nn.compact
-  def __call__(self, *xs: jax.Array) -> jax.Array:
+  def __call__(self, *xs: Array) -> Array:
     """silu(norm(linear(inputs)))."""
     return nn.silu(Norm(name="norm")(Linear(self.units, name="linear")(*xs)))
 
@@ -129,7 +131,7 @@ class MLP(nn.Module):
   units: int
 
   @nn.compact
-  def __call__(self, *xs: jax.Array) -> jax.Array:
+  def __call__(self, *xs: Array) -> Array:
     """Hidden layers one after another."""
     for i in range(self.layers):
       xs = (Hidden(self.units, name=f"hidden{i}")(*xs),)

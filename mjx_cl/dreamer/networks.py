@@ -9,13 +9,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, Key
+from jaxtyping import Float, Int, Key
 
 from mjx_cl.config import DreamerConfig
 from mjx_cl.dreamer import heads, nets, rssm
 from mjx_cl.dreamer.state import Carry, Latent, Record
 from mjx_cl.errors import UserError
 from mjx_cl.sizes import SIZES
+from mjx_cl.types import Array
 
 sg = jax.lax.stop_gradient
 

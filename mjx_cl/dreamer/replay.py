@@ -12,9 +12,10 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int, Key, Shaped
+from jaxtyping import Bool, Int, Key, Shaped
 
 from mjx_cl.dreamer.state import Record
+from mjx_cl.types import Array
 
 Address = tuple[Int[Array, "batch"], Int[Array, "batch"]]  # stream and first record of windows
 

@@ -9,10 +9,11 @@ from __future__ import annotations
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from mjx_cl.dreamer.nets import MLP, Hidden, Linear, kernel_init, mean_square, parameter
 from mjx_cl.sizes import Size
+from mjx_cl.types import Array
 
 UNIMIX = 0.01
 
@@ -46,7 +47,7 @@ class BlockLinear(nn.Module):
   units: int  # outputs per block
 
   @nn.compact
-  def __call__(self, x: jax.Array, shared: jax.Array | None = None) -> jax.Array:
+  def __call__(self, x: Array, shared: Array | None = None) -> Array:
     """Each block times its own kernel, plus what all blocks share."""
     blocks, rows, own = x.shape
     extra = 0 if shared is None else shared.shape[-1]
@@ -66,7 +67,7 @@ class BlockNorm(nn.Module):
   """RMSNorm over the whole concatenated vector of (blocks, rows, width)."""
 
   @nn.compact
-  def __call__(self, x: jax.Array) -> jax.Array:
+  def __call__(self, x: Array) -> Array:
     """Each block over its root mean square, times the gain."""
     blocks, _, width = x.shape
     gain = parameter(self, "gain", nn.initializers.ones, (blocks * width,)).reshape(
@@ -102,13 +103,13 @@ class RSSM(nn.Module):
     self.post_hidden, self.post_out = Hidden(s.hidden), Linear(s.stoch * s.classes)
 
   def __call__(
-    self, deter: jax.Array, stoch: jax.Array, action: jax.Array, tokens: jax.Array
-  ) -> tuple[jax.Array, jax.Array]:
+    self, deter: Array, stoch: Array, action: Array, tokens: Array
+  ) -> tuple[Array, Array]:
     """One step; touches every parameter, for initialisation."""
     deter = self.core(deter, stoch, action)
     return self.prior(deter), self.posterior(deter, tokens)
 
-  def cut(self, deter: jax.Array) -> jax.Array:
+  def cut(self, deter: Array) -> Array:
     """(N, D) -> (blocks, N, D / blocks), the layout in which the block-diagonal products run."""
     return deter.reshape(deter.shape[0], self.size.blocks, -1).transpose(1, 0, 2)
 
@@ -153,7 +154,7 @@ class RSSM(nn.Module):
     """Logits of q(z | deter, tokens), tokens from the encoder."""
     return self._logits(self.post_out(self.post_hidden(deter, tokens)))
 
-  def _logits(self, flat: jax.Array) -> jax.Array:
+  def _logits(self, flat: Array) -> Array:
     return flat.reshape(flat.shape[:-1] + (self.size.stoch, self.size.classes))
 
 

@@ -11,12 +11,13 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Key
+from jaxtyping import Float, Key
 
 from mjx_cl.dreamer import behaviour, heads, nets
 from mjx_cl.dreamer.behaviour import Imagined, States, Sums, readings
 from mjx_cl.dreamer.networks import Networks
 from mjx_cl.dreamer.state import Latent
+from mjx_cl.types import Array
 
 CORE = (("in_deter", "linear"), ("in_stoch", "linear"))  # what of the core meets the state
 

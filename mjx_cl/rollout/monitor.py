@@ -20,12 +20,12 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Bool, Float, Int, Key
 
 from mjx_cl.dreamer import rssm
 from mjx_cl.errors import UserError
 from mjx_cl.rollout.scan import Row
-from mjx_cl.types import Spec, Var
+from mjx_cl.types import Array, Spec, Var
 
 GROUPS = 8  # parts of the observation with a residual of their own
 LATENT = 16  # dimensions of the latent's projection

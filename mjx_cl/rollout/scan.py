@@ -15,12 +15,12 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float, Key
+from jaxtyping import Bool, Float, Key
 
 from mjx_cl import faults as faults_lib
 from mjx_cl.dreamer.state import Carry, Record
 from mjx_cl.keys import OfSeed, OfStep
-from mjx_cl.types import EnvState, Step
+from mjx_cl.types import Array, EnvState, Step
 
 STRETCH = 16  # control steps under one random action, where a robot is shaken
 

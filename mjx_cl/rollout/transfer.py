@@ -15,13 +15,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float, Int, Key
+from jaxtyping import Float, Int, Key
 
 from mjx_cl import faults as faults_lib
 from mjx_cl.dreamer.state import Carry
 from mjx_cl.errors import UserError
 from mjx_cl.rollout.scan import Rollout, Row, Stream, expand, start
-from mjx_cl.types import EnvState, Step
+from mjx_cl.types import Array, EnvState, Step
 
 
 class Arrival(NamedTuple):
