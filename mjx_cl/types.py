@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import jax
 import numpy as np
 
-# of annotations whose shapes are checked in tests: NumPy's arrays are taken as JAX's
-Array = jax.Array if TYPE_CHECKING else jax.Array | np.ndarray
+if TYPE_CHECKING:
+  from jax import Array
+else:  # of annotations whose shapes tests check: NumPy's arrays are taken as JAX's
+  Array = jax.Array | np.ndarray
 
 
 class Model(NamedTuple):

@@ -74,7 +74,7 @@ def choices(
     row[: len(own)] = [step if step < steps else FOREVER for step in own]
   flags = lambda get: jnp.asarray([get(arm) for arm in arms], bool)
   limits = [
-    min(arm.end.limit(config), stops[seed]) if arm.end.told else arm.end.limit(config)  # type: ignore[index]
+    min(arm.end.limit(config), (stops or {})[seed]) if arm.end.told else arm.end.limit(config)
     for arm, (_, seed) in zip(arms, labels)
   ]
   return Choices(

@@ -59,7 +59,8 @@ def parameter(module: nn.Module, name: str, init: Callable, shape: tuple[int, ..
     return module.param(name, init, shape)
   value: Array = module.get_variable("params", name)
   if value.shape != shape:
-    raise flax.errors.ScopeParamShapeError(name, module.scope.path_text, shape, value.shape)  # type: ignore[union-attr]
+    path = module.scope.path_text  # type: ignore[union-attr]
+    raise flax.errors.ScopeParamShapeError(name, path, shape, value.shape)
   return value
 
 
