@@ -70,12 +70,12 @@ def batch(agent, key):
   import jax
   import jax.numpy as jnp
 
-  from mjx_cl.dreamer.agent import Batch
+  from mjx_cl.dreamer.agent import Record
 
   c, keys = agent.config, jax.random.split(key, 4)
   shape = (c.batch, c.length + 1)
   none = jnp.zeros(shape, bool)
-  return Batch(
+  return Record(
     jax.random.normal(keys[0], shape + (agent.obs_size,)),
     jax.random.uniform(keys[1], shape + (agent.act_size,), minval=-1.0),
     jax.random.uniform(keys[2], shape),

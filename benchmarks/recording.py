@@ -23,9 +23,8 @@ import jax  # noqa: E402
 
 from mjx_cl import envs, faults  # noqa: E402
 from mjx_cl.leaderboard.lives import behind  # noqa: E402
-from mjx_cl.rollout.frozen import stream_keys  # noqa: E402
 from mjx_cl.rollout.monitor import Monitor  # noqa: E402
-from mjx_cl.rollout.scan import Rollout, nest, start  # noqa: E402
+from mjx_cl.rollout.scan import Rollout, nest, start, stream_keys  # noqa: E402
 from mjx_cl.training import agents
 
 TOGETHER = 8  # chunks in a row, the last of which nothing runs beside: a recording has hundreds

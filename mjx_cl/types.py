@@ -4,9 +4,15 @@ callers vmap.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
+import numpy as np
+
+if TYPE_CHECKING:
+  from jax import Array
+else:  # of annotations whose shapes tests check: NumPy's arrays are taken as JAX's
+  Array = jax.Array | np.ndarray
 
 
 class Model(NamedTuple):
@@ -63,7 +69,8 @@ class Spec(NamedTuple):
   Attributes:
     name: what tables and agents' cards call it; of a registered robot the name that it is
       registered by.
-    obs, act: one Var per scalar, in the order of the arrays.
+    obs: one Var per scalar, in the order of the array.
+    act: likewise.
     control_s: control period [s].
     episode_steps: control steps until truncation.
     acceptance: mean reward per control step from which the task counts as done well enough

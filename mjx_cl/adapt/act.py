@@ -77,9 +77,14 @@ def put_back(
   """The weights of before an adaptation, where it was aborted and they earned more.
 
   Args:
-    acting: what acts otherwise. was: int32 (groups,), phases before the chunk.
-    begins: bool (groups,), an adaptation begins. reward: float32 (groups,), a step of the chunk.
-    taken: int32 (groups,), updates of the chunk. rollback: bool (groups,), the arm goes back.
+    acting: what acts otherwise.
+    before: what the adaptation began with.
+    phase: after the chunk.
+    was: int32 (groups,), phases before it.
+    begins: bool (groups,), an adaptation begins.
+    reward: float32 (groups,), a step of the chunk.
+    taken: int32 (groups,), updates of the chunk.
+    rollback: bool (groups,), the arm goes back.
 
   Returns:
     (acting', before', Weighed).

@@ -1,7 +1,7 @@
 """What is compared: arms of a run. `ARMS` is the one table; a new arm is a line in it.
 
 An arm is a set of choices and holds no code of its own: what starts adaptation, what ends it, what
-learns, which weights it starts from, and whether the robot breaks at all. `loop.choices` turns the
+learns, which weights it starts from, and whether the robot breaks at all. `choices` turns the
 arms of a run into arrays over its streams, so that one compiled program serves any mix of them.
 Free of JAX, as config.py.
 """
@@ -10,13 +10,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
-from mjx_cl.config import FOREVER
+from mjx_cl.config import FOREVER, AdaptConfig
 from mjx_cl.errors import UserError
-
-if TYPE_CHECKING:
-  from mjx_cl.config import AdaptConfig
 
 
 @dataclass(frozen=True)
@@ -40,8 +36,8 @@ class End:
   """What ends adaptation.
 
   Attributes:
-    rule: stop and abort rules of the phase machine are in force. limit: AdaptConfig -> most control
-      steps of one adaptation.
+    rule: stop and abort rules of the phase machine are in force.
+    limit: AdaptConfig -> most control steps of one adaptation.
     told: it ends at the oracle stop of the stream's seed, which another run has found
       (RunConfig.stops), or at the limit if that comes first.
   """
@@ -53,15 +49,20 @@ class End:
 
 @dataclass(frozen=True)
 class Arm:
-  """Attributes:
-  about: one line for `mjx-cl list arms`.
-  trigger, end: when it adapts.
-  world_only: the world model learns; actor, critic and all that belongs to them stay as they are.
-  fresh: parameters, moments and counters are drawn anew from the stream's seed at every start. The
-  latent that the robot carries runs on. rollback: an adaptation that is aborted leaves the better
-  of two sets of weights, those of before it or those that it learnt, see loop.Before. breaks: the
-  robot gets the run's faults; False: their severity is 0. agent: what is joined to the name of the
-  run's agent, after a hyphen, to give that of the arm's own; "": it is the run's.
+  """What is compared with others.
+
+  Attributes:
+    about: one line for `mjx-cl list arms`.
+    trigger: what starts an adaptation.
+    end: what ends it.
+    world_only: the world model learns; actor, critic and all that belongs to them stay as they are.
+    fresh: parameters, moments and counters are drawn anew from the stream's seed at every start.
+      The latent that the robot carries runs on.
+    rollback: an adaptation that is aborted leaves the better of two sets of weights, those of
+      before it or those that it learnt, see act.Before.
+    breaks: the robot gets the run's faults; False: their severity is 0.
+    agent: what is joined to the name of the run's agent, after a hyphen, to give that of the arm's
+      own; "": it is the run's.
   """
 
   about: str
@@ -76,7 +77,7 @@ class Arm:
 
 def _random(adapt: AdaptConfig, onsets: tuple[int, ...], steps: int, seed: int) -> tuple[int, ...]:
   """One step, uniform over those from which a whole adaptation fits into the run."""
-  import numpy as np
+  import numpy as np  # not needed for the table
 
   last = steps - adapt.random_steps
   if last < adapt.warmup:

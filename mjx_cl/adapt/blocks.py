@@ -12,33 +12,32 @@ block.
 from __future__ import annotations
 
 import concurrent.futures
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_cl.adapt.loop import Choices, Digest, Loop, LoopState
+from mjx_cl.adapt.choices import Choices
+from mjx_cl.adapt.loop import Loop
+from mjx_cl.adapt.state import Digest, LoopState
+from mjx_cl.dreamer.agent import TrainState
 from mjx_cl.io.runtime import cores
 from mjx_cl.rollout.order import Lanes
+from mjx_cl.rollout.scan import Row
 
-if TYPE_CHECKING:
-  from collections.abc import Sequence
-
-  from mjx_cl.dreamer.agent import TrainState
-  from mjx_cl.rollout.scan import Row
-
-LATER = (
-  "history",
-  "past",
-)  # fields of a LoopState whose streams lie along axis 1; of the others along axis 0
+# fields of a LoopState whose streams lie along axis 1; of the others along axis 0
+LATER = ("history", "past")
 ROWS = ("residual", "score", "fired")  # fields of a Digest, likewise
 
 
-class Crew:
-  """A Loop for `groups` streams.
+class Blocks:
+  """A Loop for `groups` streams, cut into blocks.
 
   Args:
+    loop: of every block.
+    groups: streams.
     size: streams in a block; None: one on a CPU, all on an accelerator.
     threads: None: as many as cores may be used, and no more than there are blocks.
   """
@@ -53,8 +52,11 @@ class Crew:
     self._warm: set[int] = set()  # sizes of block whose program is there
 
   def init(self, trains: Sequence[TrainState], rollback: bool = False) -> list[LoopState]:
-    """State before the first step, a list of blocks. trains: TrainState that each stream begins
-    with; those of a block are put in place one by one. rollback: as of Loop.init.
+    """State before the first step, a list of blocks.
+
+    Args:
+      trains: what each stream begins with; those of a block are put in place one by one.
+      rollback: as of Loop.init.
     """
     return [self._begin(trains[block], rollback) for block in self.blocks]
 
@@ -63,9 +65,8 @@ class Crew:
     if all(train is trains[0] for train in trains):
       return state
     stack = jax.tree.map(lambda *x: jnp.stack(x), *trains)
-    return state._replace(
-      train=stack, acting=jax.tree.map(jnp.copy, stack.params)
-    )  # `before` is written at every start, before it is read
+    # `before` is written at every start, before it is read
+    return state._replace(train=stack, acting=jax.tree.map(jnp.copy, stack.params))
 
   def digest(
     self,
@@ -76,7 +77,7 @@ class Crew:
     keys: jax.Array,
     acceptance: jax.Array | None = None,
   ) -> tuple[list[LoopState], Digest]:
-    """One chunk of all streams; arguments as of Loop._digest, `states` is used up. The Digest is
+    """One chunk of all streams; arguments as of Loop.digest, `states` is used up. The Digest is
     NumPy.
     """
     host = lambda tree: jax.tree.map(np.asarray, tree)
@@ -99,16 +100,11 @@ class Crew:
 
     sizes = [block.stop - block.start for block in self.blocks]
     first = [i for i, size in enumerate(sizes) if size not in self._warm and sizes.index(size) == i]
-    out = {
-      i: one(i) for i in first
-    }  # compiles; threads that came at the same time would all compile
+    out = {i: one(i) for i in first}  # compiles; threads at the same time would all compile
     self._warm.update(sizes)
     rest = [i for i in range(len(self.blocks)) if i not in out]
-    if self.threads == 1:
-      out |= {i: one(i) for i in rest}
-    else:
-      with concurrent.futures.ThreadPoolExecutor(self.threads) as pool:
-        out |= dict(zip(rest, pool.map(one, rest)))
+    with concurrent.futures.ThreadPoolExecutor(self.threads) as pool:
+      out |= dict(zip(rest, pool.map(one, rest)))
     done = [out[i] for i in range(len(self.blocks))]
     return [state for state, _ in done], glue([digest for _, digest in done], ROWS)
 
@@ -116,17 +112,16 @@ class Crew:
     """What each stream acts by, leading (lanes,); None: (groups,). Of a single block in that order
     these are its own arrays: the next digest uses them up.
     """
-    plain = lanes is None or lanes.plain
     if len(states) == 1:
-      return states[0].acting if plain else lanes.spread(states[0].acting)  # type: ignore[union-attr]
+      return states[0].acting if lanes is None else lanes.spread(states[0].acting)
     at = [
       (states[i].acting, g - block.start)
       for i, block in enumerate(self.blocks)
       for g in range(block.start, block.stop)
     ]
+    order = range(self.groups) if lanes is None else lanes.order
     streams = [
-      jax.tree.map(lambda x: np.asarray(x)[k], acting)
-      for acting, k in (at if plain else (at[g] for g in lanes.order))  # type: ignore[union-attr]
+      jax.tree.map(lambda x: np.asarray(x)[k], acting) for acting, k in (at[g] for g in order)
     ]
     return jax.tree.map(lambda *x: jnp.asarray(np.stack(x)), *streams)
 
@@ -156,17 +151,16 @@ class Crew:
     """Inverse of `join`."""
     if len(self.blocks) == 1:
       return [state._replace(replay=state.replay[0])]
-    part = lambda name, value, block: jax.tree.map(
-      jnp.asarray, cut(jax.tree.map(np.asarray, value), block, int(name in LATER))
-    )
-    whole = {name: value for name, value in zip(LoopState._fields, state) if name != "replay"}
-    return [
-      LoopState(
-        **{name: part(name, value, block) for name, value in whole.items()},
-        replay=jax.tree.map(jnp.asarray, replay),
-      )
-      for block, replay in zip(self.blocks, state.replay, strict=True)
-    ]
+
+    def part(block: slice, replay: Any) -> LoopState:
+      fields = {
+        name: cut(jax.tree.map(np.asarray, value), block, int(name in LATER))
+        for name, value in zip(LoopState._fields, state)
+        if name != "replay"
+      }
+      return jax.tree.map(jnp.asarray, LoopState(**fields, replay=replay))
+
+    return [part(block, replay) for block, replay in zip(self.blocks, state.replay, strict=True)]
 
 
 def cut(tree: Any, block: slice, axis: int) -> Any:

@@ -11,19 +11,15 @@ the structure.
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Iterable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
+from mjx_cl.adapt.choices import Choices
+from mjx_cl.adapt.settling import SIGNALS, settled
 from mjx_cl.config import AdaptConfig
-
-if TYPE_CHECKING:
-  from collections.abc import Iterable
-
-  from mjx_cl.adapt.loop import Choices
-
-SIGNALS = ("opr", "rpr", "reward", "dyn_loss", "adv_mag", "value_loss")
 
 NOMINAL, ADAPTING, CONVERGED, ABORTED, ENDED = range(5)
 PHASES = ("nominal", "adapting", "converged", "aborted", "ended")
@@ -53,20 +49,18 @@ REASONS = (
 STATIC = ("patience", "refit", "fresh_moments")
 
 
+LEAVES = tuple(f.name for f in dataclasses.fields(AdaptConfig) if f.name not in STATIC)
+
+
 def _flatten(config: AdaptConfig) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
-  names = [f.name for f in dataclasses.fields(config)]
-  return tuple(getattr(config, n) for n in names if n not in STATIC), tuple(
-    getattr(config, n) for n in STATIC
-  )
+  values = vars(config)
+  return tuple(values[name] for name in LEAVES), tuple(values[name] for name in STATIC)
 
 
 def _unflatten(static: tuple[Any, ...], leaves: Iterable[Any]) -> AdaptConfig:
-  config = object.__new__(
-    AdaptConfig
-  )  # traced values can't be checked; those of the config that was flattened have been
-  names = [f.name for f in dataclasses.fields(AdaptConfig)]
-  for name, value in (*zip(STATIC, static), *zip((n for n in names if n not in STATIC), leaves)):
-    object.__setattr__(config, name, value)
+  # traced values can't be checked; those of the config that was flattened have been
+  config = object.__new__(AdaptConfig)
+  vars(config).update(zip((*STATIC, *LEAVES), (*static, *leaves)))
   return config
 
 
@@ -125,12 +119,13 @@ def starts(
   Args:
     fired: bool (T, groups), alarms of its rows.
     at: int32 (groups, K), control steps at which adaptation is due.
+    now: int32 ().
     repeat: control steps of a row.
+    config: AdaptConfig.
   """
   length = fired.shape[0]
-  known = (
-    now - length * repeat + (jnp.arange(length) + 1) * repeat - 1
-  )  # control step at which each row is known
+  # control step at which each row is known
+  known = now - length * repeat + (jnp.arange(length) + 1) * repeat - 1
   acted = fired & (known >= config.warmup)[:, None]
   first = jnp.argmax(acted, 0)
   alarm_step = known[first]
@@ -154,39 +149,24 @@ def decide(
   least_posture: float,
   config: AdaptConfig,
 ) -> tuple[PhaseState, jax.Array, jax.Array]:
-  """`update` of every stream, leading (groups,).
-
-  Args:
-    choices: loop.Choices.
-    acceptance: () or (groups,).
-  """
-
-  def one(
-    state: PhaseState,
-    signals: jax.Array,
-    posture: jax.Array,
-    begin: Starts,
-    choices: Choices,
-    acceptance: jax.Array | float,
-  ) -> tuple[PhaseState, jax.Array, jax.Array]:
-    return update(
-      state,
-      signals,
-      posture,
-      begin.alarm,
-      begin.step,
-      now,
-      choices.listens,
-      acceptance,
-      least_posture,
-      config,
-      begin.due,
-      choices.rule,
-      choices.limit,
-    )
-
+  """`update` of every stream, leading (groups,); acceptance: () or (groups,)."""
   level = 0 if jnp.ndim(acceptance) else None
-  return jax.vmap(one, (0, 0, 0, 0, 0, level))(state, signals, posture, begin, choices, acceptance)
+  axes = (0, 0, 0, 0, 0, None, 0, level, None, None, 0, 0, 0)
+  return jax.vmap(update, axes)(
+    state,
+    signals,
+    posture,
+    begin.alarm,
+    begin.step,
+    now,
+    choices.listens,
+    acceptance,
+    least_posture,
+    config,
+    begin.due,
+    choices.rule,
+    choices.limit,
+  )
 
 
 def give_up(
@@ -195,7 +175,11 @@ def give_up(
   """A stream whose numbers fail is given up, whatever its phase, and acts on by what it had learnt.
 
   Args:
-    was: phases before the chunk. failed: int32 (groups,), see loop.Digest. signals: (groups, 6).
+    phase: after the chunk.
+    decision: int32 (groups,), of the chunk.
+    was: int32 (groups,), phases before it.
+    failed: int32 (groups,), see Digest.
+    signals: float32 (groups, 6).
 
   Returns:
     (phase', decision').
@@ -208,18 +192,17 @@ def give_up(
 def init(config: AdaptConfig) -> PhaseState:
   """A nominal stream that knows nothing."""
   six = jnp.zeros(len(SIGNALS))
-  zero = jnp.int32(0)
   return PhaseState(
-    zero,
-    zero,
-    jnp.full((config.patience, len(SIGNALS)), jnp.nan),
-    zero,
-    jnp.float32(-jnp.inf),
-    zero,
-    six,
-    six,
-    six,
-    jnp.zeros(config.patience),
+    phase=jnp.int32(NOMINAL),
+    since=jnp.int32(0),
+    ring=jnp.full((config.patience, len(SIGNALS)), jnp.nan),
+    count=jnp.int32(0),
+    best=jnp.float32(-jnp.inf),
+    best_at=jnp.int32(0),
+    mean=six,
+    square=six,
+    number=six,
+    posture=jnp.zeros(config.patience),
   )
 
 
@@ -247,13 +230,16 @@ def update(
   """One chunk of one stream.
 
   Args:
+    state: before the chunk.
     signals: float32 (6,), means over the chunk in the order of SIGNALS, nan where unknown.
     posture: float32 (), mean posture over the chunk.
-    alarm: bool (), an alarm fell in this chunk. alarm_step: int32 (), control step of the alarm, or
-      of what was due.
+    alarm: bool (), an alarm fell in this chunk.
+    alarm_step: int32 (), control step of the alarm, or of what was due.
     now: int32 (), control steps done after this chunk.
     acts: bool (), the stream's arm acts on alarms.
-    acceptance, least_posture: float32 (), levels of the task.
+    acceptance: float32 (), level of the task.
+    least_posture: float32 (), level of the task.
+    config: AdaptConfig.
     due: bool (), a start of the arm's schedule fell in this chunk.
     rule: bool (), the stop and abort rules are in force; without them adaptation ends after `limit`
       alone, as `ended`.
@@ -270,11 +256,8 @@ def update(
   ok = settled(state.ring, state.count, state.mean, nominal_std(state), config)
   calm = jnp.all(ok if counts is None else ok | ~counts)
   state, decision = _judge(state, begins, calm, now, acceptance, least_posture, rule, limit, config)
-  return (
-    state._replace(since=jnp.where(begins, alarm_step, state.since).astype(jnp.int32)),
-    decision,
-    ok,
-  )
+  since = jnp.where(begins, alarm_step, state.since).astype(jnp.int32)
+  return state._replace(since=since), decision, ok
 
 
 def _remember(
@@ -315,8 +298,7 @@ def _judge(
 ) -> tuple[PhaseState, jax.Array]:
   """The decision of a chunk that is remembered already, and the phase that follows it.
 
-  Args:
-    begins: bool (), an adaptation begins. calm: bool (), all signals that count have settled.
+  begins: bool (), an adaptation begins; calm: bool (), all signals that count have settled.
   """
   adapting = state.phase == ADAPTING
   age = now - state.since
@@ -359,43 +341,3 @@ def _judge(
     ring=jnp.where(begins, jnp.nan, state.ring),
   )
   return state, decision.astype(jnp.int32)
-
-
-def settled(
-  ring: jax.Array,
-  count: jax.Array,
-  nominal_mean: jax.Array,
-  nominal_std: jax.Array,
-  config: AdaptConfig,
-) -> jax.Array:
-  """Which signals show neither trend nor excess fluctuation over the ring.
-
-    level      = median of the ring
-    trend      : |median(second half) - median(first half)| <= trend level
-    fluctuation: (upper - lower quartile) / 1.349 <= max(fluctuation level, excess nominal_std)
-    OPR, RPR   : also settled while level <= near nominal_mean
-
-  Medians and quartiles, because a chunk that holds a stumble or an episode's start is many times
-  the others.
-
-  Args:
-    ring: float32 (patience, 6), one row per chunk in any rotation, SIGNALS along the last axis; nan
-      rows are left out.
-    count: int32 (), rows ever written; fewer than `patience` means not settled.
-    nominal_mean, nominal_std: float32 (6,).
-
-  Returns:
-    bool (6,).
-  """
-  size = ring.shape[0]
-  order = jnp.arange(size)
-  ring = ring[(count + order) % size]  # oldest first
-  half = size // 2
-  level = jnp.nanmedian(ring, 0)
-  trend = jnp.abs(jnp.nanmedian(ring[half:], 0) - jnp.nanmedian(ring[:half], 0))
-  scale = jnp.abs(level)
-  spread = jnp.nanquantile(ring, 0.75, axis=0) - jnp.nanquantile(ring, 0.25, axis=0)
-  calm = spread / 1.349 <= jnp.maximum(config.fluctuation * scale, config.excess * nominal_std)
-  steady = (trend <= config.trend * scale) & calm
-  residual = jnp.arange(len(SIGNALS)) < 2
-  return (steady | (residual & (level <= config.near * nominal_mean))) & (count >= size)

@@ -4,20 +4,19 @@ parameters and moments.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
+from mjx_cl.adapt.act import choose
+from mjx_cl.adapt.state import LoopState
 from mjx_cl.config import AdaptConfig
 from mjx_cl.dreamer import replay as replay_lib
 from mjx_cl.dreamer.agent import Agent, TrainState, culprit
 from mjx_cl.dreamer.replay import Replay
 from mjx_cl.keys import OfAdaptation
 from mjx_cl.rollout.scan import Row, records
-
-if TYPE_CHECKING:
-  from collections.abc import Callable
 
 BEHAVIOUR = {"pol", "val", "slow", "range"}  # of a TrainState: what is no world model
 
@@ -28,15 +27,14 @@ def fill(
   """`replay` of each stream with what came after the alarm and nothing else.
 
   Args:
+    replay: before the chunk.
+    rows: of the chunk.
     begins: bool (groups,), an adaptation begins in the chunk.
     row: int32 (groups,), after which row.
     adapting: bool (groups,), the chunk began within an adaptation.
   """
-  where: Callable[..., Any] = lambda a, b: jnp.where(
-    begins.reshape((-1,) + (1,) * (a.ndim - 1)), a, b
-  )
-  count = where(jnp.zeros_like(replay.count), replay.count)
-  queue = where(jnp.zeros_like(replay.queue), replay.queue)
+  none = replay_lib.clear(replay)
+  count, queue = choose(begins, (none.count, none.queue), (replay.count, replay.queue))
   length = rows.reward.shape[0]
   keep = jnp.where(begins[None], jnp.arange(length)[:, None] > row[None], adapting[None])
   new, exist = records(rows)
@@ -56,15 +54,32 @@ def owing(
   return jnp.where(due, owed + rows * config.ratio / (c.batch * c.length), 0.0)
 
 
-def fresh_moments(agent: Agent, train: TrainState, begins: jax.Array) -> TrainState:
-  """The optimiser's moments and counters set back where an adaptation `begins` (groups,)."""
-  fresh = jax.vmap(agent.optimizer.init)(train.params)
-  reset = lambda new, old: jnp.where(begins.reshape((-1,) + (1,) * (old.ndim - 1)), new, old)
-  return train._replace(
-    opt=jax.lax.cond(
-      jnp.any(begins), lambda o: jax.tree.map(reset, fresh, o), lambda o: o, train.opt
-    )
-  )
+def begin(
+  agent: Agent,
+  state: LoopState,
+  keys: jax.Array,
+  begins: jax.Array,
+  fresh: jax.Array | None,
+  moments: bool,
+) -> tuple[TrainState, Any]:
+  """What the learner starts from, and what acts, where an adaptation `begins` (groups,).
+
+  Args:
+    agent: the learner.
+    state: before the chunk.
+    keys: of the streams.
+    begins: bool (groups,).
+    fresh: bool (groups,), parameters are drawn anew; None: of no stream.
+    moments: the optimiser's moments and counters are set back.
+  """
+  train, acting = state.train, state.acting
+  if fresh is not None:
+    train, acting = renew(agent, train, acting, keys, begins & fresh)
+  if moments:
+    new = jax.vmap(agent.optimizer.init)(train.params)
+    opt = jax.lax.cond(jnp.any(begins), lambda o: choose(begins, new, o), lambda o: o, train.opt)
+    train = train._replace(opt=opt)
+  return train, acting
 
 
 def renew(
@@ -100,10 +115,8 @@ def learn(
   each update.
   """
   c = agent.config
-  shapes = jax.tree.map(lambda x: x.shape, replay)
-  together = jax.tree.map(
-    lambda x: x.reshape((-1,) + x.shape[2:]), replay
-  )  # (groups, 1, ..) -> (groups, ..)
+  # (groups, 1, ..) -> (groups, ..)
+  together = jax.tree.map(lambda x: x.reshape((-1,) + x.shape[2:]), replay)
 
   def stream(
     g: jax.Array, state: tuple[TrainState, Replay, jax.Array]
@@ -133,16 +146,8 @@ def learn(
   train, together, failed = jax.lax.fori_loop(
     0, number.shape[0], stream, (train, together, jnp.full(number.shape, -1, jnp.int32))
   )
-  return (
-    train,
-    jax.tree.map(
-      lambda x, shape: x.reshape(shape),
-      together,
-      shapes,
-      is_leaf=lambda x: isinstance(x, jax.Array),
-    ),
-    failed,
-  )
+  apart = jax.tree.map(lambda x, like: x.reshape(like.shape), together, replay)
+  return train, apart, failed
 
 
 def take(tree: Any, g: jax.Array) -> Any:

@@ -7,163 +7,24 @@ no update.
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Hashable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from mjx_cl.adapt import act, decide, learn, watch
-from mjx_cl.adapt import arms as arms_lib
+from mjx_cl.adapt.choices import WIDTH, Choices, choices
+from mjx_cl.adapt.state import Digest, LoopState
 from mjx_cl.config import AdaptConfig
 from mjx_cl.detectors.base import Detector
 from mjx_cl.dreamer import replay as replay_lib
 from mjx_cl.dreamer.agent import Agent, TrainState
-from mjx_cl.errors import choose
-from mjx_cl.rollout.monitor import History, Monitor, Residual, unknown
+from mjx_cl.rollout.monitor import Monitor, unknown
 from mjx_cl.rollout.scan import Row
 from mjx_cl.types import Spec
 
-
-class LoopState(NamedTuple):
-  """Everything of a run but the streams; leading (groups,) unless said.
-
-  Attributes:
-    train: TrainState of each stream.
-    acting: the parameters that act and predict, a moving average of train.params while adapting,
-      equal to them otherwise.
-    replay: Replay with one environment each, post-alarm records only.
-    history: monitor history, leading (n - 1, groups, 1).
-    detector: state of the detector.
-    phase: PhaseState.
-    past: Residual of the last `refit` rows, leading (refit, groups).
-    owed: float32, fraction of an update that is due.
-    executed: int32, updates taken since the run began.
-    before: Before of each stream; None where no arm of the run goes back.
-  """
-
-  train: TrainState
-  acting: Any
-  replay: replay_lib.Replay | Any
-  history: History
-  detector: Any
-  phase: decide.PhaseState
-  past: Residual
-  owed: jax.Array
-  executed: jax.Array
-  before: act.Before | None = None
-
-
-class Digest(NamedTuple):
-  """What the host logs of a chunk: rows (T, groups) and values (groups,).
-
-  Attributes:
-    residual: Residual of each row.
-    score: float32, the detector's, of each row.
-    fired: bool, alarms, of each row.
-    signals: float32 (groups, 6), in the order of decide.SIGNALS.
-    settled: bool (groups, 6), which of them have settled.
-    phase: int32, index into decide.PHASES after the chunk.
-    decision: int32, index into decide.REASONS.
-    since: int32, control step that the last adaptation counts from.
-    updates: int32, taken since the run began.
-    failed: int32, index into agent.CAUSES of what was at fault in an update, which changed nothing
-      and was the stream's last; -1: nothing.
-    back: bool, an abort put the weights of before the adaptation back; None where no arm does.
-    earned: float32, mean reward a step of those, see act.Before; None likewise.
-    earns: float32, of the weights that have learnt; None likewise.
-  """
-
-  residual: Residual
-  score: jax.Array
-  fired: jax.Array
-  signals: jax.Array
-  settled: jax.Array
-  phase: jax.Array
-  decision: jax.Array
-  since: jax.Array
-  updates: jax.Array
-  failed: jax.Array
-  back: jax.Array | None = None
-  earned: jax.Array | None = None
-  earns: jax.Array | None = None
-
-
-# Choices.at is padded to a multiple of it: arms with up to eight starts share a program
-WIDTH = 8
-
-
-class Choices(NamedTuple):
-  """The arms of a run as arrays, leading (groups,); see arms.Arm.
-
-  Attributes:
-    listens: bool, alarms are acted on.
-    at: int32 (groups, K), control steps at which adaptation is due, FOREVER: none; K is a multiple
-      of WIDTH.
-    rule: bool, stop and abort rules are in force.
-    limit: int32, most control steps of one adaptation.
-    world_only: bool, actor and critic keep what they are. fresh: bool, every start draws new
-      parameters; None: no arm of the run does, and the program goes without the drawing, a quarter
-      of what there is to compile.
-    rollback: bool, an abort may put the weights of before the adaptation back; None: no arm of the
-      run does, and LoopState.before is None too.
-  """
-
-  listens: jax.Array
-  at: jax.Array
-  rule: jax.Array
-  limit: jax.Array
-  world_only: jax.Array
-  fresh: jax.Array | None
-  rollback: jax.Array | None = None
-
-
-def choices(
-  labels: Sequence[tuple[str, int]],
-  config: AdaptConfig,
-  steps: int,
-  onsets: Sequence[tuple[int, ...]] | None = None,
-  stops: dict[int, int] | None = None,
-) -> Choices:
-  """Choices of streams.
-
-  Args:
-    labels: (arm, seed) of each.
-    config: AdaptConfig.
-    steps: of the run.
-    onsets: true onsets of each robot, unless its arm spares it, as control steps, FOREVER: not
-      known yet; None: no faults.
-    stops: seed -> control steps after which an arm that is told its oracle stop ends.
-
-  Raises:
-    UserError where an arm's schedule does not fit into the run.
-  """
-  arms: list[Any] = [choose("arm", arm, arms_lib.ARMS) for arm, _ in labels]
-  onsets = [()] * len(arms) if onsets is None else onsets
-  at = [
-    arm.trigger.steps(config, own if arm.breaks else (), steps, seed)
-    for arm, own, (_, seed) in zip(arms, onsets, labels)
-  ]
-  width = WIDTH * max(1, -(-max(map(len, at)) // WIDTH))
-  at = [
-    [step if step < steps else arms_lib.FOREVER for step in row]
-    + [arms_lib.FOREVER] * (width - len(row))
-    for row in at
-  ]
-  flags = lambda get: jnp.asarray([get(arm) for arm in arms], bool)
-  limits = [
-    min(arm.end.limit(config), stops[seed]) if arm.end.told else arm.end.limit(config)  # type: ignore[index]
-    for arm, (_, seed) in zip(arms, labels)
-  ]
-  return Choices(
-    flags(lambda a: a.trigger.listens),
-    jnp.asarray(at, jnp.int32),
-    flags(lambda a: a.end.rule),
-    jnp.asarray(limits, jnp.int32),
-    flags(lambda a: a.world_only),
-    flags(lambda a: a.fresh) if any(arm.fresh for arm in arms) else None,
-    flags(lambda a: a.rollback) if any(arm.rollback for arm in arms) else None,
-  )
+__all__ = ["WIDTH", "Choices", "Digest", "Loop", "LoopState", "Programs", "choices"]
 
 
 class Programs:
@@ -227,8 +88,12 @@ class Loop:
       self._program = programs.share((same, repeat), self._program)
 
   def init(self, train: TrainState, groups: int, rollback: bool = False) -> LoopState:
-    """State before the first step; `train` is the shipped agent, the same for every stream.
-    rollback: an arm of the run goes back, see Before.
+    """State before the first step.
+
+    Args:
+      train: the shipped agent, the same for every stream.
+      groups: streams.
+      rollback: an arm of the run goes back, see Before.
     """
     a = self.agent
     spread = lambda tree: jax.tree.map(
@@ -237,29 +102,23 @@ class Loop:
     shapes = jax.eval_shape(
       lambda: replay_lib.init(1, self.capacity, a.obs_size, a.act_size, a.size.deter, a.size.stoch)
     )
-    replay = jax.tree.map(
-      lambda x: jnp.zeros((groups,) + x.shape, x.dtype), shapes
-    )  # empty: all zeros; a copy of one would be held twice for a while
-    rows = max(1, self.config.refit // self.repeat)
+    none = lambda: jnp.zeros(groups)
+    params = lambda: spread(train.params)
     state = LoopState(
-      spread(train),
-      spread(train.params),
-      replay,
-      self.monitor.init(groups, 1),
-      spread(self.detector.init()),
-      spread(decide.init(self.config)),
-      unknown((rows, groups), a.obs_size),
-      jnp.zeros(groups),
-      jnp.zeros(groups, jnp.int32),
-      act.Before(
-        spread(train.params), jnp.zeros(groups), jnp.zeros(groups), jnp.zeros(groups, bool)
-      )
-      if rollback
-      else None,
+      train=spread(train),
+      acting=params(),
+      # empty: all zeros; a copy of one would be held twice for a while
+      replay=jax.tree.map(lambda x: jnp.zeros((groups,) + x.shape, x.dtype), shapes),
+      history=self.monitor.init(groups, 1),
+      detector=spread(self.detector.init()),
+      phase=spread(decide.init(self.config)),
+      past=unknown((max(1, self.config.refit // self.repeat), groups), a.obs_size),
+      owed=none(),
+      executed=jnp.zeros(groups, jnp.int32),
+      before=act.Before(params(), none(), none(), jnp.zeros(groups, bool)) if rollback else None,
     )
-    return jax.tree.map(
-      lambda x: jnp.asarray(x, x.dtype) if x.weak_type else x, state
-    )  # a weak type would be a second trace, also of a run that goes on
+    # a weak type would be a second trace, also of a run that goes on
+    return jax.tree.map(lambda x: jnp.asarray(x, x.dtype) if x.weak_type else x, state)
 
   def digest(
     self,
@@ -297,7 +156,7 @@ class Loop:
     acceptance: jax.Array | float | None,
     config: AdaptConfig,
   ) -> tuple[LoopState, Digest]:
-    agent, was, length = self.agent, state.phase.phase, rows.reward.shape[0]
+    agent, was = self.agent, state.phase.phase
     split = jax.vmap(lambda key: jax.random.split(jax.random.fold_in(key, now), 3))(keys)
     seen, history, detector, past = watch.watch(
       agent, self.monitor, self.detector, self.spec, state, rows, split[:, :2]
@@ -313,13 +172,10 @@ class Loop:
     begins = decision == decide.START
 
     replay = learn.fill(state.replay, rows, begins, begin.row, was == decide.ADAPTING)
-    owed = learn.owing(agent, replay, phase.phase == decide.ADAPTING, state.owed, length, config)
+    length, adapting = rows.reward.shape[0], phase.phase == decide.ADAPTING
+    owed = learn.owing(agent, replay, adapting, state.owed, length, config)
     number = jnp.floor(owed + 1e-6).astype(jnp.int32)
-    train, acting = state.train, state.acting
-    if choices.fresh is not None:
-      train, acting = learn.renew(agent, train, acting, keys, begins & choices.fresh)
-    if config.fresh_moments:
-      train = learn.fresh_moments(agent, train, begins)
+    train, acting = learn.begin(agent, state, keys, begins, choices.fresh, config.fresh_moments)
     counted = train.updates
     train, replay, failed = learn.learn(
       agent, train, replay, split[:, 2], number, choices.world_only
@@ -327,23 +183,9 @@ class Loop:
     taken = train.updates - counted
     phase, decision = decide.give_up(phase, decision, was, failed, seen.signals)
 
-    # the robot acts by a moving average of what it learns, and keeps it when it is done
-    acting = act.follow(acting, train.params, number, config.average)
-    before, weighed = state.before, ()
-    if before is not None:
-      reward = seen.signals[:, decide.SIGNALS.index("reward")]
-      acting, before, weighed = act.put_back(  # type: ignore[assignment]
-        acting,
-        before,
-        phase,
-        was,
-        begins,
-        reward,
-        taken,
-        choices.rollback,  # type: ignore[arg-type]
-      )
-    train = train._replace(params=act.choose(act.ended(was, phase), acting, train.params))
-
+    train, acting, before, weighed = self._act(
+      state, train, acting, phase, seen, begins, number, taken, choices.rollback, config
+    )
     # a stream that is done watches again, its reference refitted on the latest rows
     over = (decision == decide.STOP) | (decision == decide.END)
     refit = lambda d, p, s: watch.refit(self.detector, d, p, s)
@@ -354,3 +196,28 @@ class Loop:
     )
     said = (phase.phase, decision, phase.since, executed, failed, *weighed)
     return state, Digest(*seen[:4], settled, *said)
+
+  def _act(
+    self,
+    state: LoopState,
+    train: TrainState,
+    acting: Any,
+    phase: decide.PhaseState,
+    seen: watch.Watched,
+    begins: jax.Array,
+    number: jax.Array,
+    taken: jax.Array,
+    rollback: jax.Array | None,
+    config: AdaptConfig,
+  ) -> tuple[TrainState, Any, act.Before | None, tuple[jax.Array, ...]]:
+    """The robot acts by a moving average of what it learns, and keeps it when it is done."""
+    was, before = state.phase.phase, state.before
+    weighed: tuple[jax.Array, ...] = ()
+    acting = act.follow(acting, train.params, number, config.average)
+    if before is not None and rollback is not None:
+      reward = seen.signals[:, decide.SIGNALS.index("reward")]
+      acting, before, weighed = act.put_back(
+        acting, before, phase, was, begins, reward, taken, rollback
+      )
+    kept = act.choose(act.ended(was, phase), acting, train.params)
+    return train._replace(params=kept), acting, before, weighed

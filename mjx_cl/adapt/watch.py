@@ -4,19 +4,18 @@ that the stop rule reads.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
+from mjx_cl.adapt.act import choose
+from mjx_cl.adapt.state import LoopState
 from mjx_cl.detectors.base import Detector
-from mjx_cl.dreamer.agent import Agent, Batch, TrainState
+from mjx_cl.dreamer.agent import Agent, Record, TrainState
 from mjx_cl.rollout.monitor import History, Monitor, Residual
 from mjx_cl.rollout.scan import Row
 from mjx_cl.types import Spec
-
-if TYPE_CHECKING:
-  from mjx_cl.adapt.loop import LoopState
 
 
 class Watched(NamedTuple):
@@ -49,7 +48,11 @@ def watch(
   """Looks at a chunk.
 
   Args:
-    state: loop.LoopState before it.
+    agent: that predicts.
+    monitor: gives residuals.
+    detector: gives alarms.
+    spec: of the environment.
+    state: before the chunk.
     rows: leading (T, groups, 1).
     keys: (groups, 2), of the monitor and of the signals.
 
@@ -80,40 +83,30 @@ def evaluate(
   The ring of recent data is the chunk itself with the last record before it as context, so an
   alarm leaves nothing old in it.
   """
+  # (groups, 1, 1 + T, ...)
   join = lambda old, new: jnp.concatenate([old[-1:].astype(new.dtype), new])[:, :, 0].swapaxes(
     0, 1
-  )[:, None]  # (groups, 1, 1 + T, ...)
-  done = rows.terminated | rows.truncated
-  deter, stoch, action = (
-    join(before.deter, rows.deter),
-    join(before.stoch, rows.stoch),
-    join(before.action, rows.action),
-  )
-  obs, reward, first = (
-    join(before.obs, rows.obs),
-    join(before.reward, rows.reward_in),
-    join(before.done, rows.first),
-  )
-  first = first.at[:, :, 0].set(True)
-  last = jnp.concatenate([first[:, :, 1:], jnp.zeros_like(first[:, :, :1])], 2)
-  terminal = jnp.concatenate(
-    [jnp.zeros_like(first[:, :, :1]), jnp.zeros_like(done[:, :, 0].T[:, None])], 2
-  )
-  batch = Batch(
-    obs,
-    action,
-    reward,
-    first,
-    last,
-    terminal,
-    deter,
-    stoch,
-    jnp.zeros_like(action),
-    jnp.zeros_like(first),
+  )[:, None]
+  deter, stoch = join(before.deter, rows.deter), join(before.stoch, rows.stoch)
+  action, obs = join(before.action, rows.action), join(before.obs, rows.obs)
+  reward = join(before.reward, rows.reward_in)
+  first = join(before.done, rows.first).at[:, :, 0].set(True)
+  none = jnp.zeros_like(first)
+  batch = Record(
+    obs=obs,
+    action=action,
+    reward=reward,
+    first=first,
+    last=jnp.concatenate([first[:, :, 1:], none[:, :, :1]], 2),
+    terminal=none,
+    deter=deter,
+    stoch=stoch,
+    demo=jnp.zeros_like(action),
+    has_demo=none,
   )
 
   def one(
-    train: TrainState, batch: Batch, key: jax.Array
+    train: TrainState, batch: Record, key: jax.Array
   ) -> tuple[jax.Array, jax.Array, jax.Array]:
     metrics = agent.loss(train.params, train.slow, train.range, batch, key)[1][0]
     return metrics["loss/dyn"], metrics["adv_mag"], metrics["loss/value"]
@@ -125,6 +118,4 @@ def refit(detector: Detector, state: Any, past: Residual, over: jax.Array) -> An
   """`state` of the detector, where `over` (groups,): one that has seen the rows `past` alone."""
   fresh = jax.tree.map(lambda x: jnp.broadcast_to(x, (over.shape[0],) + x.shape), detector.init())
   fresh, _ = jax.lax.scan(jax.vmap(detector.update), fresh, past)
-  return jax.tree.map(
-    lambda a, b: jnp.where(over.reshape((-1,) + (1,) * (a.ndim - 1)), a, b), fresh, state
-  )
+  return choose(over, fresh, state)

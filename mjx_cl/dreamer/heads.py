@@ -1,16 +1,18 @@
 """Encoder, decoder and the four heads. Features of a state: [deter, stoch], for the decoder [stoch,
 deter].
-
-`pre` in place of the features: the output of the first linear layer, where the caller has it
-already (behaviour.py).
 """
 
 from __future__ import annotations
 
-import flax.linen as nn
-import jax
+from typing import Any
 
-from mjx_cl.dreamer.nets import MLP, Linear, symlog
+import flax.linen as nn
+from jaxtyping import Float
+
+from mjx_cl.dreamer.nets import MLP, Linear, given, symlog
+from mjx_cl.types import Array
+
+FIRST = ("mlp", "hidden0", "linear")  # where a head keeps its first layer
 
 
 class Encoder(nn.Module):
@@ -19,7 +21,7 @@ class Encoder(nn.Module):
   units: int
 
   @nn.compact
-  def __call__(self, obs: jax.Array) -> jax.Array:
+  def __call__(self, obs: Array) -> Array:
     """Tokens of an observation, from symlog(obs)."""
     return MLP(3, self.units, name="mlp")(symlog(obs))
 
@@ -31,7 +33,7 @@ class Decoder(nn.Module):
   obs: int
 
   @nn.compact
-  def __call__(self, deter: jax.Array, stoch: jax.Array) -> jax.Array:
+  def __call__(self, deter: Array, stoch: Array) -> Array:
     """Observation in symlog units, from both parts of the latent."""
     return Linear(self.obs, name="out")(MLP(3, self.units, name="mlp")(stoch, deter))
 
@@ -47,11 +49,10 @@ class Head(nn.Module):
   outscale: float
 
   @nn.compact
-  def __call__(self, *features: jax.Array, pre: jax.Array | None = None) -> jax.Array:
-    """Output of the head; `pre`: what its first layer gives, where that is known already."""
-    return Linear(self.out, self.outscale, name="out")(
-      MLP(self.layers, self.units, name="mlp")(*features, pre=pre)
-    )
+  def __call__(self, deter: Array, stoch: Array) -> Array:
+    """Output of the head, (..., out)."""
+    x = MLP(self.layers, self.units, name="mlp")(deter, stoch)
+    return Linear(self.out, self.outscale, name="out")(x)
 
 
 class PolicyHead(nn.Module):
@@ -61,9 +62,19 @@ class PolicyHead(nn.Module):
   act: int
 
   @nn.compact
-  def __call__(
-    self, *features: jax.Array, pre: jax.Array | None = None
-  ) -> tuple[jax.Array, jax.Array]:
-    """Mean and deviation before they are bounded, (..., act) each; `pre` as of the other heads."""
-    x = MLP(3, self.units, name="mlp")(*features, pre=pre)
+  def __call__(self, deter: Array, stoch: Array) -> tuple[Array, Array]:
+    """Mean and deviation before they are bounded, (..., act) each."""
+    x = MLP(3, self.units, name="mlp")(deter, stoch)
     return Linear(self.act, 0.01, name="mean")(x), Linear(self.act, 0.01, name="std")(x)
+
+
+def read(
+  head: Head | PolicyHead,
+  params: Any,
+  deter: Float[Array, "*lead deter"],
+  stoch: Float[Array, "*lead stoch"],
+  first: Float[Array, "*lead units"] | None = None,
+) -> Any:
+  """What `head` says of states; `first`: what its first layer gives, where that is known."""
+  with given({} if first is None else {FIRST: first}):
+    return head.apply({"params": params}, deter, stoch)

@@ -6,18 +6,24 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Float
+
+from mjx_cl.types import Array
 
 
-def lambda_return(r_t: jax.Array, c_t: jax.Array, v_t: jax.Array, lam: float) -> jax.Array:
-  """Imagined returns (H, N) from reward, continue and value at states 1..H, each (H, N).
+def lambda_return(
+  r_t: Float[Array, "steps *rows"],
+  c_t: Float[Array, "steps *rows"],
+  v_t: Float[Array, "steps *rows"],
+  lam: float,
+) -> Float[Array, "steps *rows"]:
+  """Imagined returns from reward, continue and value at states 1..H.
 
   R_i = r_{i+1} + c_{i+1} ((1 - lam) v_{i+1} + lam R_{i+1}),   i = H-1..0,   R_H = v_H;   c already
     holds the discount
   """
 
-  def step(
-    ret: jax.Array, x: tuple[jax.Array, jax.Array, jax.Array]
-  ) -> tuple[jax.Array, jax.Array]:
+  def step(ret: Array, x: tuple[Array, Array, Array]) -> tuple[Array, Array]:
     r, c, v = x
     ret = r + c * ((1.0 - lam) * v + lam * ret)
     return ret, ret
@@ -26,14 +32,14 @@ def lambda_return(r_t: jax.Array, c_t: jax.Array, v_t: jax.Array, lam: float) ->
 
 
 def replay_return(
-  r_t: jax.Array,
-  terminal_t: jax.Array,
-  last_t: jax.Array,
-  boot_t: jax.Array,
+  r_t: Float[Array, "steps *rows"],
+  terminal_t: Float[Array, "steps *rows"],
+  last_t: Float[Array, "steps *rows"],
+  boot_t: Float[Array, "steps *rows"],
   lam: float,
   discount: float,
-) -> jax.Array:
-  """Replay-value targets (T-1, N) from arrays over T replayed steps.
+) -> Float[Array, "steps-1 *rows"]:
+  """Replay-value targets from arrays over T replayed steps.
 
     G_{T-1} = b_{T-1};   G_t = r_{t+1} + (1 - terminal_{t+1}) discount [(1 - l_{t+1}) b_{t+1} +
       l_{t+1} G_{t+1}],   l = lam (1 - last)
@@ -42,9 +48,7 @@ def replay_return(
   a true terminal cuts off.
   """
 
-  def step(
-    ret: jax.Array, x: tuple[jax.Array, jax.Array, jax.Array, jax.Array]
-  ) -> tuple[jax.Array, jax.Array]:
+  def step(ret: Array, x: tuple[Array, Array, Array, Array]) -> tuple[Array, Array]:
     r, terminal, last, boot = x
     mix = lam * (1.0 - last)
     ret = r + (1.0 - terminal) * discount * ((1.0 - mix) * boot + mix * ret)
@@ -55,16 +59,10 @@ def replay_return(
 
 
 def update_range(
-  low_high: jax.Array, returns: jax.Array, rate: float
-) -> tuple[jax.Array, jax.Array]:
+  low_high: Float[Array, "2"], returns: Float[Array, "..."], rate: float
+) -> tuple[Float[Array, "2"], Float[Array, ""]]:
   """Percentile normaliser: EMA (rate, from 0, no bias correction) of the 5th and 95th percentile of
-  `returns`.
-
-  Args:
-    low_high: float32 (2,).
-
-  Returns:
-    New (2,) and the scale max(1, high - low), float32 ().
+  `returns`. Gives the new one and the scale max(1, high - low).
   """
   now = jnp.quantile(returns.reshape(-1), jnp.array([0.05, 0.95]))
   low_high = (1.0 - rate) * low_high + rate * now

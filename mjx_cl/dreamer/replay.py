@@ -12,38 +12,21 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Bool, Int, Key, Shaped
 
-from mjx_cl.dreamer.agent import Batch
+from mjx_cl.dreamer.state import Record
+from mjx_cl.types import Array
 
-
-class Record(NamedTuple):
-  """One record: obs, the reward of arriving at it, the action chosen there, the latent of acting
-  there.
-
-  Attributes:
-    obs: float32 (O,). action: float32 (A,), unclipped, zero where `last`. reward: float32 ().
-    first, last, terminal: bool ().
-    deter: float16 (D,). stoch: uint8 (stoch,).
-    demo: float32 (A,), the demonstrator's action at obs. has_demo: bool ().
-  """
-
-  obs: jax.Array
-  action: jax.Array
-  reward: jax.Array
-  first: jax.Array
-  last: jax.Array
-  terminal: jax.Array
-  deter: jax.Array
-  stoch: jax.Array
-  demo: jax.Array
-  has_demo: jax.Array
+Address = tuple[Int[Array, "batch"], Int[Array, "batch"]]  # stream and first record of windows
 
 
 class Replay(NamedTuple):
-  """Attributes:
-  data: Record with leading (envs, capacity).
-  count: int32 (envs,), records ever written to each stream.
-  queue: int32 (envs,), number of the first record of the next window of the online queue.
+  """Records of streams side by side.
+
+  Attributes:
+    data: Record with leading (envs, capacity).
+    count: int32 (envs,), records ever written to each stream.
+    queue: int32 (envs,), number of the first record of the next window of the online queue.
   """
 
   data: Record
@@ -70,18 +53,17 @@ def room(records: int) -> int:
 def init(envs: int, capacity: int, obs_size: int, act_size: int, deter: int, stoch: int) -> Replay:
   """An empty replay."""
   zeros = lambda *shape, dtype=jnp.float32: jnp.zeros((envs, capacity) + shape, dtype)
-  flag = lambda: zeros(dtype=bool)
   data = Record(
-    zeros(obs_size),
-    zeros(act_size),
-    zeros(),
-    flag(),
-    flag(),
-    flag(),
-    zeros(deter, dtype=jnp.float16),
-    zeros(stoch, dtype=jnp.uint8),
-    zeros(act_size),
-    flag(),
+    obs=zeros(obs_size),
+    action=zeros(act_size),
+    reward=zeros(),
+    first=zeros(dtype=bool),
+    last=zeros(dtype=bool),
+    terminal=zeros(dtype=bool),
+    deter=zeros(deter, dtype=jnp.float16),
+    stoch=zeros(stoch, dtype=jnp.uint8),
+    demo=zeros(act_size),
+    has_demo=zeros(dtype=bool),
   )
   return Replay(data, jnp.zeros(envs, jnp.int32), jnp.zeros(envs, jnp.int32))
 
@@ -91,22 +73,20 @@ def clear(replay: Replay) -> Replay:
   return replay._replace(count=jnp.zeros_like(replay.count), queue=jnp.zeros_like(replay.queue))
 
 
-def add(replay: Replay, records: Record, keep: jax.Array) -> Replay:
+def add(replay: Replay, records: Record, keep: Bool[Array, "envs records"]) -> Replay:
   """Appends the records of a chunk.
 
   Args:
+    replay: of `envs` streams.
     records: Record with leading (envs, n), n at most the capacity.
     keep: bool (envs, n); the others are left out, order is kept.
   """
   capacity = replay.data.reward.shape[1]
 
-  def one(
-    data: Record, count: jax.Array, records: Record, keep: jax.Array
-  ) -> tuple[Record, jax.Array]:
+  def one(data: Record, count: Array, records: Record, keep: Array) -> tuple[Record, Array]:
     number = count + jnp.cumsum(keep) - 1
-    slot = jnp.where(
-      keep, number % capacity, capacity
-    )  # capacity lies outside: the write is dropped
+    # capacity lies outside: the write is dropped
+    slot = jnp.where(keep, number % capacity, capacity)
     data = jax.tree.map(lambda d, r: d.at[slot].set(r.astype(d.dtype), mode="drop"), data, records)
     return data, count + jnp.sum(keep)
 
@@ -114,15 +94,19 @@ def add(replay: Replay, records: Record, keep: jax.Array) -> Replay:
   return replay._replace(data=data, count=count.astype(jnp.int32))
 
 
-def windows(replay: Replay, length: int) -> jax.Array:
+def windows(replay: Replay, length: int) -> Int[Array, ""]:
   """Windows of `length` records that can be drawn, int32 ()."""
   capacity = replay.data.reward.shape[1]
   return jnp.sum(jnp.maximum(0, jnp.minimum(replay.count, capacity) - length + 1))
 
 
 def sample(
-  replay: Replay, key: jax.Array, batch: int, length: int, only: jax.Array | None = None
-) -> tuple[Replay, Batch, tuple[jax.Array, jax.Array]]:
+  replay: Replay,
+  key: Key[Array, ""],
+  batch: int,
+  length: int,
+  only: Int[Array, ""] | None = None,
+) -> tuple[Replay, Record, Address]:
   """Draws windows: first those waiting in the online queue, then uniformly over all windows.
 
   The queue holds every non-overlapping window of each stream once, oldest first, so each fresh
@@ -130,12 +114,15 @@ def sample(
   first one.
 
   Args:
-    batch, length: windows and records of each (context included).
+    replay: to draw from.
+    key: of the draw.
+    batch: windows.
+    length: records of each, context included.
     only: int32 (), the one stream to draw from, as if the others held nothing; None: all.
 
   Returns:
-    (replay', Batch with leading (batch, length), address). address = (stream (batch,), number of
-    the first record (batch,)). The caller makes sure that at least one window exists.
+    (replay', Record with leading (batch, length), address). The caller makes sure that at least one
+    window exists.
   """
   capacity = replay.data.reward.shape[1]
   mine = True if only is None else jnp.arange(len(replay.count)) == only
@@ -161,30 +148,23 @@ def sample(
   at = (start[:, None] + jnp.arange(length)) % capacity
   out = jax.tree.map(lambda d: d[stream[:, None], at], replay.data)
   last = out.last.at[:, :-1].set(out.last[:, :-1] | out.first[:, 1:])
-  batch_ = Batch(
-    out.obs,
-    out.action,
-    out.reward,
-    out.first.at[:, 0].set(True),
-    last,
-    out.terminal,
-    out.deter,
-    out.stoch.astype(jnp.int32),
-    out.demo,
-    out.has_demo,
-  )
-  return replay._replace(queue=queue + taken * length), batch_, (stream, start)
+  first = out.first.at[:, 0].set(True)
+  drawn = out._replace(first=first, last=last, stoch=out.stoch.astype(jnp.int32))
+  return replay._replace(queue=queue + taken * length), drawn, (stream, start)
 
 
 def refresh(
-  replay: Replay, address: tuple[jax.Array, jax.Array], latents: tuple[jax.Array, jax.Array]
+  replay: Replay,
+  address: Address,
+  latents: tuple[Shaped[Array, "batch steps deter"], Int[Array, "batch steps variables"]],
 ) -> Replay:
   """Overwrites the stored latents of records 1.. of each window with freshly computed ones, evicted
   records apart.
 
   Args:
+    replay: that the windows were drawn from.
     address: as `sample` returned it.
-    latents: deter (batch, T, D), stoch (batch, T, stoch) of records 1..T of each window.
+    latents: deter and stoch of records 1..T of each window.
   """
   capacity = replay.data.reward.shape[1]
   stream, start = address
@@ -193,8 +173,7 @@ def refresh(
   alive = number >= (replay.count - capacity)[stream][:, None]
   slot = jnp.where(alive, number % capacity, capacity)
   write = lambda d, x: d.at[stream[:, None], slot].set(x.astype(d.dtype), mode="drop")
+  data = replay.data
   return replay._replace(
-    data=replay.data._replace(
-      deter=write(replay.data.deter, deter), stoch=write(replay.data.stoch, stoch)
-    )
+    data=data._replace(deter=write(data.deter, deter), stoch=write(data.stoch, stoch))
   )

@@ -9,26 +9,23 @@ later and o ranging over observation variables:
   streaming   s_t[o] = (1/n) sum_{i=1..n} |xhat_{t|t-i}[o] - x_t[o]|, in the row whose arrival is t
 
 OPR = mean over o; RPR is the same sum over the reward. A window is cut at a reset and averaged over
-the steps left; fewer than
-`least` of them, or fewer than n steps since the run began, make the row invalid.   Source: the
-  paper, section on change detection.
+the steps left; fewer than `least` of them, or fewer than n steps since the run began, make the row
+invalid. Source: the paper, section on change detection.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool, Float, Int, Key
 
 from mjx_cl.dreamer import rssm
 from mjx_cl.errors import UserError
-from mjx_cl.types import Spec, Var
-
-if TYPE_CHECKING:
-  from mjx_cl.dreamer.agent import Agent
-  from mjx_cl.rollout.scan import Row
+from mjx_cl.rollout.scan import Row
+from mjx_cl.types import Array, Spec, Var
 
 GROUPS = 8  # parts of the observation with a residual of their own
 LATENT = 16  # dimensions of the latent's projection
@@ -49,11 +46,14 @@ class Residual(NamedTuple):
   """What detectors see of one row. Whatever is not known is nan.
 
   Attributes:
-    opr, rpr: float32 (). variables: float32 (O,), in raw units. valid: bool (): opr, rpr, variables
-      and groups are known.
+    opr: float32 (), mean of `variables`.
+    rpr: float32 (), that of the reward.
+    variables: float32 (O,), in raw units.
+    valid: bool (), opr, rpr, variables and groups are known.
     groups: float32 (8,), mean residual of the parts `spec.watched`, in typical deviations of each
       variable.
-    reward: float32 (), of arriving. terminated: bool (), the episode ended in arriving.
+    reward: float32 (), of arriving.
+    terminated: bool (), the episode ended in arriving.
     surprise: float32 (), KL(posterior || prior) of the latent at the decision [nats].
     latent: float32 (16,), a fixed projection of the posterior latent at the decision, see
       `Monitor.project`.
@@ -72,10 +72,9 @@ class Residual(NamedTuple):
 
 def unknown(leading: tuple[int, ...], variables: int) -> Residual:
   """Rows of which nothing is known."""
-  nan, false = (
-    lambda *shape: jnp.full(leading + shape, jnp.nan),
-    lambda: jnp.zeros(leading, bool),
-  )  # no two fields share a buffer: all are donated
+  # no two fields share a buffer: all are donated
+  nan = lambda *shape: jnp.full(leading + shape, jnp.nan)
+  false = lambda: jnp.zeros(leading, bool)
   return Residual(
     nan(), nan(), nan(variables), false(), nan(GROUPS), nan(), false(), nan(), nan(LATENT)
   )
@@ -95,8 +94,16 @@ def watched(spec: Spec) -> tuple[tuple[str, tuple[int, ...]], ...]:
 
 
 class History(NamedTuple):
-  """The last n - 1 rows before a chunk, time-major (n - 1, groups, members, ...). `exists` is false
-  before the run began.
+  """The last n - 1 rows before a chunk, time-major (n - 1, groups, members, ...).
+
+  Attributes:
+    deter: float32 (D,), latent at the decision.
+    stoch: int32 (stoch,), its class indices.
+    action: float32 (A,).
+    obs: float32 (O,), of arriving.
+    reward: float32 (), of arriving.
+    done: bool (), the episode ended in arriving.
+    exists: bool (), false before the run began.
   """
 
   deter: jax.Array
@@ -123,7 +130,7 @@ class Monitor:
 
   def __init__(
     self,
-    agent: Agent,
+    agent: Any,
     n: int = 15,
     form: str = "paper",
     actions: str = "recorded",
@@ -142,38 +149,37 @@ class Monitor:
     for k, (_, at) in enumerate(watched(spec)):
       for i in at:
         self._groups[i, k] = 1.0 / (len(at) * spec.obs[i].scale)
-    rng = np.random.default_rng(LATENT)
-    self._projection = (
-      rng.standard_normal((agent.size.deter + agent.stoch_size, LATENT))
-      / np.sqrt(
-        np.concatenate(
-          [np.full(agent.size.deter, agent.size.deter), np.full(agent.stoch_size, agent.size.stoch)]
-        )
-      )[:, None]
-    ).astype(np.float32)
+    size, shape = agent.size, (agent.size.deter + agent.stoch_size, LATENT)
+    parts = [np.full(size.deter, size.deter), np.full(agent.stoch_size, size.stoch)]
+    normal = np.random.default_rng(LATENT).standard_normal(shape)
+    self._projection = (normal / np.sqrt(np.concatenate(parts))[:, None]).astype(np.float32)
 
   def init(self, groups: int, members: int) -> History:
     """The history before a run."""
     a = self.agent
-    zeros = lambda *shape: jnp.zeros((self.n - 1, groups, members) + shape)
+    zeros = lambda *shape, dtype=jnp.float32: jnp.zeros(
+      (self.n - 1, groups, members) + shape, dtype
+    )
     return History(
       zeros(a.size.deter),
-      jnp.zeros((self.n - 1, groups, members, a.size.stoch), jnp.int32),
+      zeros(a.size.stoch, dtype=jnp.int32),
       zeros(a.act_size),
       zeros(a.obs_size),
       zeros(),
-      zeros().astype(bool),
-      zeros().astype(bool),
+      zeros(dtype=bool),
+      zeros(dtype=bool),
     )
 
   def update(
-    self, params: Any, history: History, rows: Row, keys: jax.Array
+    self, params: Any, history: History, rows: Row, keys: Key[Array, "groups"]
   ) -> tuple[History, Residual]:
     """Residuals of one chunk.
 
     Args:
-      params: leading (groups,). rows: rollout.Row with leading (T, groups, members), T >= n - 1.
-        keys: (groups,).
+      params: leading (groups,).
+      history: before the chunk.
+      rows: leading (T, groups, members), T >= n - 1.
+      keys: of the predictions.
 
     Returns:
       (history', Residual with leading (T, groups, members)).
@@ -181,24 +187,23 @@ class Monitor:
     seq = self._join(history, rows)
     per_group = jax.vmap(self._group, (0, 1, 0), 1)
     opr, rpr, variables, valid = per_group(params, seq, keys)
-    surprise, latent = jax.vmap(self._look, (0, 1, 1, 1), 1)(
-      params, rows.obs, rows.deter, rows.stoch
-    )
+    look = jax.vmap(self._look, (0, 1, 1, 1), 1)
+    surprise, latent = look(params, rows.obs, rows.deter, rows.stoch)
     residual = Residual(
-      opr,
-      rpr,
-      variables,
-      valid,
-      variables @ self._groups,
-      rows.reward,
-      rows.terminated,
-      surprise,
-      latent,
+      opr=opr,
+      rpr=rpr,
+      variables=variables,
+      valid=valid,
+      groups=variables @ self._groups,
+      reward=rows.reward,
+      terminated=rows.terminated,
+      surprise=surprise,
+      latent=latent,
     )
     return self._last(history, seq), residual
 
   def update_each(
-    self, params: Any, history: History, rows: Row, keys: jax.Array
+    self, params: Any, history: History, rows: Row, keys: Key[Array, "groups members"]
   ) -> tuple[History, Residual]:
     """`update` with a key for each member, (groups, members): no member's residuals depend on which
     others there are, but for the last digit.
@@ -222,10 +227,15 @@ class Monitor:
     return jax.tree.map(lambda x: x[-(self.n - 1) :], seq) if self.n > 1 else history
 
   def _group(
-    self, params: Any, seq: History, key: jax.Array
-  ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    self, params: Any, seq: History, key: Key[Array, ""]
+  ) -> tuple[
+    Float[Array, "steps members"],
+    Float[Array, "steps members"],
+    Float[Array, "steps members obs"],
+    Bool[Array, "steps members"],
+  ]:
     """One parameter set; seq has leading (n - 1 + T, members)."""
-    n, total, members = self.n, seq.done.shape[0], seq.done.shape[1]
+    n, (total, members) = self.n, seq.done.shape
     rows = total - n + 1
     starts = rows if self.form == "paper" else total
     # window[i, s] = row s + i, clamped; `inside` says that it exists
@@ -240,16 +250,11 @@ class Monitor:
     else:
       obs, reward = self.agent.dream(params, deter, stoch, n, key)
     shape = (n, starts, members)
-    error = jnp.concatenate(
-      [
-        jnp.abs(obs.reshape(shape + (-1,)) - seq.obs[index]),
-        jnp.abs(reward.reshape(shape) - seq.reward[index])[..., None],
-      ],
-      -1,
-    )
-    ended = (
-      jnp.cumsum(seq.done[index].astype(jnp.int32), 0) - seq.done[index]
-    )  # resets before the i-th arrival
+    obs_error = jnp.abs(obs.reshape(shape + (-1,)) - seq.obs[index])
+    reward_error = jnp.abs(reward.reshape(shape) - seq.reward[index])
+    error = jnp.concatenate([obs_error, reward_error[..., None]], -1)
+    # resets before the i-th arrival
+    ended = jnp.cumsum(seq.done[index].astype(jnp.int32), 0) - seq.done[index]
     valid = inside[..., None] & (ended == 0) & seq.exists[:starts][None]
     if self.form == "streaming":  # row k gathers the i-th prediction of start k - i + 1
       row = jnp.arange(n - 1, total)[None] - jnp.arange(n)[:, None]
@@ -262,18 +267,21 @@ class Monitor:
     return jnp.mean(mean[..., :-1], -1), mean[..., -1], mean[..., :-1], good
 
   def _look(
-    self, params: Any, obs: jax.Array, deter: jax.Array, stoch: jax.Array
-  ) -> tuple[jax.Array, jax.Array]:
-    """Surprise [nats] and projected latent (16,) of decisions: obs (..., O), deter (..., D), stoch
-    (..., stoch) int.
-    """
+    self,
+    params: Any,
+    obs: Float[Array, "*lead obs"],
+    deter: Float[Array, "*lead deter"],
+    stoch: Int[Array, "*lead variables"],
+  ) -> tuple[Float[Array, "*lead"], Float[Array, "*lead 16"]]:
+    """Surprise [nats] and projected latent of decisions."""
     logits = [x.astype(jnp.float32) for x in self.agent.beliefs(params, deter, obs)]
     return rssm.kl(*logits), self.project(deter, stoch)
 
-  def project(self, deter: jax.Array, stoch: jax.Array) -> jax.Array:
-    """float32 (..., 16): one fixed Gaussian projection (NumPy's default_rng(16)) of [deter /
-    sqrt(D), one-hot stoch / sqrt(variables)].
+  def project(
+    self, deter: Float[Array, "*lead deter"], stoch: Int[Array, "*lead variables"]
+  ) -> Float[Array, "*lead 16"]:
+    """One fixed Gaussian projection (NumPy's default_rng(16)) of [deter / sqrt(D), one-hot stoch /
+    sqrt(variables)].
     """
-    return (
-      jnp.concatenate([deter.astype(jnp.float32), self.agent.hot(stoch)], -1) @ self._projection
-    )
+    latent = jnp.concatenate([deter.astype(jnp.float32), self.agent.hot(stoch)], -1)
+    return latent @ self._projection

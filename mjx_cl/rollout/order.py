@@ -9,8 +9,7 @@ a power of two and divides what a register holds:
     lane = width * seed + arm        width = the least power of two that holds all arms; lanes
       without an arm live an arm's life once more
 
-What it costs is measured in benchmarks/README.md; with three arms a third more robots act and move,
-with five 60 % more.
+What it costs is in benchmarks/README.md.
 """
 
 from __future__ import annotations
@@ -27,13 +26,15 @@ class Lanes:
   """The lanes of arms x seeds streams, which are numbered arm by arm, seed by seed.
 
   Args:
-    arms, seeds: their numbers.
+    arms: their number.
+    seeds: their number.
     backend: name of JAX's backend; None: the default one. On an accelerator all streams are
       computed alike.
 
   Attributes:
-    order: int (lanes,), the stream in each lane. place: int (arms x seeds,), lane of each stream.
-      plain: streams lie in their own order.
+    order: int (lanes,), the stream in each lane.
+    place: int (arms x seeds,), lane of each stream.
+    plain: streams lie in their own order.
   """
 
   def __init__(self, arms: int, seeds: int, backend: str | None = None) -> None:

@@ -9,24 +9,18 @@ arriving. A reset touches neither the fault clock nor a detector.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
+from jaxtyping import Bool, Float, Key
 
 from mjx_cl import faults as faults_lib
-from mjx_cl.dreamer.agent import Carry
-from mjx_cl.dreamer.replay import Record
-from mjx_cl.keys import OfStep
-from mjx_cl.types import EnvState
-
-if TYPE_CHECKING:
-  from collections.abc import Sequence
-
-  from jax.typing import ArrayLike
-
-  from mjx_cl.types import Step
+from mjx_cl.dreamer.state import Carry, Record
+from mjx_cl.keys import OfSeed, OfStep
+from mjx_cl.types import Array, EnvState, Step
 
 STRETCH = 16  # control steps under one random action, where a robot is shaken
 
@@ -35,10 +29,15 @@ class Stream(NamedTuple):
   """One robot between two decisions.
 
   Attributes:
-    env: EnvState. agent: Carry. obs: float32 (O,). reward: float32 (), of arriving at obs, 0 at an
-      episode's start.
-    first: bool (), obs starts an episode. key: the stream's key; every draw folds in the step.
-    t: int32 (), control steps since the run began. episode: int32 (). injection: the true fault.
+    env: EnvState.
+    agent: Carry.
+    obs: float32 (O,).
+    reward: float32 (), of arriving at obs, 0 at an episode's start.
+    first: bool (), obs starts an episode.
+    key: the stream's key; every draw folds in the step.
+    t: int32 (), control steps since the run began.
+    episode: int32 (), number of the episode.
+    injection: the true fault.
   """
 
   env: EnvState
@@ -56,12 +55,23 @@ class Row(NamedTuple):
   """What one decision brings; a chunk stacks T of them, time-major.
 
   Attributes:
-    obs (O,), first (), reward_in (), action (A,), deter (D,), stoch (stoch,) int: at the decision.
-    reward (): sum over the control steps of the decision; rewards (repeat,): one by one.
-    final_obs (O,), terminated (), truncated (): of arriving.
-    severity (): true severity in force in the last control step, the greatest where there are
-      several faults. episode int32 (). demo (A,), has_demo ().
-    severities (repeat,): that of each control step; None where a decision is one.
+    obs: float32 (O,), at the decision.
+    first: bool (), obs starts an episode.
+    reward_in: float32 (), of arriving at obs.
+    action: float32 (A,).
+    deter: float32 (D,), latent at the decision.
+    stoch: int32 (stoch,), class indices of the latent.
+    reward: float32 (), sum over the control steps of the decision.
+    rewards: float32 (repeat,), one by one.
+    final_obs: float32 (O,), of arriving.
+    terminated: bool (), of arriving.
+    truncated: bool (), of arriving.
+    severity: float32 (), true severity in force in the last control step, the greatest where there
+      are several faults.
+    episode: int32 (), number of the episode.
+    demo: float32 (A,), the demonstrator's action at obs.
+    has_demo: bool ().
+    severities: float32 (repeat,), severity of each control step; None where a decision is one.
   """
 
   obs: jax.Array
@@ -82,50 +92,65 @@ class Row(NamedTuple):
   severities: jax.Array | None = None
 
 
+def stream_keys(seeds: Iterable[int], streams: int) -> Key[Array, "keys"]:
+  """Keys of `streams` streams for each seed, (len(seeds) * streams,); the first of a seed is the
+  one that `run` uses.
+  """
+  keys = [
+    jax.random.key(s) if i == 0 else jax.random.fold_in(jax.random.key(s), OfSeed.FURTHER + i)
+    for s in seeds
+    for i in range(streams)
+  ]
+  return jnp.stack(keys)
+
+
 def start(
   env: Any,
   agent: Any,
   fault: faults_lib.Fault | tuple[faults_lib.Fault, ...],
-  key: jax.Array,
-  severity: ArrayLike | Sequence[float] = 0.0,
-  onset: ArrayLike | Sequence[float] = 0,
-  duration: ArrayLike | Sequence[float] = faults_lib.FOREVER,
-  target: jax.Array | int = -1,
+  key: Key[Array, ""],
+  severity: ArrayLike | Sequence[Any] = 0.0,
+  onset: ArrayLike | Sequence[Any] = 0,
+  duration: ArrayLike | Sequence[Any] = faults_lib.FOREVER,
+  target: Any = -1,
   plan: faults_lib.Plan | None = None,
 ) -> Stream:
   """A fresh stream; its robot, fault target and every later draw come from `key`.
 
   Args:
-    fault: Fault or tuple of F. severity, onset, duration, target: () or (F,). plan: in place of
-      severity, onset and duration.
+    env: of the robot.
+    agent: that acts.
+    fault: Fault or tuple of F.
+    key: of the stream.
+    severity: () or (F,).
+    onset: () or (F,) [control steps].
+    duration: () or (F,) [control steps].
+    target: () or (F,); -1: drawn.
+    plan: in place of severity, onset and duration.
   """
   t = jnp.int32(0)
   key_env, key_fault, key = jax.random.split(key, 3)
-  injection = faults_lib.begin(
-    fault, key_fault, faults_lib.plan(severity, onset, duration) if plan is None else plan, target
-  )
-  now, model = (
-    jax.random.fold_in(key, t),
-    faults_lib.owned_model(faults_lib.as_tuple(fault), env.model),
-  )
+  plan = faults_lib.plan(severity, onset, duration) if plan is None else plan
+  injection = faults_lib.begin(fault, key_fault, plan, target)
+  now = jax.random.fold_in(key, t)
+  model = faults_lib.owned_model(faults_lib.as_tuple(fault), env.model)
   ports = faults_lib.Ports(model, ctrl=jnp.zeros(len(env.spec.act)), first=True)
-  _, ports, _ = faults_lib.drive(
-    fault, injection, t, jax.random.fold_in(now, OfStep.FAULTS), ports
-  )  # onset 0: the first episode is of the faulty robot
+  # onset 0: the first episode is of the faulty robot
+  _, ports, _ = faults_lib.drive(fault, injection, t, jax.random.fold_in(now, OfStep.FAULTS), ports)
   env_state, obs = env.init(ports.model, key_env)
   injection, obs = faults_lib.sense(
     fault, injection, t, jax.random.fold_in(now, OfStep.FIRST_READING), model, obs, True
   )
   return Stream(
-    env_state,
-    agent.carry(),
-    obs,
-    jnp.float32(0),
-    jnp.bool_(True),
-    key,
-    t,
-    jnp.int32(0),
-    injection,
+    env=env_state,
+    agent=agent.carry(),
+    obs=obs,
+    reward=jnp.float32(0),
+    first=jnp.bool_(True),
+    key=key,
+    t=t,
+    episode=jnp.int32(0),
+    injection=injection,
   )
 
 
@@ -138,7 +163,9 @@ class Rollout:
   """Acting, physics and fault for (groups, members) streams.
 
   Args:
-    env, agent, fault: what is joined; `fault` may be a tuple.
+    env: of the robot.
+    agent: that acts.
+    fault: Fault or a tuple of them.
     repeat: control steps per decision.
     deterministic: the policy's mean instead of a sample.
     expert: a demonstrator, Stream -> action, or None.
@@ -161,8 +188,12 @@ class Rollout:
     self.chunk = functools.partial(jax.jit, static_argnames=("length",))(self._chunk)
 
   def _decide(
-    self, params: Any, stream: Stream, drive: jax.Array, shake: jax.Array | None
-  ) -> tuple[Carry, jax.Array, jax.Array, jax.Array]:
+    self,
+    params: Any,
+    stream: Any,
+    drive: Bool[Array, ""],
+    shake: Float[Array, ""] | None,
+  ) -> tuple[Carry, Float[Array, "act"], Float[Array, "act"], Bool[Array, ""]]:
     key = jax.random.fold_in(stream.key, stream.t)
     key_act, key_expert = jax.random.split(jax.random.fold_in(key, OfStep.ACT))
     carry, action = self.agent.act(params, stream.agent, stream.obs, key_act, self.deterministic)
@@ -181,29 +212,22 @@ class Rollout:
       carry = carry._replace(action=action)
     return carry, action, demo, has_demo
 
-  def _control(self, stream: Stream, action: jax.Array) -> tuple[Any, Step, jax.Array]:
+  def _control(
+    self, stream: Any, action: Float[Array, "act"]
+  ) -> tuple[Any, Step, Float[Array, ""]]:
     """One control step of one robot under its faults."""
     now = jax.random.fold_in(stream.key, stream.t)
     injection, ports, severity = self._drive(stream, now, action)
     env_state, out = self.env.step(ports.model, stream.env, ports.ctrl)
-    injection, obs = faults_lib.sense(
-      self.fault,
-      injection,
-      stream.t + 1,
-      jax.random.fold_in(now, OfStep.READING),
-      self.model,
-      out.final_obs,
-    )
+    t = stream.t + 1
+    reading = jax.random.fold_in(now, OfStep.READING)
+    injection, obs = faults_lib.sense(self.fault, injection, t, reading, self.model, out.final_obs)
     out = out._replace(obs=obs, final_obs=obs)
-    return (
-      stream._replace(env=env_state, t=stream.t + 1, injection=injection),
-      out,
-      jnp.max(severity),
-    )
+    return stream._replace(env=env_state, t=t, injection=injection), out, jnp.max(severity)
 
   def _drive(
-    self, stream: Stream, now: jax.Array, action: jax.Array
-  ) -> tuple[faults_lib.Injection, faults_lib.Ports, jax.Array]:
+    self, stream: Any, now: Key[Array, ""], action: Float[Array, "act"]
+  ) -> tuple[faults_lib.Injection, faults_lib.Ports, Array]:
     ports = faults_lib.Ports(self.model, ctrl=action, first=stream.first)
     return faults_lib.drive(
       self.fault, stream.injection, stream.t, jax.random.fold_in(now, OfStep.FAULTS), ports
@@ -212,95 +236,95 @@ class Rollout:
   def _chunk(
     self,
     params: Any,
-    streams: Stream,
+    streams: Any,
     length: int,
-    drive: jax.Array | None = None,
-    shake: jax.Array | None = None,
+    drive: Bool[Array, "groups members"] | None = None,
+    shake: Float[Array, "groups members"] | None = None,
   ) -> tuple[Any, Row]:
     """`length` decisions.
 
     Args:
       params: agent parameters with leading (groups,).
       streams: Stream with leading (groups, members).
-      drive: bool (groups, members), the expert acts; used only where there is one.
-      shake: float32 (groups, members), probability that a stretch of STRETCH control steps is
-        driven by one random action, uniform in [-1, 1], in place of the policy's; None: never.
+      length: decisions.
+      drive: the expert acts; used only where there is one.
+      shake: probability that a stretch of STRETCH control steps is driven by one random action,
+        uniform in [-1, 1], in place of the policy's; None: never.
 
     Returns:
       (streams', Row with leading (length, groups, members)).
     """
-    if drive is None:
-      drive = jnp.zeros(streams.t.shape, bool)
-    shaken = None if shake is None else 0
-    decide = nest(self._decide, (0, 0, 0, shaken), (None, 0, 0, shaken))
-    control = nest(self._control, (0, 0), (0, 0))
+    drive = jnp.zeros(streams.t.shape, bool) if drive is None else drive
     params = jax.vmap(self.agent.prepare)(params)
-
-    def step(streams: Stream, _: Any) -> tuple[Stream, Row]:
-      carry, action, demo, has_demo = decide(params, streams, drive, shake)
-      before = streams
-      streams, out, severity = control(streams, action)
-      rewards, severities = [out.reward], [severity]
-      for _ in range(self.repeat - 1):
-        over = out.terminated | out.truncated
-        later, new, severity = control(streams, action)
-        hold = lambda old, new: jax.tree.map(
-          lambda a, b: jnp.where(expand(over, b), a, b), old, new
-        )
-        clock = later.t
-        streams, out = hold(streams, later)._replace(t=clock), hold(out, new)
-        rewards.append(jnp.where(over, 0.0, new.reward))
-        severities.append(severity)
-      reward = sum(rewards[1:], rewards[0])
-      done = out.terminated | out.truncated
-      stoch = jnp.argmax(
-        carry.stoch.reshape(
-          carry.stoch.shape[:-1] + (self.agent.size.stoch, self.agent.size.classes)
-        ),
-        -1,
-      )
-      row = Row(
-        before.obs,
-        before.first,
-        before.reward,
-        action,
-        carry.deter,
-        stoch,
-        reward,
-        jnp.stack(rewards, -1),
-        out.final_obs,
-        out.terminated,
-        out.truncated,
-        severity,
-        before.episode,
-        demo,
-        has_demo,
-        jnp.stack(severities, -1) if self.repeat > 1 else None,
-      )
-      streams = streams._replace(
-        agent=carry, obs=out.obs, reward=reward, first=jnp.zeros_like(done)
-      )
-      return jax.lax.cond(jnp.any(done), self._reset, lambda s, d: s, streams, done), row
-
+    step = lambda streams, _: self._step(params, streams, drive, shake)
     return jax.lax.scan(step, streams, None, length=length)
 
-  def _reset(self, streams: Stream, done: jax.Array) -> Stream:
+  def _step(
+    self,
+    params: Any,
+    streams: Any,
+    drive: Bool[Array, "groups members"],
+    shake: Float[Array, "groups members"] | None,
+  ) -> tuple[Any, Row]:
+    """One decision of all streams."""
+    shaken = None if shake is None else 0
+    decide = nest(self._decide, (0, 0, 0, shaken), (None, 0, 0, shaken))
+    carry, action, demo, has_demo = decide(params, streams, drive, shake)
+    moved, out, rewards, severities = self._hold(streams, action)
+    reward = sum(rewards[1:], rewards[0])
+    done = out.terminated | out.truncated
+    size = self.agent.size
+    hot = carry.stoch.reshape(carry.stoch.shape[:-1] + (size.stoch, size.classes))
+    row = Row(
+      obs=streams.obs,
+      first=streams.first,
+      reward_in=streams.reward,
+      action=action,
+      deter=carry.deter,
+      stoch=jnp.argmax(hot, -1),
+      reward=reward,
+      rewards=jnp.stack(rewards, -1),
+      final_obs=out.final_obs,
+      terminated=out.terminated,
+      truncated=out.truncated,
+      severity=severities[-1],
+      episode=streams.episode,
+      demo=demo,
+      has_demo=has_demo,
+      severities=jnp.stack(severities, -1) if self.repeat > 1 else None,
+    )
+    moved = moved._replace(agent=carry, obs=out.obs, reward=reward, first=jnp.zeros_like(done))
+    return jax.lax.cond(jnp.any(done), self._reset, lambda s, d: s, moved, done), row
+
+  def _hold(
+    self, streams: Any, action: Float[Array, "groups members act"]
+  ) -> tuple[Any, Step, list[Array], list[Array]]:
+    """`repeat` control steps with one action; a stream whose episode is over rests, its clock runs
+    on. Gives also reward and severity of each step.
+    """
+    control = nest(self._control, (0, 0), (0, 0))
+    streams, out, severity = control(streams, action)
+    rewards, severities = [out.reward], [severity]
+    for _ in range(self.repeat - 1):
+      over = out.terminated | out.truncated
+      later, new, severity = control(streams, action)
+      rest = lambda old, new: jax.tree.map(lambda a, b: jnp.where(expand(over, b), a, b), old, new)
+      streams, out = rest(streams, later)._replace(t=later.t), rest(out, new)
+      rewards.append(jnp.where(over, 0.0, new.reward))
+      severities.append(severity)
+    return streams, out, rewards, severities
+
+  def _reset(self, streams: Any, done: Bool[Array, "groups members"]) -> Any:
     """Starts a new episode where `done`; keys fold in the step, so a reset is reproducible."""
 
-    def one(stream: Stream, done: jax.Array) -> Stream:
+    def one(stream: Any, done: Array) -> Any:
       now = jax.random.fold_in(stream.key, stream.t)
-      _, ports, _ = self._drive(
-        stream, now, jnp.zeros(len(self.env.spec.act))
-      )  # a task that has changed draws its episodes otherwise
+      # a task that has changed draws its episodes otherwise
+      _, ports, _ = self._drive(stream, now, jnp.zeros(len(self.env.spec.act)))
       env_state, obs = self.env.init(ports.model, jax.random.fold_in(now, OfStep.EPISODE))
+      reading = jax.random.fold_in(now, OfStep.FIRST_READING)
       injection, obs = faults_lib.sense(
-        self.fault,
-        stream.injection,
-        stream.t,
-        jax.random.fold_in(now, OfStep.FIRST_READING),
-        self.model,
-        obs,
-        True,
+        self.fault, stream.injection, stream.t, reading, self.model, obs, True
       )
       new = stream._replace(
         env=env_state,
@@ -316,12 +340,12 @@ class Rollout:
     return nest(one, (0, 0), (0, 0))(streams, done)
 
 
-def expand(mask: jax.Array, like: jax.Array) -> jax.Array:
+def expand(mask: Bool[Array, "..."], like: Array) -> Bool[Array, "..."]:
   """Appends axes to `mask` until it broadcasts against `like`."""
   return mask.reshape(mask.shape + (1,) * (like.ndim - mask.ndim))
 
 
-def records(rows: Row) -> tuple[Record, jax.Array]:
+def records(rows: Row) -> tuple[Record, Bool[Array, "groups members records"]]:
   """Rows (T, groups, members) -> replay records (groups, members, 2 T) and which of them exist.
 
   Every decision gives a record; an episode's end gives one more, of the final observation, with
@@ -330,31 +354,31 @@ def records(rows: Row) -> tuple[Record, jax.Array]:
   done = rows.terminated | rows.truncated
   none = jnp.zeros_like(done)
   act = Record(
-    rows.obs,
-    rows.action,
-    rows.reward_in,
-    rows.first,
-    none,
-    none,
-    rows.deter,
-    rows.stoch,
-    rows.demo,
-    rows.has_demo,
+    obs=rows.obs,
+    action=rows.action,
+    reward=rows.reward_in,
+    first=rows.first,
+    last=none,
+    terminal=none,
+    deter=rows.deter,
+    stoch=rows.stoch,
+    demo=rows.demo,
+    has_demo=rows.has_demo,
   )
   end = Record(
-    rows.final_obs,
-    jnp.zeros_like(rows.action),
-    rows.reward,
-    none,
-    done,
-    rows.terminated,
-    jnp.zeros_like(rows.deter),
-    jnp.zeros_like(rows.stoch),
-    jnp.zeros_like(rows.demo),
-    none,
+    obs=rows.final_obs,
+    action=jnp.zeros_like(rows.action),
+    reward=rows.reward,
+    first=none,
+    last=done,
+    terminal=rows.terminated,
+    deter=jnp.zeros_like(rows.deter),
+    stoch=jnp.zeros_like(rows.stoch),
+    demo=jnp.zeros_like(rows.demo),
+    has_demo=none,
   )
 
-  def weave(a: jax.Array, b: jax.Array) -> jax.Array:
+  def weave(a: Array, b: Array) -> Array:
     x = jnp.stack([a, b], 1).reshape((-1,) + a.shape[1:])  # (2 T, groups, members, ...)
     return jnp.moveaxis(x, 0, 2)
 

@@ -9,30 +9,36 @@ is kept.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Float, Int, Key
 
 from mjx_cl import faults as faults_lib
-from mjx_cl.dreamer.agent import Carry
+from mjx_cl.dreamer.state import Carry
 from mjx_cl.errors import UserError
 from mjx_cl.rollout.scan import Rollout, Row, Stream, expand, start
-from mjx_cl.types import EnvState
-
-if TYPE_CHECKING:
-  from jax.typing import ArrayLike
-
-  from mjx_cl.types import Step
+from mjx_cl.types import Array, EnvState, Step
 
 
 class Arrival(NamedTuple):
   """A Stream of the second robot, and when it comes to life.
 
+  While the stream waits, `env` rests and `agent`, `obs`, `reward`, `first` mean nothing.
+
   Attributes:
-    env .. injection: as in rollout.Stream. While the stream waits, `env` rests and `agent`, `obs`,
-    `reward`, `first` mean nothing.
+    env: as in Stream, and so the others to `injection`.
+    agent: Carry.
+    obs: float32 (O,).
+    reward: float32 ().
+    first: bool ().
+    key: the stream's key.
+    t: int32 ().
+    episode: int32 ().
+    injection: faults of the second robot.
     due: int32 (), the first episode that ends in this control step or a later one is the first
       robot's last.
     enter: int32 (), control step that this robot's first episode begins with, FOREVER: not known
@@ -56,8 +62,9 @@ class Moving(NamedTuple):
   """Streams that change robots, leading (groups, members).
 
   Attributes:
-    before: Stream of the first robot; of no meaning from `after.enter` on. after: Arrival of the
-      second robot, whose clock stands until the first chunk in which a stream may move.
+    before: Stream of the first robot; of no meaning from `after.enter` on.
+    after: Arrival of the second robot, whose clock stands until the first chunk in which a stream
+      may move.
   """
 
   before: Stream
@@ -69,19 +76,18 @@ class Arriving(Rollout):
   so that the next one begins by the ordinary reset.
   """
 
-  def _control(self, stream: Arrival, action: jax.Array) -> tuple[Any, Step, jax.Array]:  # type: ignore[override]
-    later, out, severity = super()._control(stream, action)  # type: ignore[arg-type]
+  def _control(
+    self, stream: Arrival, action: Float[Array, "act"]
+  ) -> tuple[Any, Step, Float[Array, ""]]:
+    later, out, _ = super()._control(stream, action)
     waits = stream.t < stream.enter
     env = jax.tree.map(lambda rest, moved: jnp.where(waits, rest, moved), stream.env, later.env)
     out = out._replace(
       terminated=out.terminated & ~waits,
       truncated=jnp.where(waits, later.t == stream.enter, out.truncated),
     )
-    return (
-      later._replace(env=env),
-      out,
-      jnp.where(waits, 0.0, 1.0),
-    )  # to be another robot is severity 1, whatever else befalls it
+    # to be another robot is severity 1, whatever else befalls it
+    return later._replace(env=env), out, jnp.where(waits, 0.0, 1.0)
 
 
 class Transfer:
@@ -95,9 +101,12 @@ class Transfer:
   the stream's own and the control step, as after any reset.
 
   Args:
-    before, after: environments. agent: acts in both.
-    faults: tuple of Faults of `after`, their clocks counted from step 0 of the run.
+    before: environment of the first robot.
+    after: of the second one.
+    agent: acts in both.
+    faults: of `after`, their clocks counted from step 0 of the run.
     repeat: control steps per decision, 1.
+    deterministic: the policy's mean instead of a sample.
 
   Raises:
     UserError for another `repeat`, or robots that differ in what the agent sees or does.
@@ -117,11 +126,8 @@ class Transfer:
         "a change of robots needs an agent that decides in every control step; this one holds "
         f"its action for {repeat}"
       )
-    if (before.spec.obs, before.spec.act, before.spec.control_s) != (
-      after.spec.obs,
-      after.spec.act,
-      after.spec.control_s,
-    ):
+    seen = lambda spec: (spec.obs, spec.act, spec.control_s)
+    if seen(before.spec) != seen(after.spec):
       raise UserError(
         f"robot {before.spec.name!r} cannot become {after.spec.name!r}, whose observation, "
         "action or control period is another"
@@ -132,10 +138,15 @@ class Transfer:
     self._part, self._merge = jax.jit(part), jax.jit(merge)
 
   def start(
-    self, key: jax.Array, target: jax.Array | int, plan: faults_lib.Plan, due: ArrayLike
+    self, key: Key[Array, ""], target: Any, plan: faults_lib.Plan, due: ArrayLike
   ) -> Moving:
-    """A fresh stream. key, target, plan: see rollout.start, of the faults of `after`. due: int32
-    (), see Arrival; FOREVER: never changes.
+    """A fresh stream.
+
+    Args:
+      key: see rollout.start.
+      target: of the faults of `after`.
+      plan: likewise.
+      due: int32 (), see Arrival; FOREVER: never changes.
     """
     before = start(self.before.env, self.agent, self.healthy, key)
     after = start(self.after.env, self.agent, self.after.fault, key, target=target, plan=plan)
@@ -157,10 +168,8 @@ class Transfer:
     return Moving(left, arrived), self._merge(before.t, after.enter, rows, others)
 
 
-def clock(t: jax.Array, rows: Row) -> jax.Array:
-  """Control step of each row, (T, groups, members), of a chunk that begins with step `t` (groups,
-  members).
-  """
+def clock(t: Int[Array, "groups members"], rows: Row) -> Int[Array, "steps groups members"]:
+  """Control step of each row of a chunk that begins with step `t`."""
   return t + jnp.arange(rows.reward.shape[0])[:, None, None]
 
 
@@ -179,7 +188,9 @@ def part(before: Stream, rows: Row, after: Arrival) -> Arrival:
   )
 
 
-def merge(t: jax.Array, enter: jax.Array, before: Row, after: Row) -> Row:
+def merge(
+  t: Int[Array, "groups members"], enter: Int[Array, "groups members"], before: Row, after: Row
+) -> Row:
   """Of each stream the rows of `before` up to step enter - 1, then those of `after`."""
   moved = clock(t, before) >= enter
   return jax.tree.map(lambda a, b: jnp.where(expand(moved, a), b, a), before, after)

@@ -32,7 +32,7 @@ import numpy as np
 from mjx_cl import detectors, envs, faults
 from mjx_cl.adapt import decide as phase_lib
 from mjx_cl.adapt.arms import ARMS, FOREVER, never_stops
-from mjx_cl.adapt.blocks import Crew
+from mjx_cl.adapt.blocks import Blocks
 from mjx_cl.adapt.decide import SIGNALS
 from mjx_cl.adapt.loop import Choices, Loop, LoopState, Programs, choices
 from mjx_cl.config import CHUNK, RunConfig
@@ -188,7 +188,7 @@ class Runner:
       robot,
       json.dumps(settings, sort_keys=True, default=repr),
     )
-    self.crew = Crew(
+    self.crew = Blocks(
       Loop(
         agent,
         monitor,

@@ -13,7 +13,7 @@ import pytest
 import quick
 
 from mjx_cl.adapt import decide as phase_lib
-from mjx_cl.adapt.blocks import Crew, cut
+from mjx_cl.adapt.blocks import Blocks, cut
 from mjx_cl.adapt.decide import (
   ABORT_BELOW,
   ABORT_BUDGET,
@@ -472,7 +472,7 @@ def tell(kind, config=EAGER, used=0, block=1):
   keys, chosen = jax.random.split(jax.random.key(1), 3), choices(ARMS, config, CHUNKS * STEPS)
   copy = lambda tree: jax.tree.map(lambda x: np.array(x), tree)
   begin, told = copy(state), []
-  crew = Crew(loop, 3, block, threads=2)
+  crew = Blocks(loop, 3, block, threads=2)
   states = crew.split(state._replace(replay=[cut(state.replay, own, 0) for own in crew.blocks]))
   whole = lambda joined: joined._replace(
     replay=jax.tree.map(lambda *x: np.concatenate(x), *joined.replay)

@@ -10,7 +10,7 @@ import quick
 
 from mjx_cl.config import DreamerConfig, replace
 from mjx_cl.dreamer import nets, rssm
-from mjx_cl.dreamer.agent import Agent, Batch, Weights, parameter_count
+from mjx_cl.dreamer.agent import Agent, Record, Weights, parameter_count
 
 OBS, ACT, ROWS, LENGTH, IMAGINE = 5, 2, 3, 4, 3
 SMALL = dict(size="tiny", batch=ROWS, length=LENGTH, imagine=IMAGINE, warmup=20)
@@ -33,7 +33,7 @@ def make_batch(seed=0, ends=False):
     flag(*((1, 4),) * ends),
     flag(*((0, 4), (2, 3)) * ends),
   )
-  return Batch(
+  return Record(
     3 * n(OBS),
     1.5 * n(ACT),
     n(),

@@ -8,7 +8,7 @@ import pytest
 
 from mjx_cl import envs
 from mjx_cl.leaderboard import lives, record, streams
-from mjx_cl.rollout.frozen import stream_keys
+from mjx_cl.rollout.scan import stream_keys
 from mjx_cl.training import agents
 
 ROOT = pathlib.Path(__file__).parents[2]

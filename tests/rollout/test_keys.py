@@ -12,7 +12,7 @@ import pytest
 
 import mjx_cl
 from mjx_cl import keys
-from mjx_cl.rollout.frozen import stream_keys
+from mjx_cl.rollout.scan import stream_keys
 
 ENUMS = [x for x in vars(keys).values() if isinstance(x, type) and issubclass(x, enum.IntEnum)][1:]
 PACKAGE = pathlib.Path(mjx_cl.__file__).parent

@@ -1,0 +1,88 @@
+"""The arms of a run as arrays over its streams."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_cl.adapt.arms import ARMS
+from mjx_cl.config import FOREVER, AdaptConfig
+from mjx_cl.errors import choose
+
+# Choices.at is padded to a multiple of it: arms with up to eight starts share a program
+WIDTH = 8
+
+
+class Choices(NamedTuple):
+  """The arms of a run as arrays, leading (groups,); see arms.Arm.
+
+  Attributes:
+    listens: bool, alarms are acted on.
+    at: int32 (groups, K), control steps at which adaptation is due, FOREVER: none; K is a multiple
+      of WIDTH.
+    rule: bool, stop and abort rules are in force.
+    limit: int32, most control steps of one adaptation.
+    world_only: bool, actor and critic keep what they are.
+    fresh: bool, every start draws new parameters; None: no arm of the run does, and the program
+      goes without the drawing.
+    rollback: bool, an abort may put the weights of before the adaptation back; None: no arm of the
+      run does, and LoopState.before is None too.
+  """
+
+  listens: jax.Array
+  at: jax.Array
+  rule: jax.Array
+  limit: jax.Array
+  world_only: jax.Array
+  fresh: jax.Array | None
+  rollback: jax.Array | None = None
+
+
+def choices(
+  labels: Sequence[tuple[str, int]],
+  config: AdaptConfig,
+  steps: int,
+  onsets: Sequence[tuple[int, ...]] | None = None,
+  stops: dict[int, int] | None = None,
+) -> Choices:
+  """Choices of streams.
+
+  Args:
+    labels: (arm, seed) of each.
+    config: AdaptConfig.
+    steps: of the run.
+    onsets: true onsets of each robot, unless its arm spares it, as control steps, FOREVER: not
+      known yet; None: no faults.
+    stops: seed -> control steps after which an arm that is told its oracle stop ends.
+
+  Raises:
+    UserError where an arm's schedule does not fit into the run.
+  """
+  arms = [choose("arm", arm, ARMS) for arm, _ in labels]
+  onsets = [()] * len(arms) if onsets is None else onsets
+  at = [
+    arm.trigger.steps(config, own if arm.breaks else (), steps, seed)
+    for arm, own, (_, seed) in zip(arms, onsets, labels)
+  ]
+  width = WIDTH * max(1, -(-max(map(len, at)) // WIDTH))
+  padded = np.full((len(arms), width), FOREVER, np.int32)
+  for row, own in zip(padded, at):
+    row[: len(own)] = [step if step < steps else FOREVER for step in own]
+  flags = lambda get: jnp.asarray([get(arm) for arm in arms], bool)
+  limits = [
+    min(arm.end.limit(config), (stops or {})[seed]) if arm.end.told else arm.end.limit(config)
+    for arm, (_, seed) in zip(arms, labels)
+  ]
+  return Choices(
+    flags(lambda a: a.trigger.listens),
+    jnp.asarray(padded),
+    flags(lambda a: a.end.rule),
+    jnp.asarray(limits, jnp.int32),
+    flags(lambda a: a.world_only),
+    flags(lambda a: a.fresh) if any(arm.fresh for arm in arms) else None,
+    flags(lambda a: a.rollback) if any(arm.rollback for arm in arms) else None,
+  )

@@ -1,0 +1,77 @@
+"""What a run carries from chunk to chunk, and what the host logs of one."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+
+from mjx_cl.adapt.act import Before
+from mjx_cl.adapt.decide import PhaseState
+from mjx_cl.dreamer.agent import TrainState
+from mjx_cl.dreamer.replay import Replay
+from mjx_cl.rollout.monitor import History, Residual
+
+
+class LoopState(NamedTuple):
+  """Everything of a run but the streams; leading (groups,) unless said.
+
+  Attributes:
+    train: TrainState of each stream.
+    acting: the parameters that act and predict, a moving average of train.params while adapting,
+      equal to them otherwise.
+    replay: Replay with one environment each, post-alarm records only.
+    history: monitor history, leading (n - 1, groups, 1).
+    detector: state of the detector.
+    phase: PhaseState.
+    past: Residual of the last `refit` rows, leading (refit, groups).
+    owed: float32, fraction of an update that is due.
+    executed: int32, updates taken since the run began.
+    before: Before of each stream; None where no arm of the run goes back.
+  """
+
+  train: TrainState
+  acting: Any
+  replay: Replay | Any
+  history: History
+  detector: Any
+  phase: PhaseState
+  past: Residual
+  owed: jax.Array
+  executed: jax.Array
+  before: Before | None = None
+
+
+class Digest(NamedTuple):
+  """What the host logs of a chunk: rows (T, groups) and values (groups,).
+
+  Attributes:
+    residual: Residual of each row.
+    score: float32, the detector's, of each row.
+    fired: bool, alarms, of each row.
+    signals: float32 (groups, 6), in the order of decide.SIGNALS.
+    settled: bool (groups, 6), which of them have settled.
+    phase: int32, index into decide.PHASES after the chunk.
+    decision: int32, index into decide.REASONS.
+    since: int32, control step that the last adaptation counts from.
+    updates: int32, taken since the run began.
+    failed: int32, index into agent.CAUSES of what was at fault in an update, which changed nothing
+      and was the stream's last; -1: nothing.
+    back: bool, an abort put the weights of before the adaptation back; None where no arm does.
+    earned: float32, mean reward a step of those, see Before; None likewise.
+    earns: float32, of the weights that have learnt; None likewise.
+  """
+
+  residual: Residual
+  score: jax.Array
+  fired: jax.Array
+  signals: jax.Array
+  settled: jax.Array
+  phase: jax.Array
+  decision: jax.Array
+  since: jax.Array
+  updates: jax.Array
+  failed: jax.Array
+  back: jax.Array | None = None
+  earned: jax.Array | None = None
+  earns: jax.Array | None = None
