@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from typing import TypeVar
 
-if TYPE_CHECKING:
-  from collections.abc import Mapping
-  from typing import TypeVar
-
-  Member = TypeVar("Member")
+Member = TypeVar("Member")
 
 
 class UserError(Exception):
@@ -25,6 +22,12 @@ class FileError(UserError):
   """A broken, foreign or missing file, a full disk, a numeric failure: exit code 1."""
 
   exit_code = 1
+
+
+def require(holds: object, text: str) -> None:
+  """Raises UserError with this text unless the condition holds."""
+  if not holds:
+    raise UserError(text)
 
 
 def choose(kind: str, name: str, table: Mapping[str, Member]) -> Member:

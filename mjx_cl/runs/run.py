@@ -48,7 +48,7 @@ from mjx_cl.rollout.monitor import Monitor
 from mjx_cl.rollout.order import Lanes
 from mjx_cl.rollout.scan import Rollout, Stream, nest, start
 from mjx_cl.rollout.transfer import Moving, Transfer
-from mjx_cl.runs.doubts import doubts, watching
+from mjx_cl.runs.doubts import notes
 from mjx_cl.runs.identity import arm_agents, check_same, identity, known_as, threshold_of
 from mjx_cl.runs.records import Ledger, acts
 from mjx_cl.runs.settings import check
@@ -680,7 +680,7 @@ def execute(
       clear(out)
     runner.open()
     tables.write_json(out / "config.json", values)
-  for text in [*filter(None, [watching(config)]), *doubts(config)]:
+  for text in notes(config):
     tell(f"note: {text}")
   tell(
     f"{len(config.arms) * config.seeds} streams of {config.steps:,} control steps; what is not "

@@ -1,0 +1,179 @@
+"""`bench`: the parts of a suite run one after another or side by side, each into a folder as
+`mjx-cl run` writes it; finished parts are never run again.
+
+OUT/suite.json holds the resolved parts; OUT/PART/ the result files of each; what they say together
+is in scores.py. Parts are independent: several machines share a suite by `shard`, and `offers` and
+`take` take over what others finished.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pathlib
+import shutil
+import time
+from collections.abc import Callable, Collection, Iterable, Iterator
+from typing import Any
+
+from mjx_cl.errors import UserError
+from mjx_cl.runs import merge, run, workers
+from mjx_cl.runs.costs import Estimate
+from mjx_cl.runs.doubts import notes as notes_of
+from mjx_cl.runs.published import PUBLISHED
+from mjx_cl.runs.scores import collect
+from mjx_cl.runs.suite import Part, Suite, finished, write_plan
+
+MERGED = (*PUBLISHED, "trace.parquet", "residuals.parquet")
+Tell = Callable[[str], object]
+Display = Callable[[], contextlib.AbstractContextManager[Callable[[run.Progress], Any]]]
+
+
+def notes(parts: Iterable[Part]) -> list[tuple[str, str]]:
+  """What `mjx-cl run` would say of these parts' settings before it starts (doubts.py),
+  each with the parts that it holds for.
+  """
+  which: dict[str, list[str]] = {}
+  for part in parts:
+    for text in notes_of(part.config):
+      which.setdefault(text, []).append(part.name)
+  return [
+    (text, names[0] if len(names) == 1 else f"{names[0]} and {len(names) - 1} more")
+    for text, names in which.items()
+  ]
+
+
+def offers(
+  out: pathlib.Path,
+  parts: Iterable[Part],
+  folders: Collection[pathlib.Path | str],
+  tell: Tell = lambda text: None,
+) -> dict[str, list[pathlib.Path]]:
+  """Part -> folders that its run can be taken from, of those that are not finished in OUT: one, or
+  several whose seeds are to be joined, see merge.py.
+
+  Args:
+    out: folder of the suite.
+    parts: of the suite.
+    folders: others' OUT of the same suite.
+    tell: gets a line for each part of theirs that is refused, since it was run with other settings
+      or cannot be read.
+
+  Raises:
+    UserError: where OUT holds a part with other settings, or seeds of a part are missing or there
+      twice.
+  """
+  found = {}
+  for part in parts:
+    if finished(out, part):
+      continue
+    there = []
+    for folder in (pathlib.Path(f) / part.name for f in folders):
+      try:
+        if text := merge.differs(folder, part.config, merge.SEEDS):
+          tell(f"note: {folder} {text}; it is not taken over")
+        elif own := merge.seeds_of(folder, part.config):
+          there.append((folder, own))
+      except UserError as e:
+        tell(f"note: {e}; {part.name} is not taken over from there")
+    first, count = part.config.first_seed, part.config.seeds
+    whole = [[folder] for folder, own in there if own == list(range(first, first + count))]
+    if sources := whole[0] if whole else merge.choose([folder for folder, _ in there], part.config):
+      found[part.name] = sources
+  return found
+
+
+def take(out: pathlib.Path, parts: Iterable[Part], found: dict[str, list[pathlib.Path]]) -> None:
+  """Copies to OUT, or joins there, what `offers` has found of the parts."""
+  for part in parts:
+    if not (sources := found.get(part.name)):
+      continue
+    tmp = out / (part.name + ".tmp")
+    shutil.rmtree(tmp, ignore_errors=True)
+    tmp.mkdir(parents=True)
+    if len(sources) == 1:
+      for name in MERGED:
+        if (sources[0] / name).exists():
+          shutil.copyfile(sources[0] / name, tmp / name)
+      merge.copy_agents(sources[0], tmp)
+    else:
+      merge.join(sources, tmp, part.config)
+    shutil.rmtree(out / part.name, ignore_errors=True)
+    os.replace(tmp, out / part.name)
+
+
+@contextlib.contextmanager
+def _silent() -> Iterator[Callable[[run.Progress], Any]]:
+  """A display that shows nothing."""
+  yield lambda progress: None
+
+
+def execute(
+  plan: Suite,
+  out: pathlib.Path | str,
+  parts: Iterable[Part],
+  estimates: dict[str, Estimate] | None = None,
+  tell: Tell = lambda text: None,
+  display: Display = _silent,
+  save_every_s: float = 60.0,
+  jobs: int = 1,
+  worker: str = "",
+) -> dict:
+  """Runs the parts that are not finished, in order; one that was cut off goes on from its last
+  checkpoint.
+
+  Args:
+    plan: the suite.
+    out: folder of the suite.
+    parts: of the plan, see `pick`.
+    estimates: part -> Estimate, for the time left.
+    tell: called with each line for the user.
+    display: context manager that gives run.execute's progress.
+    save_every_s: most seconds of work that a kill loses.
+    jobs: parts side by side, see workers.py, the longest first. The last digits of a run depend on
+      how many cores it has.
+    worker: module that such a process runs.
+
+  Returns:
+    bench.json's value.
+  """
+  out = pathlib.Path(out)
+  known: dict[str, dict] = {}
+  write_plan(plan, out)
+  todo = [p for p in parts if not finished(out, p)]
+  guess = lambda names: sum(estimates[name].seconds for name in names) if estimates else 0.0
+  if jobs > 1 and len(todo) > 1:
+    names = sorted((p.name for p in todo), key=lambda name: -guess([name]))
+    over: list[str] = []
+    begin = time.monotonic()
+
+    def end(name: str) -> None:
+      over.append(name)
+      collect(out, plan, known)
+      left = ""
+      if estimates and len(over) < len(names):
+        rest = (time.monotonic() - begin) * (guess(names) / guess(over) - 1)
+        left = f"; at most about {round(rest / 60) or 1} min left"
+      tell(f"{name} finished, {len(over)} of {len(names)}{left}")
+
+    workers.together(worker, out, names, min(jobs, len(names)), end, tell)
+    return collect(out, plan, known)
+  spent, programs, names = 0.0, run.Programs(), [p.name for p in todo]
+  for i, part in enumerate(todo):
+    if estimates:
+      left = guess(names[i:]) * (spent / guess(names[:i]) if i else 1.0)
+      tell(f"{part.name} ({i + 1} of {len(todo)}); about {round(left / 60) or 1} min left")
+    begin = time.monotonic()
+    folder = out / part.name
+    with display() as progress:
+      run.execute(
+        part.config,
+        folder,
+        resume=(folder / "config.json").exists(),
+        progress=progress,
+        save_every_s=save_every_s,
+        programs=programs,
+      )
+    spent += time.monotonic() - begin
+    collect(out, plan, known)
+  return collect(out, plan, known)
