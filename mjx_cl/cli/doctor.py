@@ -14,7 +14,7 @@ def report() -> dict:
 
   from mjx_cl import __version__, envs
   from mjx_cl.io import runtime
-  from mjx_cl.runs import suite
+  from mjx_cl.runs import costs
 
   rows = {
     "mjx_cl": __version__,
@@ -24,7 +24,7 @@ def report() -> dict:
   rows["physics"] = runtime.default_physics()
   rows["free_memory_gib"] = round(psutil.virtual_memory().available / 2**30, 1)
   rows["compile_cache"] = str(runtime.cache_dir())
-  rows["matmul_gflop_s"] = round(suite.matmul_rate() / 1e9)
+  rows["matmul_gflop_s"] = round(costs.matmul_rate() / 1e9)
   env = envs.make("walker")
   if env.physics.name == "native":
     num = 256

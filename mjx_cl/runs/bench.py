@@ -25,7 +25,7 @@ from mjx_cl.runs.scores import collect
 from mjx_cl.runs.suite import Part, Suite, finished, write_plan
 
 MERGED = (*PUBLISHED, "trace.parquet", "residuals.parquet")
-Tell = Callable[[str], object]
+Tell = Callable[[str], None]
 Display = Callable[[], contextlib.AbstractContextManager[Callable[[run.Progress], Any]]]
 
 

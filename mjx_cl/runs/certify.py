@@ -202,7 +202,9 @@ def _lives(
   begin = lambda k: moves.start(k, -1, faults_lib.plan(), onset)
   moving = nest(begin, 0, 0)(key[None, None])
   staying = nest(lambda k: start(env, agent, healthy, k), 0, 0)(key[None, None])
-  enter, moved, stayed = faults_lib.FOREVER, [], []
+  enter = faults_lib.FOREVER
+  moved: list[np.ndarray] = []
+  stayed: list[np.ndarray] = []
   while enter == faults_lib.FOREVER or len(moved) * CHUNK < enter + max(certificate.AFTER):
     moving, rows = moves.chunk(params, moving, CHUNK)
     moved.append(_channels(rows))

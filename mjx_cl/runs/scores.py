@@ -60,7 +60,7 @@ def scores(folder: pathlib.Path) -> dict:
       pass
   # no longer than the first stream is watched
   watched = zip(survival.watched(rows, steps), rows)
-  seen = [w for w, r in watched if not r["change"] and r["onset"] is not None]
+  seen = [w for w, r in watched if w is not None and not r["change"]]
   for arm in arms:
     own = [r for r in rows if r["arm"] == arm]
     out["recovery"][arm] = recovery(own, steps, min([HORIZON, *seen]))
