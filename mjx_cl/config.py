@@ -71,6 +71,11 @@ def kinds(where: str, annotations: dict[str, str], values: dict, before: str = "
       )
 
 
+def field_kinds(where: str, of: type, values: dict, before: str = "") -> None:
+  """`kinds` of the fields of the dataclass `of`."""
+  kinds(where, {field.name: str(field.type) for field in dataclasses.fields(of)}, values, before)
+
+
 def whole(config: object, *names: str, most: int = FOREVER - 1) -> None:
   """Raises unless every named field is a whole number of at least 0 and at most `most`."""
   for name in names:

@@ -19,7 +19,7 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 from mjx_cl.adapt.arms import ARMS
-from mjx_cl.config import AdaptConfig, RunConfig, kinds, replace
+from mjx_cl.config import AdaptConfig, RunConfig, field_kinds, replace
 from mjx_cl.errors import UserError, require
 from mjx_cl.io import folders, tables
 from mjx_cl.runs import merge, settings
@@ -153,8 +153,8 @@ def config(where: str, values: dict) -> RunConfig:
     isinstance(arms, (list, tuple)) and all(isinstance(arm, str) for arm in arms),
     f"{where}: arms is one list of names; got {arms!r}; choose from: {', '.join(ARMS)}",
   )
-  check_kinds(where, RunConfig, values)
-  check_kinds(where, AdaptConfig, adapt, "adapt.")
+  field_kinds(where, RunConfig, values)
+  field_kinds(where, AdaptConfig, adapt, "adapt.")
   try:
     whole = values | {"arms": tuple(arms), "adapt": replace(AdaptConfig(), **adapt)}
     return settings.check(RunConfig(**whole))
@@ -162,13 +162,6 @@ def config(where: str, values: dict) -> RunConfig:
     raise UserError(f"{where}: {e}") from None
   except TypeError as e:
     raise UserError(f"{where}: a value of the wrong kind ({e})") from None
-
-
-def check_kinds(where: str, of: type, values: dict, before: str = "") -> None:
-  """Raises UserError where a setting of the dataclass `of` has a value of another kind than its
-  annotation says.
-  """
-  kinds(where, {field.name: str(field.type) for field in dataclasses.fields(of)}, values, before)
 
 
 def resolved(values: dict) -> RunConfig:

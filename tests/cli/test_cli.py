@@ -22,7 +22,8 @@ from test_run import saved  # noqa: F401  a fixture
 import mjx_cl
 from mjx_cl import detectors, envs, faults
 from mjx_cl.adapt.arms import ARMS
-from mjx_cl.cli import app, commands, display
+from mjx_cl.cli import app, results
+from mjx_cl.cli import tables as shown
 from mjx_cl.config import PRESETS, RunConfig
 from mjx_cl.errors import FileError
 from mjx_cl.faults import presets
@@ -147,6 +148,10 @@ def test_help_names_every_command(mjx):
   )
 
 
+def test_no_command_is_answered_by_the_help(mjx):
+  assert mjx() == (2, mjx("--help")[1], "")
+
+
 def test_version(capsys):
   with pytest.raises(SystemExit) as end:
     app.main(["--version"])
@@ -190,7 +195,7 @@ def test_a_run_is_shown_as_a_table_with_intervals(capsys):
   arm |= {"reward_final": 0.88, "reward_final_ci": [0.85, 0.92]}
   summary = {"env": "walker", "fault": "gear", "severity": 0.5, "onset": 4000, "steps": 13_000}
   summary |= {"detector": "cusum", "wall_s": 65.0, "wall_share": {"physics": 1.0}}
-  display.show_summary(summary | {"arms": {"detector": arm}}, "runs/x")
+  shown.show_summary(summary | {"arms": {"detector": arm}}, "runs/x")
   out = capsys.readouterr().out
   assert "walker, gear 0.5 at step 4,000 of 13,000, detector cusum; 1:05 wall" in out
   row, below = (
@@ -260,7 +265,7 @@ def test_query(mjx, refused, tmp_path):
 
 
 def test_report_elsewhere_than_in_a_checkout_is_one_line(refused, tmp_path, monkeypatch):
-  monkeypatch.setattr(commands, "__file__", str(tmp_path / "mjx_cl" / "cli" / "commands.py"))
+  monkeypatch.setattr(results, "__file__", str(tmp_path / "mjx_cl" / "cli" / "results.py"))
   assert "checkout" in refused(2, "report", "--check")
 
 
@@ -312,7 +317,6 @@ RUN = {
 }
 OTHER = {
   "command": (["rnu"], ["rnu"]),
-  "no command": ([], ["run"]),
   "train: environment": (["train", "wlker"], ["wlker", "walker"]),
   "train: preset": (["train", "walker", "--preset", "huge"], ["huge", "cpu, paper, tiny"]),
   "train: setting": (["train", "walker", "--set", "lerning=3"], ["lerning", "lr"]),
@@ -634,7 +638,7 @@ def test_a_second_interrupt_ends_the_process_without_its_threads(tmp_path):
   """
   code = """
 import sys, threading, time, os, signal
-from mjx_cl.cli import app as cli, commands
+from mjx_cl.cli import app as cli
 from mjx_cl.io.interrupt import Interruptible
 def slow():
   time.sleep(300)

@@ -22,7 +22,7 @@ import pyarrow.parquet
 import pytest
 
 from mjx_cl import envs
-from mjx_cl.cli import app, commands
+from mjx_cl.cli import app, runs
 from mjx_cl.config import CHUNK, AdaptConfig, RunConfig
 from mjx_cl.dreamer.agent import Agent
 from mjx_cl.envs.walker import Walker
@@ -820,9 +820,9 @@ def test_progress_that_nobody_reads_ends_no_work(monkeypatch, tmp_path):
     run, "Runner", type("Stubbed", (Stub,), {"signals": 1, "notes": (notes := [])})
   )
   monkeypatch.setattr(
-    commands,
+    runs,
     "RunDisplay",
-    lambda: contextlib.nullcontext(lambda p: commands.say("a line of progress")),
+    lambda: contextlib.nullcontext(lambda p: runs.say("a line of progress")),
   )
   monkeypatch.setattr(sys, "stderr", broken := Broken())
   assert app.main(["run", "walker", "--out", str(tmp_path / "x")]) == 130
