@@ -7,8 +7,6 @@ Ctrl-C, after state is saved.
 What each command takes stands in flags.py, what does it in the module that COMMANDS names.
 """
 
-from __future__ import annotations
-
 import atexit
 import contextlib
 import importlib

@@ -91,9 +91,9 @@ def do_report(args: Report) -> None:
     for page in pages:
       report.report(args.results, page)
   if args.figures:
-    from mjx_cl.runs import published
+    from mjx_cl.runs import bench
 
-    for file in published.redraw(args.results):
+    for file in bench.redraw(args.results):
       print(f"{file}: drawn anew", file=sys.stderr)
   stale: dict[str, str] = {}
   for page, blocks in found.items():

@@ -12,7 +12,7 @@ from mjx_cl.cli.tables import show_summary
 from mjx_cl.config import RunConfig
 from mjx_cl.errors import UserError, require
 from mjx_cl.io import folders, memory
-from mjx_cl.runs import bench, costs, published, run, workers
+from mjx_cl.runs import bench, costs, run, workers
 from mjx_cl.runs.suite import Part, Suite, finished, pick, standing, suite
 
 
@@ -35,7 +35,7 @@ def do_bench(args: Bench) -> None:
   out = pathlib.Path(args.out or f"runs/bench/{plan.name}")
   check_merge(args.merge, parts)
   if args.publish:
-    published.earlier(args.publish, plan)
+    bench.earlier(args.publish, plan)
   done = {p.name for p in parts if finished(out, p)}
   found = bench.offers(out, parts, args.merge, say)
   robots = costs.Robots()
@@ -70,7 +70,7 @@ def do_bench(args: Bench) -> None:
     plan, out, parts, estimates, say, RunDisplay, jobs=jobs, worker="mjx_cl.cli.worker"
   )
   if args.publish:
-    published.publish(out, plan, args.publish)
+    bench.publish(out, plan, args.publish)
   if args.json:
     emit(value)
     return

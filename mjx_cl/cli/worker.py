@@ -1,7 +1,5 @@
 """One part of a suite in a process of its own: `python -m mjx_cl.cli.worker OUT PART CORES`."""
 
-from __future__ import annotations
-
 import os
 import pathlib
 import signal

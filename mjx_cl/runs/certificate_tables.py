@@ -1,7 +1,5 @@
 """The files of `mjx-cl certify`: certificates.parquet, a table for a reader, what `--json` says."""
 
-from __future__ import annotations
-
 import pathlib
 
 import pyarrow

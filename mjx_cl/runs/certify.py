@@ -2,8 +2,6 @@
 and what it costs an agent that does not adapt.
 """
 
-from __future__ import annotations
-
 import pathlib
 from collections.abc import Callable, Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """What the parts of a suite will take on this machine, seconds and bytes, before any is run."""
 
-from __future__ import annotations
-
 import functools
 import time
 from collections.abc import Iterable

@@ -1,7 +1,5 @@
 """What a user is told before a run starts: its threshold, and what may not have been meant."""
 
-from __future__ import annotations
-
 import dataclasses
 import inspect
 

@@ -9,8 +9,6 @@ was run. Tables that one piece lacks, as published ones lack their trace, are le
 were kept stay by arm and seed.
 """
 
-from __future__ import annotations
-
 import functools
 import itertools
 import pathlib

@@ -5,8 +5,6 @@ NumPy on the host; nothing here moves a robot. Definitions: scoring/recovery.py,
 Streams are numbered arm by arm, seed by seed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import NamedTuple
 

@@ -1,4 +1,4 @@
-"""`run`: the whole loop for arms x seeds streams, a host loop over chunks.
+"""`run`: the whole loop for arms x seeds streams, a host loop over chunks, and its result files.
 
 Where the robot becomes another one (a preset with `becomes`, see rollout/transfer.py) each stream
 has an onset of its own: the step with which its first episode of the other robot begins. That step
@@ -18,19 +18,29 @@ without adaptation shares its past.
 import pathlib
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
+import jax
+import numpy as np
+
+from mjx_cl.adapt import decide as phase_lib
 from mjx_cl.adapt.loop import Programs
 from mjx_cl.config import RunConfig
-from mjx_cl.errors import UserError
+from mjx_cl.errors import FileError, UserError
+from mjx_cl.faults.presets import becomes
 from mjx_cl.io import folders, tables
 from mjx_cl.io.interrupt import Interruptible
+from mjx_cl.render import figures
 from mjx_cl.runs.doubts import notes
 from mjx_cl.runs.identity import check_same, identity
-from mjx_cl.runs.results import finish
+from mjx_cl.runs.records import Ledger
 from mjx_cl.runs.runner import Progress, Runner
 from mjx_cl.runs.settings import check
+from mjx_cl.runs.summary import summary
+from mjx_cl.scoring import events as event_table
+from mjx_cl.scoring import stop_rule
+from mjx_cl.training import agents
 
 
 def execute(
@@ -121,3 +131,121 @@ def clear(out: pathlib.Path) -> None:
     for folder in (card.parent, card.parent.parent):
       if not any(folder.iterdir()):
         folder.rmdir()
+
+
+def finish(runner: Runner, tell: Callable[[str], Any] = lambda text: None) -> dict:
+  """Writes trace, events, runs, summary and figure, of an arm that never stops also signals,
+  snapshots and stop; removes the working files.
+
+  Returns:
+    summary.json's value.
+  """
+  config, out, steps = runner.config, runner.out, runner.config.steps
+  if runner.snapshots:
+    runner.save()  # their evaluation takes a while; one that is cut off goes on from here
+  trace = {k: v[:steps] if v.shape[0] >= steps else v for k, v in runner.trace().items()}
+  # the last chunk lives on to its end
+  outside = (trace["decision"] == phase_lib.START) & (trace["since"] >= steps)
+  trace["decision"] = np.where(outside, phase_lib.NOTHING, trace["decision"])
+  ledger = ledger_of(runner)
+  table, events = ledger.trace(trace), ledger.events(trace)
+  rows = ledger.rows(trace, events)
+  tables.write_table(out / "trace.parquet", table)
+  event_table.write(out / "events.parquet", events)
+  write_rows(out / "runs.parquet", rows, rows[0])
+  if config.residuals:
+    columns = {k: table[k] for k in ("stream", "arm", "seed", "step")}
+    for k, v in enumerate(runner.env.spec.obs):
+      columns[v.name] = np.ascontiguousarray(trace["variables"][:, :, k].T).reshape(-1)
+    tables.write_table(out / "residuals.parquet", columns)
+  figures.figure(out)
+  if runner.endless and "posture" in trace:
+    tables.write_table(out / "signals.parquet", ledger.signals(trace))
+  value = summary(ledger, rows, trace, runner.seconds, runner.quiet, runner.done_chunks)
+  if runner.snapshots and (taken := runner.snapshots.taken(trace, runner.chunk_steps)):
+    scores, value["wall_s_snapshots"] = runner.snapshots.evaluate(taken, targets(runner), tell)
+    tables.write_table(out / "snapshots.parquet", scores)
+    judged = stop_rule.of_folder(out)
+    write_rows(out / "stop.parquet", judged, stop_rule.COLUMNS)
+    value["stop_rule"] = stop_rule.summarise(judged)
+  if config.keep:
+    keep(runner)
+  tables.write_json(out / "summary.json", value)
+  runner.checkpoints.close()
+  shutil.rmtree(runner.work, ignore_errors=True)
+  return value
+
+
+def write_rows(path: pathlib.Path, rows: list[dict], names: Iterable[str]) -> None:
+  """Writes the columns `names` of rows as Parquet."""
+  tables.write_table(path, {name: [r[name] for r in rows] for name in names})
+
+
+def targets(runner: Runner) -> np.ndarray:
+  """Int (groups, F), of each stream's faults."""
+  streams = runner.state.streams
+  last = streams if runner.other is None else streams.after
+  return np.asarray(last.injection.target)[:, 0]
+
+
+def ledger_of(runner: Runner) -> Ledger:
+  """What must be known of the run besides its trace."""
+  names = [runner.config.fault] * runner.groups
+  if runner.other is None:
+    names = [
+      "+".join(f"{f.name}:{f.targets[t]}" for f, t in zip(runner.faults, row))
+      for row in targets(runner)
+    ]
+  return Ledger(
+    runner.config,
+    runner.env.spec,
+    runner.repeat,
+    runner.chunk_steps,
+    runner.changes,
+    None if runner.other is None else runner.other.spec.name,
+    runner.labels,
+    runner.breaks,
+    [name if breaks else "none" for name, breaks in zip(names, runner.breaks)],
+    runner.onsets(),
+    np.asarray(runner._updates),
+    runner.stream_seconds,
+  )
+
+
+def keep(runner: Runner) -> None:
+  """Writes OUT/agents/ARM-SEED for every stream that has learnt: the weights that it acts by at
+  the end, and the moments and counters of its learner.
+
+  Of a stream that went back (arm `rollback`) the weights are those of before, moments, slow
+  critic and counters those of the learner that was given up. The card is that of the agent it
+  began with but for what that scored, and `adapted`: robot and fault it has lived with, arm,
+  seed, control steps of the run, updates taken.
+  """
+  config, folder = runner.config, runner.out / "agents"
+  for block, loop in zip(runner.crew.blocks, runner.state.loop):
+    for at, g in enumerate(range(block.start, block.stop)):
+      arm, seed = runner.labels[g]
+      updates = int(runner._updates[g])
+      if not updates:
+        continue
+      train = loop.train._replace(params=loop.acting)
+      card = runner.others.get(arm, runner.trained).card | {
+        "adapted": {
+          "env": config.env,
+          "becomes": becomes(config),
+          "fault": config.fault,
+          "arm": arm,
+          "seed": seed,
+          "steps": config.steps,
+          "updates": updates,
+        }
+      }
+      card = {k: v for k, v in card.items() if k not in ("eval", "demonstrator_return")}
+      try:
+        agents.save(
+          folder / f"{arm}-{seed}", jax.tree.map(lambda x: np.asarray(x[at]), train), card
+        )
+      except OSError as e:
+        raise FileError(
+          f"cannot write in {folder}: {e.strerror or e}; --resume writes them again"
+        ) from None

@@ -1,7 +1,5 @@
 """The life of a run: all its streams, chunk by chunk, and its checkpoints."""
 
-from __future__ import annotations
-
 import itertools
 import pathlib
 import sys

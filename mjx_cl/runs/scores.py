@@ -5,8 +5,6 @@ summaries and what the arms of each say together (`scores`), OUT/recovery.png th
 curves of recovery, OUT/ratio.png recovery against train ratio where a suite has several.
 """
 
-from __future__ import annotations
-
 import pathlib
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Whether the settings of a whole run fit together: its fault, its robot, its arms."""
 
-from __future__ import annotations
-
 import dataclasses
 
 from mjx_cl.adapt.arms import ARMS, never_stops

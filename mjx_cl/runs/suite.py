@@ -7,8 +7,6 @@ grid: `severity = [0.25, 0.5]` with `adapt.ratio = [4, 16]` are four parts,
 NAME/severity=0.25,adapt.ratio=4 and so on. What is not given is RunConfig's default.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import json

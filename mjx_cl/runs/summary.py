@@ -1,7 +1,5 @@
 """summary.json of a run: per arm the aggregates of its rows, each with its interval."""
 
-from __future__ import annotations
-
 import collections
 from collections.abc import Callable, Sequence
 from typing import Any

@@ -6,8 +6,6 @@ part; OUT/suite.json says what the part is. A worker saves and ends when its sta
 so that none outlives its parent.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import pathlib

@@ -16,7 +16,7 @@ from test_cli import mjx, refused  # noqa: F401  fixtures
 from mjx_cl.config import RunConfig
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.io import tables
-from mjx_cl.runs import bench, costs, merge, published, records, summary
+from mjx_cl.runs import bench, costs, merge, records, summary
 from mjx_cl.runs import suite as suites
 from mjx_cl.training import agents
 
@@ -33,9 +33,7 @@ def part_of(suite, name, seeds=None):
   known = suite in suites.shipped()
   (part,) = suites.pick(
     (
-      suites.suite(suite)
-      if known
-      else published._published(RESULTS / suite, suite.replace("_", "-"))
+      suites.suite(suite) if known else bench._published(RESULTS / suite, suite.replace("_", "-"))
     ).parts,
     (name,),
   )

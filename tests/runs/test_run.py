@@ -30,7 +30,7 @@ from mjx_cl.errors import FileError, UserError
 from mjx_cl.io import tables
 from mjx_cl.render import figures
 from mjx_cl.runs import run, workers
-from mjx_cl.runs.results import ledger_of
+from mjx_cl.runs.run import ledger_of
 from mjx_cl.scoring import events, intervals
 from mjx_cl.training import agents
 

@@ -20,7 +20,7 @@ from mjx_cl.config import CHUNK, AdaptConfig, RunConfig
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.io import folders, memory, tables
 from mjx_cl.render import figures
-from mjx_cl.runs import bench, costs, crew, merge, published, run, scores
+from mjx_cl.runs import bench, costs, crew, merge, run, scores
 from mjx_cl.runs import suite as suites
 from mjx_cl.scoring import stop_rule
 
@@ -409,7 +409,7 @@ def test_lengths_of_finetunings_are_those_of_the_published_suites():
 
 def published(folder):
   """The suite of a folder of results/."""
-  return published._published(
+  return bench._published(
     RESULTS / folder, json.loads((RESULTS / folder / "bench.json").read_text())["suite"]
   )
 
@@ -1034,7 +1034,7 @@ def test_published_figures_are_drawn_anew(tmp_path, mjx):  # noqa: F811
   (tmp_path / "study/bench.json").write_text(
     json.dumps(value | {"suite": "nobody"})
   )  # a suite of one's own is read from its folder
-  assert [p.name for p in published.redraw(tmp_path)] == ["recovery.png", "ratio.png"]
+  assert [p.name for p in bench.redraw(tmp_path)] == ["recovery.png", "ratio.png"]
   (tmp_path / "study/suite.json").unlink()
   for text, word in (
     ("{", "JSONDecodeError"),
@@ -1043,4 +1043,4 @@ def test_published_figures_are_drawn_anew(tmp_path, mjx):  # noqa: F811
   ):
     (tmp_path / "study/bench.json").write_text(text)
     with pytest.raises(FileError, match=f"^cannot draw the figures of .*{word}"):
-      published.redraw(tmp_path)
+      bench.redraw(tmp_path)
