@@ -72,12 +72,12 @@ def fits(shown: Table, on: Console) -> bool:
 
 
 def _cell(arm: dict, key: str, form: str, of: str | None = None) -> str:
-  """A number of an arm, out of how many, and its 95 % interval below it."""
-  value, interval = arm[key], arm.get(f"{key}_ci")
-  if value is None:
-    return "-"
-  text = format(value, form) + (f" of {arm[of]}" if of else "")
-  return text if interval is None else f"{text}\n[{interval[0]:{form}}, {interval[1]:{form}}]"
+  """A number of an arm, out of how many, and its 95 % interval below it; - for what is unknown."""
+  number = lambda x: "-" if x is None else format(round(x, 9), form)
+  text, interval = number(arm[key]), arm.get(f"{key}_ci")
+  if of and arm[key] is not None:
+    text = f"{text} of {arm[of]}"
+  return f"{text}\n[{', '.join(map(number, interval))}]" if interval else text
 
 
 def _outcomes(arm: dict) -> str:

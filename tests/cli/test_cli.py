@@ -211,6 +211,22 @@ def test_a_run_is_shown_as_a_table_with_intervals(capsys):
   assert "[steps]" in out and out.endswith("files in runs/x\n")
 
 
+@pytest.mark.parametrize("columns", [60, 80, 100, 200])
+def test_a_runs_table_keeps_to_the_terminal(capsys, monkeypatch, columns):
+  """What does not fit is named and lies in summary.json; an interval may have no upper end."""
+  monkeypatch.setenv("COLUMNS", str(columns))
+  summary = store.read_json(pathlib.Path(__file__).parents[2] / "results/walker_gear/summary.json")
+  arm = summary["arms"]["detector"]
+  arm |= {"latency_median_steps": 50.0, "latency_median_steps_ci": [20.0, None]}
+  shown.show_summary(summary, "runs/x")
+  first, *lines = capsys.readouterr().out.splitlines()
+  assert max(len(line) for line in lines if set(line) & set("│┃━─")) <= columns
+  text = "\n".join(lines)
+  assert all(name in text for name in ("detector", "none", "50", "[20, -]", "at last"))
+  assert ("not shown" in text) == (columns < 200)
+  assert "files in runs/x" in text
+
+
 def test_doctor(mjx):
   code, out, err = mjx("doctor", "--json")
   rows = json.loads(out)

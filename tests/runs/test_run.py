@@ -780,7 +780,6 @@ class Stub:
   config_dict = lambda self: {}
   open = lambda self: None
   save = lambda self: self.notes.append("save")
-  finish = lambda self, tell: self.notes.append("finish")
 
 
 @pytest.mark.parametrize(
@@ -793,6 +792,7 @@ def test_an_interrupt_is_acted_on_between_two_chunks(tmp_path, monkeypatch, sign
   monkeypatch.setattr(
     run, "Runner", type("Stubbed", (Stub,), {"signals": signals, "notes": (notes := [])})
   )
+  monkeypatch.setattr(run, "finish", lambda runner, tell: runner.notes.append("finish"))
   call = lambda: run.execute(RunConfig("walker"), tmp_path / "x")
   if signals:
     with pytest.raises(KeyboardInterrupt):
