@@ -123,6 +123,34 @@ def take(out: pathlib.Path, parts: Iterable[Part], found: dict[str, list[pathlib
     os.replace(tmp, out / part.name)
 
 
+def _together(
+  plan: Suite,
+  out: pathlib.Path,
+  names: list[str],
+  guess: Callable[[list[str]], float],
+  tell: Tell,
+  jobs: int,
+  worker: str,
+) -> None:
+  """Runs parts side by side; arguments as of `execute`, `guess` gives the seconds that parts take,
+  0 where nobody knows.
+  """
+  over: list[str] = []
+  known: dict[str, dict] = {}
+  begin = time.monotonic()
+
+  def end(name: str) -> None:
+    over.append(name)
+    collect(out, plan, known)
+    left = ""
+    if guess(over) and len(over) < len(names):
+      rest = (time.monotonic() - begin) * (guess(names) / guess(over) - 1)
+      left = f"; at most about {round(rest / 60) or 1} min left"
+    tell(f"{name} finished, {len(over)} of {len(names)}{left}")
+
+  workers.together(worker, out, names, min(jobs, len(names)), end, tell)
+
+
 @contextlib.contextmanager
 def _silent() -> Iterator[Callable[[run.Progress], Any]]:
   """A display that shows nothing."""
@@ -159,27 +187,16 @@ def execute(
     bench.json's value.
   """
   out = pathlib.Path(out)
-  known: dict[str, dict] = {}
   write_plan(plan, out)
   todo = [p for p in parts if not finished(out, p)]
   guess = lambda names: sum(estimates[name].seconds for name in names) if estimates else 0.0
+  names = [p.name for p in todo]
   if jobs > 1 and len(todo) > 1:
-    names = sorted((p.name for p in todo), key=lambda name: -guess([name]))
-    over: list[str] = []
-    begin = time.monotonic()
-
-    def end(name: str) -> None:
-      over.append(name)
-      collect(out, plan, known)
-      left = ""
-      if estimates and len(over) < len(names):
-        rest = (time.monotonic() - begin) * (guess(names) / guess(over) - 1)
-        left = f"; at most about {round(rest / 60) or 1} min left"
-      tell(f"{name} finished, {len(over)} of {len(names)}{left}")
-
-    workers.together(worker, out, names, min(jobs, len(names)), end, tell)
-    return collect(out, plan, known)
-  spent, programs, names = 0.0, run.Programs(), [p.name for p in todo]
+    names.sort(key=lambda name: -guess([name]))
+    _together(plan, out, names, guess, tell, jobs, worker)
+    return collect(out, plan)
+  spent, programs = 0.0, run.Programs()
+  known: dict[str, dict] = {}
   for i, part in enumerate(todo):
     if estimates:
       left = guess(names[i:]) * (spent / guess(names[:i]) if i else 1.0)

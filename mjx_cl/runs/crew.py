@@ -74,6 +74,6 @@ def crew(
     repeat,
     capacity=records(config.steps),
     same=same,
-    programs=programs,
+    programs=programs or Programs(),
   )
   return Crew(loop, groups)

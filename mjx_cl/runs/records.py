@@ -275,13 +275,7 @@ class Ledger(NamedTuple):
     return set_apart(rows, events)
 
   def _row(
-    self,
-    trace: dict[str, np.ndarray],
-    events: list[dict],
-    g: int,
-    change: int,
-    life: Life,
-    lost: float | None,
+    self, trace: dict, events: list[dict], g: int, change: int, life: Life, lost: float | None
   ) -> dict:
     """The row of stream `g` and its change number `change`.
 
@@ -295,7 +289,7 @@ class Ledger(NamedTuple):
     """
     onset, end = (*life.changes, self.config.steps)[change : change + 2]
     begin, never = onset if change else 0, self.onsets[g] is None
-    reward = trace["reward"][:end, g].astype(float)
+    (arm, seed), reward = self.labels[g], trace["reward"][:end, g].astype(float)
     before = life.pre
     if change:
       # no arm without adaptation lives on as this one does: its own first steps after the change
@@ -305,21 +299,16 @@ class Ledger(NamedTuple):
     elif never:
       lost = None
     own = [e for e in events if begin <= e["step"] < max(end, 1)]
-    starts = [e["step"] for e in own if e["kind"] == "start"]
-    ends = [e for e in own if e["kind"] in ("stop", "abort")]
-    outcome = "adapting" if starts else "nominal"
-    if change and trace["phase"][begin, g] == phase_lib.ADAPTING:
-      outcome = "adapting"
-    if ends and (not starts or ends[-1]["step"] > starts[-1]):
-      outcome = OUTCOMES[ends[-1]["decision"]]
+    adapting = trace["phase"][begin:end, g] == phase_lib.ADAPTING
+    healthy = None if change else recovery.return_lost_healthy(reward, onset, before, life.begun)
     score = alarms.score(trace["alarm"][begin:end, g], onset - begin)
     latency, affected = score.latency_steps, None if lost is None else bool(lost >= 0.1)
     fallen = trace["terminated"][:end, g]
     updates = self.updates[g] if end == self.config.steps else trace["updates"][end, g]
     return {
       "stream": g,
-      "arm": self.labels[g][0],
-      "seed": self.labels[g][1],
+      "arm": arm,
+      "seed": seed,
       "fault": self.names[g],
       "change": change,
       "kind": life.changes[onset],
@@ -328,10 +317,7 @@ class Ledger(NamedTuple):
       "latency_steps": latency,
       "latency_s": None if latency is None else latency * self.spec.control_s,
       "false_alarms": None if change else score.false_alarms,
-      "adapt_start": starts[0] if starts else None,
-      "adapt_stop": ends[-1]["step"] if ends else None,
-      "outcome": outcome,
-      "reason": ends[-1]["reason"] if ends else None,
+      **came_to(own, bool(change) and adapting[0]),
       "affected": affected,
       "recovery_step": recovery.recovery_step(reward, onset, before) if affected else None,
       "stable_step": None if never else recovery.stable_step(reward, fallen, onset, before),
@@ -339,14 +325,33 @@ class Ledger(NamedTuple):
       "reward_drop": lost,
       "reward_final": float(np.mean(reward[-recovery.FINAL :])),
       "return_lost": None if never else recovery.return_lost(reward, onset, before),
-      "return_lost_healthy": None
-      if change
-      else recovery.return_lost_healthy(reward, onset, before, life.begun),
+      "return_lost_healthy": healthy,
       "terminations": int(fallen[begin:].sum()),
-      "adapted_steps": int(np.sum(trace["phase"][begin:end, g] == phase_lib.ADAPTING)),
+      "adapted_steps": int(np.sum(adapting)),
       "updates": int(updates - (trace["updates"][begin, g] if change else 0)),
       "wall_s": None if change else float(self.stream_seconds[g]),
     }
+
+
+def came_to(events: list[dict], under_way: bool) -> dict:
+  """What a stream's adaptations came to.
+
+  Args:
+    events: of the stream, in order.
+    under_way: whether it adapted when they began.
+  """
+  starts = [e["step"] for e in events if e["kind"] == "start"]
+  ends = [e for e in events if e["kind"] in ("stop", "abort")]
+  last: dict = ends[-1] if ends else {"step": None, "reason": None}
+  outcome = "adapting" if starts or under_way else "nominal"
+  if ends and (not starts or last["step"] > starts[-1]):
+    outcome = OUTCOMES[last["decision"]]
+  return {
+    "adapt_start": starts[0] if starts else None,
+    "adapt_stop": last["step"],
+    "outcome": outcome,
+    "reason": last["reason"],
+  }
 
 
 def set_apart(rows: list[dict], events: list[dict]) -> list[dict]:

@@ -99,9 +99,18 @@ def execute(
     f"{len(config.arms) * config.seeds} streams of {config.steps:,} control steps; what is not "
     "compiled yet is compiled first, a minute or two"
   )
-  saved = time.monotonic()
+  last = live(runner, progress, save_every_s)
+  return finish(runner, lambda text: last and progress(last._replace(note=text)))
+
+
+def live(
+  runner: Runner, progress: Callable[[Progress], Any], save_every_s: float
+) -> Progress | None:
+  """Lives a run to its end and returns its last Progress; saves every `save_every_s` seconds, and
+  before an interrupt ends it.
+  """
+  saved, last = time.monotonic(), None
   with Interruptible() as interrupt:
-    last = None
     while not runner.done:
       last = runner.step()
       progress(last)
@@ -114,7 +123,7 @@ def execute(
       if time.monotonic() - saved > save_every_s:
         runner.save()
         saved = time.monotonic()
-  return finish(runner, lambda text: last and progress(last._replace(note=text)))
+  return last
 
 
 def clear(out: pathlib.Path) -> None:
