@@ -118,7 +118,7 @@ def recorded(kind: type, record: Mapping[str, Any]) -> dict[str, Any]:
   """Fields of `kind` that a card or a config.json of this or an earlier version holds.
 
   Raises:
-    ValueError, one line: a field that this version has not, unless its value changes nothing.
+    ValueError: one line, for a field that this version has not, unless its value changes nothing.
   """
   names = {f.name for f in dataclasses.fields(kind)}
   for name, value in record.items():

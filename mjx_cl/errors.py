@@ -1,7 +1,5 @@
 """Errors that reach a user as one line. The CLI prints the message and leaves with `exit_code`."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import TypeVar
 

@@ -2,8 +2,6 @@
 callers vmap.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import jax
@@ -46,8 +44,14 @@ class Step(NamedTuple):
 
 
 class Var(NamedTuple):
-  """One scalar of an observation or action: name, unit, bounds, and `scale`, its typical deviation
-  while the healthy robot is at work.
+  """One scalar of an observation or action.
+
+  Attributes:
+    name: what files call it.
+    unit: SI.
+    low: least value.
+    high: greatest value.
+    scale: typical deviation while the healthy robot is at work.
   """
 
   name: str
@@ -63,7 +67,8 @@ class Spec(NamedTuple):
   Attributes:
     name: what tables and agents' cards call it; of a registered robot the name that it is
       registered by.
-    obs, act: one Var per scalar, in the order of the arrays.
+    obs: one Var per scalar, in the order of the array.
+    act: likewise.
     control_s: control period [s].
     episode_steps: control steps until truncation.
     acceptance: mean reward per control step from which the task counts as done well enough

@@ -273,7 +273,7 @@ def certify(
       row |= found.get(certificate.Lane(row["fault"], row["target"], row["severity"]), {})
   for preset in moves:
     progress(f"{name}: {preset}")
-    other = envs.make(presets.PRESETS[preset].becomes, physics)  # type: ignore[arg-type]
+    other = envs.make(str(presets.PRESETS[preset].becomes), physics)
     row = become(env, other, preset)._asdict() | unknown
     if trained:
       lives = []

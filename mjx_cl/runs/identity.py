@@ -2,13 +2,11 @@
 same.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import json
 import pathlib
-from typing import TYPE_CHECKING
+from typing import Any
 
 from mjx_cl import detectors, envs
 from mjx_cl.adapt.arms import ARMS
@@ -20,17 +18,18 @@ from mjx_cl.runs.settings import check
 from mjx_cl.scoring import stop_rule
 from mjx_cl.training import agents
 
-if TYPE_CHECKING:
-  from typing import Any
-
 
 def arm_agents(config: RunConfig, env: Any) -> dict[str, agents.Trained]:
   """Arm -> its own agent, of the arms that bring one: the run's with the arm's word behind its
   name, or beside the folder that --agent gives.
 
+  Args:
+    config: of the run.
+    env: its robot.
+
   Raises:
-    UserError where there is no such agent, or it differs from the run's in size, obs_scale or
-    repeat.
+    UserError: where there is no such agent, or it differs from the run's in size, obs_scale
+      or repeat.
   """
   out = {}
   for arm in (a for a in config.arms if ARMS[a].agent):

@@ -72,7 +72,7 @@ def differs(folder: pathlib.Path | str, config: RunConfig, but: tuple[str, ...] 
     but: settings that may differ.
 
   Raises:
-    FileError for a config.json or an agent that is broken.
+    FileError: for a config.json or an agent that is broken.
   """
   folder = pathlib.Path(folder)
   if not (folder / "config.json").exists():
@@ -101,7 +101,7 @@ def cards(config: RunConfig) -> dict[str, dict]:
   as where it was moved.
 
   Raises:
-    FileError for a broken one.
+    FileError: for a broken one.
   """
   file = pathlib.Path(config.agent or "no agent by folder") / "card.json"
   written = file.stat().st_mtime_ns if file.is_file() else None
@@ -132,7 +132,8 @@ def seeds_of(folder: pathlib.Path | str, config: RunConfig) -> list[int] | None:
   no finished run.
 
   Raises:
-    UserError where it was run with other settings; FileError for a config.json that is not a run's.
+    UserError: where it was run with other settings.
+    FileError: for a config.json that is not a run's.
   """
   folder = pathlib.Path(folder)
   if not (folder / "config.json").exists() or not (folder / "summary.json").exists():

@@ -13,7 +13,7 @@ def check(config: RunConfig) -> RunConfig:
   given.
 
   Raises:
-    UserError for an unknown preset, schedule or arm, a number out of range, or settings that
+    UserError: for an unknown preset, schedule or arm, a number out of range, or settings that
       exclude each other.
   """
   changes = presets.changes(config)
