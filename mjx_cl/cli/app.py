@@ -76,8 +76,8 @@ def done_by(kind: type, module: str) -> Callable[[Any], None]:
   """What does a command: `do_NAME` of its module."""
 
   def do(command: Any) -> None:
-    room = importlib.import_module(f"mjx_cl.cli.{module}")
-    getattr(room, f"do_{kind.__name__.lower()}")(command)
+    done = importlib.import_module(f"mjx_cl.cli.{module}")
+    getattr(done, f"do_{kind.__name__.lower()}")(command)
 
   return do
 

@@ -26,7 +26,7 @@ from mjx_cl.io import folders as folder_lib
 from mjx_cl.io import tables as store
 from mjx_cl.render import figures
 from mjx_cl.runs import summary
-from mjx_cl.runs.identity import arm_agents, differing, identity
+from mjx_cl.runs.identity import arm_agents, departure, differing, identity
 from mjx_cl.scoring import events, stop_rule
 from mjx_cl.training import agents
 
@@ -89,11 +89,7 @@ def differs(folder: pathlib.Path | str, config: RunConfig, but: tuple[str, ...] 
   for name, today in cards(config).items():
     if name in old and (keys := folder_lib.differing(today, old[name], deep=True)):
       changed.append(f"{name} ({', '.join(keys)})")
-  if changed == ["threshold"]:
-    return (
-      f"was begun when its detector {old.get('detector')} had another default threshold than today"
-    )
-  return f"was begun with another {', '.join(changed)}" if changed else None
+  return departure(old, changed) or None
 
 
 def cards(config: RunConfig) -> dict[str, dict]:

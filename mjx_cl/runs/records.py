@@ -12,7 +12,6 @@ import numpy as np
 
 from mjx_cl.adapt import decide as phase_lib
 from mjx_cl.adapt.arms import ARMS, FOREVER, NEVER
-from mjx_cl.adapt.decide import SIGNALS
 from mjx_cl.config import RunConfig
 from mjx_cl.faults.presets import Change
 from mjx_cl.rollout.monitor import watched
@@ -159,7 +158,7 @@ class Ledger(NamedTuple):
     least = (self.spec.posture or (0, np.nan))[1]
     return self._streams(chunks) | {
       "step": np.tile(np.minimum(steps, self.config.steps) - 1, groups).astype(np.int32),
-      **{name: flat(trace["signals"][:, :, i]) for i, name in enumerate(SIGNALS)},
+      **{name: flat(trace["signals"][:, :, i]) for i, name in enumerate(phase_lib.SIGNALS)},
       "posture": flat(trace["posture"]),
       "acceptance": flat(trace["acceptance"]),
       "least_posture": np.full(chunks * groups, least, np.float32),

@@ -14,7 +14,6 @@ import numpy as np
 from mjx_cl import envs, faults
 from mjx_cl.adapt import decide as phase_lib
 from mjx_cl.adapt.arms import ARMS, FOREVER, never_stops
-from mjx_cl.adapt.decide import SIGNALS
 from mjx_cl.adapt.loop import Choices, Digest, LoopState, Programs, choices
 from mjx_cl.config import CHUNK, RunConfig
 from mjx_cl.dreamer.agent import CAUSES, EXPLODED
@@ -211,7 +210,7 @@ class Runner:
       arms,
       seeds,
       digest.phase,
-      digest.signals[:, SIGNALS.index("reward")],
+      digest.signals[:, phase_lib.SIGNALS.index("reward")],
       self._alarms,
       digest.updates,
     )
@@ -238,7 +237,7 @@ class Runner:
     """Says which streams are given up for a loss at fault; they live on without learning. A reward
     that is no number would spoil every figure: that ends the run.
     """
-    lost = np.flatnonzero(~np.isfinite(digest.signals[:, SIGNALS.index("reward")]))
+    lost = np.flatnonzero(~np.isfinite(digest.signals[:, phase_lib.SIGNALS.index("reward")]))
     if len(lost):
       raise FileError(
         f"numeric failure at step {now} in stream {self.labels[lost[0]]}: its reward is not "
@@ -246,7 +245,9 @@ class Runner:
       )
     for g in np.flatnonzero(digest.decision == phase_lib.ABORT_NUMERIC):
       bad = int(digest.failed[g])
-      wrong = [name for name, x in zip(SIGNALS[3:], digest.signals[g, 3:]) if not np.isfinite(x)]
+      wrong = [
+        name for name, x in zip(phase_lib.SIGNALS[3:], digest.signals[g, 3:]) if not np.isfinite(x)
+      ]
       term = CAUSES[bad] if bad >= 0 else wrong[0]
       arm, seed = self.labels[g]
       print(

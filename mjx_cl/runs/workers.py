@@ -18,7 +18,7 @@ from typing import Any
 
 import jax
 
-from mjx_cl.errors import FileError, UserError
+from mjx_cl.errors import FileError, UserError, require
 from mjx_cl.io.interrupt import Interruptible
 from mjx_cl.io.runtime import cores
 
@@ -40,13 +40,13 @@ def number(asked: int | None, needs: list[int], space: int) -> int:
     fits += space >= 0
   if asked is None:
     return max(1, min(limit, fits))
-  if not 1 <= asked <= limit:
-    raise UserError(f"--jobs must lie in 1..{limit} on this machine; got {asked}")
-  if min(asked, len(needs)) > max(1, fits):
-    raise UserError(
-      f"{asked} parts side by side do not fit into memory, {max(1, fits)} would; give --jobs "
-      f"{max(1, fits)} or fewer --seeds"
-    )
+  require(1 <= asked <= limit, f"--jobs must lie in 1..{limit} on this machine; got {asked}")
+  fits = max(1, fits)
+  require(
+    min(asked, len(needs)) <= fits,
+    f"{asked} parts side by side do not fit into memory, {fits} would; give --jobs {fits} or fewer "
+    "--seeds",
+  )
   return asked
 
 
