@@ -131,9 +131,12 @@ def _together(
   tell: Tell,
   jobs: int,
   worker: str,
-) -> None:
+) -> dict[str, dict]:
   """Runs parts side by side; arguments as of `execute`, `guess` gives the seconds that parts take,
   0 where nobody knows.
+
+  Returns:
+    name -> scores of the parts that are finished.
   """
   over: list[str] = []
   known: dict[str, dict] = {}
@@ -149,6 +152,7 @@ def _together(
     tell(f"{name} finished, {len(over)} of {len(names)}{left}")
 
   workers.together(worker, out, names, min(jobs, len(names)), end, tell)
+  return known
 
 
 @contextlib.contextmanager
@@ -193,8 +197,7 @@ def execute(
   names = [p.name for p in todo]
   if jobs > 1 and len(todo) > 1:
     names.sort(key=lambda name: -guess([name]))
-    _together(plan, out, names, guess, tell, jobs, worker)
-    return collect(out, plan)
+    return collect(out, plan, _together(plan, out, names, guess, tell, jobs, worker))
   spent, programs = 0.0, run.Programs()
   known: dict[str, dict] = {}
   for i, part in enumerate(todo):
