@@ -69,9 +69,9 @@ def execute(
     summary.json's value.
   """
   config = check(config)
-  out = pathlib.Path(out)
-  fresh = not out.exists()
+  fresh = not pathlib.Path(out).exists()
   state = folders.claim_folder(out, resume, overwrite)
+  out = pathlib.Path(out)  # not before: it would make the current folder of an empty name
   if state == "done":
     # `auto` physics is resolved there
     check_same(out, {k: v for k, v in identity(config).items() if k != "physics"})
