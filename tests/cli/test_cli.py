@@ -183,7 +183,8 @@ def test_list(mjx):
   assert all(name in text for table in tables.values() for name in table)
 
 
-def test_a_run_is_shown_as_a_table_with_intervals(capsys):
+def test_a_run_is_shown_as_a_table_with_intervals(capsys, monkeypatch):
+  monkeypatch.setenv("COLUMNS", "200")
   arm = {"seeds": 4, "affected": 4, "alarms": 4, "false_alarm_streams": 0, "converged": 3}
   arm |= {
     "aborted_by_rule": 1,
