@@ -6,13 +6,8 @@ alone starts no JAX. Call `setup` first. Other modules are private unless the do
 them.
 """
 
-from __future__ import annotations
-
 import importlib
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-  from typing import Any
+from typing import Any
 
 __version__ = "0.1.0"
 __all__ = [

@@ -1,14 +1,9 @@
 """Errors that reach a user as one line. The CLI prints the message and leaves with `exit_code`."""
 
-from __future__ import annotations
+from collections.abc import Mapping
+from typing import TypeVar
 
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-  from collections.abc import Mapping
-  from typing import TypeVar
-
-  Member = TypeVar("Member")
+Member = TypeVar("Member")
 
 
 class UserError(Exception):
@@ -25,6 +20,12 @@ class FileError(UserError):
   """A broken, foreign or missing file, a full disk, a numeric failure: exit code 1."""
 
   exit_code = 1
+
+
+def require(holds: object, text: str) -> None:
+  """Raises UserError with this text unless the condition holds."""
+  if not holds:
+    raise UserError(text)
 
 
 def choose(kind: str, name: str, table: Mapping[str, Member]) -> Member:

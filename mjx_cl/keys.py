@@ -7,8 +7,6 @@ a changed one changes every published life. `jax.random.split(key, n)` is as if 
 folded in, so a key that is split has no further user below n.
 """
 
-from __future__ import annotations
-
 import enum
 
 

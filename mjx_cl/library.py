@@ -2,8 +2,6 @@
 of the whole loop, a detector's score on the recorded streams.
 """
 
-from __future__ import annotations
-
 import pathlib
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -32,7 +30,8 @@ def load_agent(env: str, path: str | None = None) -> agents.Trained:
     path: shipped name or folder; None: the robot's shipped agent.
 
   Raises:
-    UserError for an unknown robot or agent, FileError for a broken file.
+    UserError: for an unknown robot or agent.
+    FileError: for a broken file.
   """
   return agents.of(envs.make(env), path)
 
@@ -62,7 +61,8 @@ def run(
     What summary.json holds.
 
   Raises:
-    UserError for a wrong name or range, FileError where files cannot be read or written.
+    UserError: for a wrong name or range.
+    FileError: where files cannot be read or written.
   """
   config = replace(RunConfig(env), **settings, adapt=replace(AdaptConfig(), **(adapt or {})))
   return execute(config, out, resume, overwrite)
@@ -87,7 +87,7 @@ def score(
     Rows of the leaderboard, one for each robot, fault and severity.
 
   Raises:
-    UserError for an unknown detector, robot or channel.
+    UserError: for an unknown detector, robot or channel.
   """
   held = StreamSet(streams)
   chosen = held.choose(tuple(robots))
@@ -99,4 +99,4 @@ def score(
     entries, extra = [], [(name, submissions.from_host(host, None))]
   else:
     raise UserError(f"detector is a name or a class with update(x); got {type(detector).__name__}")
-  return [row for row in board.score(held, entries, chosen, extra).rows]
+  return list(board.score(held, entries, chosen, extra).rows)

@@ -2,14 +2,19 @@
 never change.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 
 class Size(NamedTuple):
-  """Widths of one preset. `stoch` is the number of categorical variables, `blocks` those of the
-  recurrent core.
+  """Widths of one preset.
+
+  Attributes:
+    deter: deterministic part of the latent.
+    hidden: of the layers between.
+    classes: of a categorical variable.
+    units: of encoder, decoder and heads.
+    stoch: number of categorical variables.
+    blocks: of the recurrent core.
   """
 
   deter: int
@@ -24,15 +29,8 @@ class Size(NamedTuple):
 # size400k, 640,867 for size1m, 2,477,219 for size2m, 9,738,019 for size12m
 SIZES = {
   "tiny": Size(128, 32, 8, 32, stoch=8),  # not of the table: for tests and probe environments
-  "size400k": Size(
-    384,
-    48,
-    3,
-    48,
-    # by the table's rule but not of it, like size2m: for what depends on the size where no GPU is
-    # at
-    # hand
-  ),
+  # by the table's rule but not of it, like size2m
+  "size400k": Size(384, 48, 3, 48),
   "size1m": Size(512, 64, 4, 64),
   "size2m": Size(1024, 128, 8, 128),
   "size12m": Size(2048, 256, 16, 256),

@@ -2,8 +2,6 @@
 callers vmap.
 """
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
@@ -52,8 +50,14 @@ class Step(NamedTuple):
 
 
 class Var(NamedTuple):
-  """One scalar of an observation or action: name, unit, bounds, and `scale`, its typical deviation
-  while the healthy robot is at work.
+  """One scalar of an observation or action.
+
+  Attributes:
+    name: what files call it.
+    unit: SI.
+    low: least value.
+    high: greatest value.
+    scale: typical deviation while the healthy robot is at work.
   """
 
   name: str

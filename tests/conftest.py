@@ -47,11 +47,12 @@ def resident_gib() -> float:
 @pytest.fixture(scope="session", autouse=True)
 def programs():
   """All runs of a test process share their compiled programs, as the parts of a suite do."""
-  from mjx_cl.runs import run
+  from mjx_cl.runs import crew, run
 
   kept = run.Programs()
   with pytest.MonkeyPatch.context() as patch:
-    patch.setattr(run, "Programs", lambda: kept)
+    for module in (crew, run):
+      patch.setattr(module, "Programs", lambda: kept)
     yield kept
 
 

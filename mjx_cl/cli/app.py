@@ -4,25 +4,24 @@ answers at once.
 Exit codes: 0 done; 2 arguments, names, ranges, refused --out; 1 files, disk, numeric failure; 130
 Ctrl-C, after state is saved.
 
-What each command takes stands in flags.py, what it does in commands.py.
+What each command takes stands in flags.py, what does it in the module that COMMANDS names.
 """
-
-from __future__ import annotations
 
 import atexit
 import contextlib
+import importlib
 import io
 import os
 import re
 import signal
 import sys
-from typing import TYPE_CHECKING, Annotated, Any, Union
+import types
+from collections.abc import Callable
+from typing import Annotated, Any, Union
 
 import tyro
 
 from mjx_cl import __version__
-from mjx_cl.cli import commands
-from mjx_cl.cli.display import apart, say
 from mjx_cl.cli.flags import (
   Bench,
   Certify,
@@ -39,30 +38,28 @@ from mjx_cl.cli.flags import (
   Run,
   Train,
 )
+from mjx_cl.cli.output import apart, say
 from mjx_cl.config import FaultConfig
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.io.interrupt import Interruptible, Lasting, later
 
-if TYPE_CHECKING:
-  import types
-  from collections.abc import Callable
-
-COMMANDS = (
-  Run,
-  Train,
-  Eval,
-  Certify,
-  Record,
-  Leaderboard,
-  Bench,
-  Plot,
-  Render,
-  Query,
-  Detect,
-  Report,
-  List,
-  Doctor,
-)  # Run is `mjx-cl run`, done by commands.do_run
+# what is said of a command in flags.py -> the module that does it, imported once it is called
+COMMANDS = {
+  Run: "runs",
+  Train: "agents",
+  Eval: "agents",
+  Certify: "robots",
+  Record: "board",
+  Leaderboard: "board",
+  Bench: "runs",
+  Plot: "results",
+  Render: "robots",
+  Query: "results",
+  Detect: "log",
+  Report: "results",
+  List: "names",
+  Doctor: "doctor",
+}
 Command = Union[  # type: ignore[valid-type]  # noqa: UP007  of a computed tuple
   tuple(
     Annotated[
@@ -73,14 +70,27 @@ Command = Union[  # type: ignore[valid-type]  # noqa: UP007  of a computed tuple
     for kind in COMMANDS
   )
 ]
-DO = {kind: getattr(commands, f"do_{kind.__name__.lower()}") for kind in COMMANDS}
+
+
+def done_by(kind: type, module: str) -> Callable[[Any], None]:
+  """What does a command: `do_NAME` of its module."""
+
+  def do(command: Any) -> None:
+    done = importlib.import_module(f"mjx_cl.cli.{module}")
+    getattr(done, f"do_{kind.__name__.lower()}")(command)
+
+  return do
+
+
+DO = {kind: done_by(kind, module) for kind, module in COMMANDS.items()}
 
 
 def parse(argv: list[str] | None) -> Any:
   """Arguments -> command. tyro's framed report of a mistake becomes one line. `--version` alone
-  prints it and ends.
+  prints it and ends; no argument is a mistake that the help answers.
   """
-  if (sys.argv[1:] if argv is None else argv) == ["--version"]:
+  argv = sys.argv[1:] if argv is None else argv
+  if argv == ["--version"]:
     print(f"mjx-cl {__version__}")
     raise SystemExit(0)
   report = io.StringIO()
@@ -89,11 +99,13 @@ def parse(argv: list[str] | None) -> Any:
       return tyro.cli(  # type: ignore[call-overload]
         Command,
         prog="mjx-cl",
-        args=argv,
+        args=argv or ["--help"],
         description="Robots that notice a fault, adapt to it and know when they are done.",
         config=(tyro.conf.FlagCreatePairsOff,),
       )
   except SystemExit as e:
+    if not argv:
+      raise SystemExit(UserError.exit_code) from None
     if e.code in (0, None):
       raise
     text = re.sub(r"\x1b\[[0-9;]*m", "", report.getvalue())
@@ -140,14 +152,13 @@ def _attempt(do: Callable[[], object], again: Callable[[], str]) -> int:
     return e.exit_code
   except KeyboardInterrupt:
     say(f"mjx-cl: interrupted{again()}")
-    atexit.register(
-      signal.signal, signal.SIGINT, signal.SIG_IGN
-    )  # a second Ctrl-C finds an interpreter that is clearing up
+    # a second Ctrl-C finds an interpreter that is clearing up
+    atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)
     return 130
-  except (
-    BrokenPipeError
-  ):  # of standard output: the reader has what it wanted, and results are in their files by then
-    return 0
+  except BrokenPipeError:
+    return (
+      0  # of standard output: the reader has what it wanted, results are in their files by then
+    )
   except OSError as e:
     say(f"mjx-cl: {e.strerror or e}{f': {e.filename}' if e.filename else ''}")
     return FileError.exit_code
@@ -171,26 +182,19 @@ def main(argv: list[str] | None = None) -> int:
     if not isinstance(command, (Plot, Query, Report)):
       from mjx_cl.io import runtime
 
-      runtime.setup(
-        runtime.sharing(command.seeds) if isinstance(command, Train) and command.seeds > 0 else 1
-      )
+      shared = isinstance(command, Train) and command.seeds > 0
+      runtime.setup(runtime.sharing(command.seeds) if shared else 1)
     with apart(command):
       DO[type(command)](command)
 
   def again() -> str:
-    kind = type(command) if command else None
-    return (
-      "; what was saved can be resumed with --resume"
-      if kind in (Run, Train)
-      else "; the same command goes on where it stopped"
-      if kind in (Record, Bench)
-      else ""
-    )
+    if isinstance(command, (Run, Train)):
+      return "; what was saved can be resumed with --resume"
+    return "; the same command goes on where it stopped" * isinstance(command, (Record, Bench))
 
   status = attempt(do, again)
-  if (
-    status == 130 and argv is None and Interruptible.again
-  ):  # a save that was broken off has threads that would complain of the interpreter's end
+  # a save that was broken off has threads that would complain of the interpreter's end
+  if status == 130 and argv is None and Interruptible.again:
     for stream in (sys.stdout, sys.stderr):
       with contextlib.suppress(OSError, ValueError):
         stream.flush()

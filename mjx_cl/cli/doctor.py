@@ -1,21 +1,20 @@
-"""What `mjx-cl doctor` reports."""
-
-from __future__ import annotations
+"""The command doctor: what the machine offers."""
 
 import time
 
+import jax
+import numpy as np
 import psutil
+
+from mjx_cl import __version__, envs
+from mjx_cl.cli.flags import Doctor
+from mjx_cl.cli.output import emit
+from mjx_cl.io import runtime
+from mjx_cl.runs import costs
 
 
 def report() -> dict:
   """Versions, devices, backend, memory, cache folder, and a speed check of about two seconds."""
-  import jax
-  import numpy as np
-
-  from mjx_cl import __version__, envs
-  from mjx_cl.io import runtime
-  from mjx_cl.runs import suite
-
   rows = {
     "mjx_cl": __version__,
     **{k: v for k, v in runtime.provenance().items() if k in ("versions", "python", "machine")},
@@ -24,7 +23,7 @@ def report() -> dict:
   rows["physics"] = runtime.default_physics()
   rows["free_memory_gib"] = round(psutil.virtual_memory().available / 2**30, 1)
   rows["compile_cache"] = str(runtime.cache_dir())
-  rows["matmul_gflop_s"] = round(suite.matmul_rate() / 1e9)
+  rows["matmul_gflop_s"] = round(costs.matmul_rate() / 1e9)
   env = envs.make("walker")
   if env.physics.name == "native":
     num = 256
@@ -38,3 +37,15 @@ def report() -> dict:
       steps += num
     rows["walker_control_steps_s"] = round(steps / (time.perf_counter() - begin))
   return rows
+
+
+def do_doctor(args: Doctor) -> None:
+  """Prints what the machine offers."""
+  rows = report()
+  if args.json:
+    emit(rows)
+    return
+  for name, value in rows.items():
+    if isinstance(value, dict):
+      value = ", ".join(f"{k} {v}" for k, v in value.items())
+    print(f"{name:16s} {value}")

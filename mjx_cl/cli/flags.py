@@ -21,16 +21,18 @@ class Run(RunConfig):
   --out.
 
   Example: mjx-cl run walker --fault gear --severity 0.5 --seeds 2 --out runs/gear
+
+  Attributes:
+    out: Result folder.
+    json: One JSON value on standard output, nothing else there.
+    resume: Go on with a run that was cut off.
+    overwrite: Replace an earlier run in --out.
   """
 
   out: str = "runs/latest"
-  """Result folder."""
   json: bool = False
-  """One JSON value on standard output, nothing else there."""
   resume: bool = False
-  """Go on with a run that was cut off."""
   overwrite: bool = False
-  """Replace an earlier run in --out."""
 
 
 @dataclass(frozen=True)
@@ -38,35 +40,36 @@ class Train:
   """Pretrains an agent; ends with OUT/agent (weights, card), which every --agent takes.
 
   Example: mjx-cl train walker --preset tiny --out runs/train
+
+  Attributes:
+    env: Robot, see `mjx-cl list envs`.
+    out: Folder for checkpoints, metrics.parquet and the agent.
+    preset: Learner and schedule, see `mjx-cl list presets`.
+    demonstrator: A policy's .npz, `reference`: the robot's own driver (car), or `ppo`: train
+      one with brax; default: none.
+    agent: Start from this agent's weights, moments and counters; the replay is filled by
+      acting.
+    set: Settings of learner or schedule, name=value ... (updates=20000 lr=1e-4).
+    seeds: Agents trained side by side; their parameters share one program.
+    save_every_s: Seconds between checkpoints.
+    resume: Go on with a training that was cut off, with the settings it began with; `updates`
+      may be others.
+    overwrite: Replace an earlier training in --out, its agent and its demonstrator too.
   """
 
   env: Positional[str]
-  """Robot, see `mjx-cl list envs`."""
   out: str = "runs/train"
-  """Folder for checkpoints, metrics.parquet and the agent."""
   preset: str = "cpu"
-  """Learner and schedule, see `mjx-cl list presets`."""
   demonstrator: str | None = None
-  """A policy's .npz, `reference`: the robot's own driver (car), or `ppo`: train one with brax;
-  default: none.
-  """
   agent: str | None = None
-  """Start from this agent's weights, moments and counters; the replay is filled by acting."""
   set: tuple[str, ...] = ()
-  """Settings of learner or schedule, name=value ... (updates=20000 lr=1e-4)."""
   seed: int = 0
   seeds: int = 1
-  """Agents trained side by side; their parameters share one program."""
   physics: str = "auto"
   save_every_s: float = 240.0
-  """Seconds between checkpoints."""
   json: bool = False
   resume: bool = False
-  """Go on with a training that was cut off, with the settings it began with; `updates` may be
-  others.
-  """
   overwrite: bool = False
-  """Replace an earlier training in --out, its agent and its demonstrator too."""
 
 
 @dataclass(frozen=True)
@@ -74,13 +77,15 @@ class Eval:
   """Return of an agent on the healthy robot.
 
   Example: mjx-cl eval walker --episodes 20
+
+  Attributes:
+    seed: Episodes use seeds seed, seed + 1, ...
   """
 
   env: Positional[str]
   episodes: int = 20
   agent: str | None = None
   seed: int = 0
-  """Episodes use seeds seed, seed + 1, ..."""
   physics: str = "auto"
   deterministic: bool = False
   json: bool = False
@@ -92,18 +97,20 @@ class Certify:
   and certificates.md into --out.
 
   Example: mjx-cl certify walker --fault gear --episodes 0 --out runs/certificates
+
+  Attributes:
+    env: Robots, default: all, see `mjx-cl list envs`.
+    out: Result folder; rows of other robots in it are kept.
+    fault: Only these faults, or presets that turn the robot into another one.
+    episodes: Episodes per fault and severity for the return lost without adaptation; 0: none.
+    agent: Trained agent: shipped name or folder; default: the shipped one, where there is one.
   """
 
   env: Positional[tuple[str, ...]] = ()
-  """Robots, default: all, see `mjx-cl list envs`."""
   out: str = "results"
-  """Result folder; rows of other robots in it are kept."""
   fault: tuple[str, ...] = ()
-  """Only these faults, or presets that turn the robot into another one."""
   episodes: int = 20
-  """Episodes per fault and severity for the return lost without adaptation; 0: none."""
   agent: str | None = None
-  """Trained agent: shipped name or folder; default: the shipped one, where there is one."""
   physics: str = "auto"
   json: bool = False
 
@@ -117,22 +124,23 @@ class Record:
   OUT/work until all are there.
 
   Example: mjx-cl record leaderboard --robot walker --out runs/streams
+
+  Attributes:
+    suite: Suite by name, see `mjx-cl list suites`, or a .toml file.
+    out: Folder of the set.
+    robot: Only these robots of the suite.
+    agent: Trained agent: shipped name or folder; default: the shipped one of each robot.
+    overwrite: Replace a set that is in --out; with --robot, in a set of the same suite, those
+      robots' streams alone.
   """
 
   suite: Positional[str] = "leaderboard"
-  """Suite by name, see `mjx-cl list suites`, or a .toml file."""
   out: str = "runs/streams"
-  """Folder of the set."""
   robot: tuple[str, ...] = ()
-  """Only these robots of the suite."""
   agent: str | None = None
-  """Trained agent: shipped name or folder; default: the shipped one of each robot."""
   physics: str = "auto"
   json: bool = False
   overwrite: bool = False
-  """Replace a set that is in --out; with --robot, in a set of the same suite, those robots' streams
-  alone.
-  """
 
 
 @dataclass(frozen=True)
@@ -144,42 +152,41 @@ class Leaderboard:
   class, --submit with a file of scores.
 
   Example: mjx-cl leaderboard --robot walker --detector cusum ewma --out runs/leaderboard
+
+  Attributes:
+    streams: Folder of `mjx-cl record`; default: the set that ships.
+    out: Result folder.
+    overwrite: Replace an earlier board in --out, or files that --export left.
+    robot: Only these robots of the set.
+    detector: Only these detectors, by their names on the board, or name@channel,
+      path/to/file.py:factory, module:factory; `none`: only the oracles and one's own. Default:
+      all.
+    add: module:Class or file.py:Class, a Python class with update(x) -> bool; a river detector
+      works unchanged.
+    set: Settings of --add, name=value ...
+    channel: What --add watches: opr, rpr, reward, surprise or group_0 .. group_7.
+    log: Give --add the logarithm, as the built-in detectors of one number have it.
+    threshold: Setting of --add that is calibrated, larger = fewer alarms; default: it runs as
+      it is, and its own rate of false alarms is printed.
+    submit: Parquet with the columns stream, step, score, for all streams that --export writes.
+    name: Name of --add or --submit on the board.
+    export: Only write the streams in full into this folder, one Parquet file per robot, for
+      tools of one's own.
   """
 
   streams: Positional[str | None] = None
-  """Folder of `mjx-cl record`; default: the set that ships."""
   out: str = "runs/leaderboard"
-  """Result folder."""
   overwrite: bool = False
-  """Replace an earlier board in --out, or files that --export left."""
   robot: tuple[str, ...] = ()
-  """Only these robots of the set."""
   detector: tuple[str, ...] = ()
-  """Only these detectors, by their names on the board, or name@channel, path/to/file.py:factory,
-  module:factory; `none`: only the oracles and one's own. Default: all.
-  """
   add: str | None = None
-  """module:Class or file.py:Class, a Python class with update(x) -> bool; a river detector works
-  unchanged.
-  """
   set: tuple[str, ...] = ()
-  """Settings of --add, name=value ..."""
   channel: str = "opr"
-  """What --add watches: opr, rpr, reward, surprise or group_0 .. group_7."""
   log: bool = False
-  """Give --add the logarithm, as the built-in detectors of one number have it."""
   threshold: str | None = None
-  """Setting of --add that is calibrated, larger = fewer alarms; default: it runs as it is, and its
-  own rate of false alarms is printed.
-  """
   submit: str | None = None
-  """Parquet with the columns stream, step, score, for all streams that --export writes."""
   name: str | None = None
-  """Name of --add or --submit on the board."""
   export: str | None = None
-  """Only write the streams in full into this folder, one Parquet file per robot, for tools of one's
-  own.
-  """
   json: bool = False
 
 
@@ -192,38 +199,38 @@ class Bench:
   OUT/PART/ as `mjx-cl run` does, OUT/bench.parquet, OUT/bench.json.
 
   Example: mjx-cl bench quick --plan
+
+  Attributes:
+    suite: paper, quick, full, study or a .toml file, see `mjx-cl list benches`.
+    out: Result folder; default: runs/bench/SUITE.
+    only: Only these parts, or those below these names.
+    seeds: In place of the suite's.
+    first_seed: In place of the suite's.
+    arm: In place of the suite's.
+    plan: Only print the plan.
+    shard: K/N: this machine runs every N-th part from the K-th on.
+    jobs: Parts side by side, each on its share of the cores; default: one per core as far as
+      memory allows.
+    merge: Folders of the same suite from other machines; their finished parts are copied here
+      and not run, seeds of a part that several hold are joined.
+    publish: Copy finished parts' tables and figures, without the traces, to this folder.
+    resume: Said for completeness: a suite always goes on.
   """
 
   suite: Positional[str] = "quick"
-  """paper, quick, full, study or a .toml file, see `mjx-cl list benches`."""
   out: str | None = None
-  """Result folder; default: runs/bench/SUITE."""
   only: tuple[str, ...] = ()
-  """Only these parts, or those below these names."""
   seeds: int | None = None
-  """In place of the suite's."""
   first_seed: int | None = None
-  """In place of the suite's."""
   arm: tuple[str, ...] = ()
-  """In place of the suite's."""
   physics: str = "auto"
   plan: bool = False
-  """Only print the plan."""
   shard: str = "0/1"
-  """K/N: this machine runs every N-th part from the K-th on."""
   jobs: int | None = None
-  """Parts side by side, each on its share of the cores; default: one per core as far as memory
-  allows.
-  """
   merge: tuple[str, ...] = ()
-  """Folders of the same suite from other machines; their finished parts are copied here and not
-  run, seeds of a part that several hold are joined.
-  """
   publish: str | None = None
-  """Copy finished parts' tables and figures, without the traces, to this folder."""
   json: bool = False
   resume: bool = False
-  """Said for completeness: a suite always goes on."""
 
 
 @dataclass(frozen=True)
@@ -242,28 +249,30 @@ class Render(FaultConfig):
   acts.
 
   Example: mjx-cl render walker --fault gear --target right_hip --out gear.gif
+
+  Attributes:
+    out: File that ends in .gif or .mp4; default: ENV.gif.
+    agent: Trained agent: shipped name or folder; `none` stands still, `random` moves at random.
+    steps: Control steps in all.
+    width: Pixels.
+    height: Pixels.
+    fps: Pictures per second, at the robot's own pace.
+    view: robot (MuJoCo), top (a car on its track, with its lidar) or auto.
+    deterministic: Act by the policy's mean instead of a sample.
   """
 
   fault: str = "none"
   onset: int = 200
   out: str | None = None
-  """File that ends in .gif or .mp4; default: ENV.gif."""
   agent: str | None = None
-  """Trained agent: shipped name or folder; `none` stands still, `random` moves at random."""
   steps: int = 400
-  """Control steps in all."""
   seed: int = 0
   width: int = 480
-  """Pixels."""
   height: int = 360
-  """Pixels."""
   fps: float = 20.0
-  """Pictures per second, at the robot's own pace."""
   view: str = "auto"
-  """robot (MuJoCo), top (a car on its track, with its lidar) or auto."""
   physics: str = "auto"
   deterministic: bool = False
-  """Act by the policy's mean instead of a sample."""
   json: bool = False
 
 
@@ -282,38 +291,37 @@ class Detect:
   of any counts. Writes detect.json, alarms.csv and detect.png into --out.
 
   Example: mjx-cl detect today.csv --nominal healthy.csv --out runs/detect
+
+  Attributes:
+    file: Log to judge, .csv or .csv.gz.
+    nominal: Log of the healthy system, same columns; three times --arl0 samples or more.
+    column: Columns to watch; default: all columns of numbers that both files have, less clocks
+      and constant ones.
+    detector: Detectors of one number per sample, one for each column, or of several channels,
+      one for all columns together; default: all; or module:Class, file.py:Class, a Python class
+      with update(x) and a threshold of its own.
+    set: Settings of such a class, name=value ...
+    arl0: Wanted mean number of samples between false alarms of one detector, all columns
+      together.
+    rate: Samples (or steps of the column `step`) per second; default: from the column `time`,
+      or one of seconds (`time_s`).
+    logarithm: Watch the logarithm; for residuals, which are positive and skewed. A sample of 0
+      or less is refused.
+    out: Folder for the results; default: only the table.
+    overwrite: Replace an earlier detection in --out.
   """
 
   file: Positional[str]
-  """Log to judge, .csv or .csv.gz."""
   nominal: str
-  """Log of the healthy system, same columns; three times --arl0 samples or more."""
   column: tuple[str, ...] = ()
-  """Columns to watch; default: all columns of numbers that both files have, less clocks and
-  constant ones.
-  """
   detector: tuple[str, ...] = ()
-  """Detectors of one number per sample, one for each column, or of several channels, one for all
-  columns together; default: all; or module:Class, file.py:Class, a Python class with update(x) and
-  a threshold of its own.
-  """
   set: tuple[str, ...] = ()
-  """Settings of such a class, name=value ..."""
   arl0: float = 10_000
-  """Wanted mean number of samples between false alarms of one detector, all columns together."""
   rate: float | None = None
-  """Samples (or steps of the column `step`) per second; default: from the column `time`, or one of
-  seconds (`time_s`).
-  """
   logarithm: bool = False
-  """Watch the logarithm; for residuals, which are positive and skewed. A sample of 0 or less is
-  refused.
-  """
   out: str | None = None
-  """Folder for the results; default: only the table."""
   json: bool = False
   overwrite: bool = False
-  """Replace an earlier detection in --out."""
 
 
 @dataclass(frozen=True)
@@ -325,12 +333,15 @@ class Query:
   folder, under their own names (trace, events, runs).
 
   Example: mjx-cl query runs/latest "select arm, seed, outcome from runs"
+
+  Attributes:
+    words: [FOLDER] [SQL]
+    within: One more folder, DIR or NAME=DIR: its tables are views that begin with its name.
+      Repeatable.
   """
 
   words: Positional[tuple[str, ...]] = ()
-  """[FOLDER] [SQL]"""
   within: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(name="in")] = ()
-  """One more folder, DIR or NAME=DIR: its tables are views that begin with its name. Repeatable."""
   json: bool = False
 
 
@@ -340,18 +351,21 @@ class Report:
   report:NAME -->` and `<!-- /report -->`, nothing else.
 
   Example: mjx-cl report --check
+
+  Attributes:
+    results: Folder of the results.
+    page: Texts with marked blocks; default: README.md and docs/*.md.
+    check: Write nothing; exit code 1 and the names of the blocks where text and results
+      disagree.
+    figures: Draw recovery.png and ratio.png of every published suite anew as well. A run's
+      figure.png needs its trace (`mjx-cl plot`), leaderboard.html the streams (`mjx-cl
+      leaderboard`).
   """
 
   results: str = "results"
-  """Folder of the results."""
   page: tuple[str, ...] = ()
-  """Texts with marked blocks; default: README.md and docs/*.md."""
   check: bool = False
-  """Write nothing; exit code 1 and the names of the blocks where text and results disagree."""
   figures: bool = False
-  """Draw recovery.png and ratio.png of every published suite anew as well. A run's figure.png needs
-  its trace (`mjx-cl plot`), leaderboard.html the streams (`mjx-cl leaderboard`).
-  """
   json: bool = False
 
 
@@ -360,12 +374,13 @@ class List:
   """Names that other commands take.
 
   Example: mjx-cl list faults
+
+  Attributes:
+    what: envs, faults, fault-presets, schedules, detectors, presets, agents, arms, sizes,
+      suites, benches or all.
   """
 
   what: Positional[str] = "all"
-  """envs, faults, fault-presets, schedules, detectors, presets, agents, arms, sizes, suites,
-  benches or all.
-  """
   json: bool = False
 
 

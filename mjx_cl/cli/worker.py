@@ -1,14 +1,12 @@
 """One part of a suite in a process of its own: `python -m mjx_cl.cli.worker OUT PART CORES`."""
 
-from __future__ import annotations
-
 import os
 import pathlib
 import signal
 import sys
 import threading
 
-from mjx_cl.cli import app, display
+from mjx_cl.cli import app
 from mjx_cl.io import runtime, tables
 
 
@@ -24,12 +22,14 @@ def main(arguments: list[str]) -> int:
   threading.Thread(target=_orphan, daemon=True).start()
 
   def do() -> None:
+    runtime.setup()
+    # JAX has not started before
+    from mjx_cl.cli.live import RunDisplay
     from mjx_cl.runs import run, suite
 
-    runtime.setup()
     folder = pathlib.Path(out)
     values = tables.read_json(folder / "suite.json")["parts"][name]
-    with display.RunDisplay() as shown:
+    with RunDisplay() as shown:
       run.execute(
         suite.config(name, values),
         folder / name,

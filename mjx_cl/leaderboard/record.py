@@ -25,8 +25,8 @@ from mjx_cl.io import arrays, folders, runtime, tables
 from mjx_cl.leaderboard import lives, set_tables
 from mjx_cl.leaderboard.streams import META, SCHEMA, VERSION
 from mjx_cl.leaderboard.suite import Suite
-from mjx_cl.rollout.scan import stream_keys
 from mjx_cl.rollout.monitor import watched
+from mjx_cl.rollout.scan import stream_keys
 from mjx_cl.training import agents
 
 MADE = ("command", "versions", "python", "git_commit", "machine")  # of config.json: how it was made

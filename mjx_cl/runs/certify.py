@@ -2,10 +2,9 @@
 and what it costs an agent that does not adapt.
 """
 
-from __future__ import annotations
-
 import pathlib
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,58 +14,41 @@ from mjx_cl import envs
 from mjx_cl import faults as faults_lib
 from mjx_cl.config import PRESETS
 from mjx_cl.dreamer.agent import Agent
-from mjx_cl.errors import FileError, UserError
+from mjx_cl.errors import require
 from mjx_cl.faults import certificate, presets
-from mjx_cl.io import tables
 from mjx_cl.rollout.monitor import Monitor
-from mjx_cl.rollout.scan import Rollout, nest, start
+from mjx_cl.rollout.scan import Rollout, Row, nest, start
 from mjx_cl.rollout.transfer import Transfer
+from mjx_cl.runs.certificate_tables import COSTS
 from mjx_cl.scoring import intervals
 from mjx_cl.training import agents
 from mjx_cl.training.episodes import Episodes
 
-if TYPE_CHECKING:
-  from collections.abc import Callable, Sequence
-  from typing import Any
-
 CHUNK = 50  # decisions
 WARM = 30  # decisions at an episode's start whose residuals are not compared
 AT_ONCE = 120  # robots side by side
-COLUMNS = certificate.Certificate._fields + (
-  "physics",
-  "agent",
-  "episodes",
-  "return_nominal",
-  "return_mean",
-  "return_lost",
-  "return_lost_low",
-  "return_lost_high",
-  "kl_nats",
-)
 
 
 class Cost:
   """Lives whole episodes of the shipped agent under faults, all in one program per robot.
 
   Args:
-    env, trained: robot and its agent. faults: name -> Fault, the program's.
+    env: robot.
+    trained: its agent.
+    faults: name -> Fault, the program's.
     episodes: per lane; episode e starts from seed e, for every lane alike.
   """
 
   def __init__(self, env: Any, trained: agents.Trained, faults: dict, episodes: int) -> None:
-    self.env, self.agent, self.faults, self.episodes = env, trained.agent, faults, episodes
+    self.faults, self.episodes = faults, episodes
     self.params = jax.tree.map(lambda x: x[None], trained.train.params)
-    self.repeat = int(trained.card.get("repeat", 1))
-    self.rollout = Rollout(env, self.agent, tuple(faults.values()), self.repeat)
-    self.monitor = Monitor(self.agent, spec=self.env.spec)
+    agent, own, repeat = trained.agent, tuple(faults.values()), int(trained.card.get("repeat", 1))
+    self.chunks = -(-env.spec.episode_steps // repeat // CHUNK)
+    self.rollout = Rollout(env, agent, own, repeat)
+    self.monitor = Monitor(agent, spec=env.spec)
     self.watch = jax.jit(self.monitor.update)
-    self.begin = jax.jit(
-      jax.vmap(
-        lambda key, plan, target: start(
-          env, self.agent, tuple(faults.values()), key, target=target, plan=plan
-        )
-      )
-    )
+    begin = lambda key, plan, target: start(env, agent, own, key, target=target, plan=plan)
+    self.begin = jax.jit(jax.vmap(begin))
 
   def live(self, chosen: list[certificate.Lane]) -> tuple[np.ndarray, list[np.ndarray]]:
     """Returns of every lane (lanes, episodes), and of each lane the valid (ln OPR, ln RPR),
@@ -81,32 +63,29 @@ class Cost:
     )
     history = self.monitor.init(1, lanes * self.episodes)
     lived, residuals, kept = Episodes((1, lanes * self.episodes)), [], []
-    for chunk in range(-(-self.env.spec.episode_steps // self.repeat // CHUNK)):
+    for chunk in range(self.chunks):
       streams, rows = self.rollout.chunk(self.params, streams, CHUNK)
       history, residual = self.watch(
         self.params, history, rows, jax.random.split(jax.random.key(chunk), 1)
       )
-      residuals.append(
-        np.stack([np.asarray(residual.opr)[:, 0], np.asarray(residual.rpr)[:, 0]], -1)
-      )
+      residuals.append(np.stack([np.asarray(x)[:, 0] for x in (residual.opr, residual.rpr)], -1))
       warm = np.arange(chunk * CHUNK, (chunk + 1) * CHUNK) >= WARM
       kept.append(lived.add(rows)[:, 0] & warm[:, None])
       if not lived.alive.any():
         break
-    values, kept = np.concatenate(residuals), np.concatenate(kept)  # type: ignore[assignment]
-    good = kept & np.isfinite(values).all(-1)
+    values = np.concatenate(residuals)
+    good = np.concatenate(kept) & np.isfinite(values).all(-1)
     logs = np.log(np.maximum(values, 1e-9))
-    mine = lambda i: slice(i * self.episodes, (i + 1) * self.episodes)
-    return lived.total.reshape(lanes, self.episodes), [
-      logs[:, mine(i)][good[:, mine(i)]] for i in range(lanes)
-    ]
+    mine = [slice(i * self.episodes, (i + 1) * self.episodes) for i in range(lanes)]
+    returns = lived.total.reshape(lanes, self.episodes)
+    return returns, [logs[:, own][good[:, own]] for own in mine]
 
 
 def divergence(faulted: np.ndarray, nominal: np.ndarray) -> float | None:
   """Kullback-Leibler divergence of two normal fits to (ln OPR, ln RPR), nats per step.
 
-    KL = (tr(S0^-1 S1) + (m0 - m1)' S0^-1 (m0 - m1) - 2 + ln(det S0 / det S1)) / 2          1
-      faulted, 0 nominal
+    KL = (tr(S0^-1 S1) + (m0 - m1)' S0^-1 (m0 - m1) - 2 + ln(det S0 / det S1)) / 2
+    1: faulted, 0: nominal
 
   What a detector can gain per step if samples were independent; they are not, so it is an upper
   figure for one that reads these two.
@@ -116,158 +95,8 @@ def divergence(faulted: np.ndarray, nominal: np.ndarray) -> float | None:
   m1, m0 = faulted.mean(0), nominal.mean(0)
   s1, s0 = np.cov(faulted.T) + 1e-9 * np.eye(2), np.cov(nominal.T) + 1e-9 * np.eye(2)
   inverse = np.linalg.inv(s0)
-  return float(
-    (
-      np.trace(inverse @ s1)
-      + (m0 - m1) @ inverse @ (m0 - m1)
-      - 2
-      + np.log(np.linalg.det(s0) / np.linalg.det(s1))
-    )
-    / 2
-  )
-
-
-def changes(robot: str) -> list[str]:
-  """Presets that turn this robot into another one and do no more; what others add later is
-  certified as a preset of that one.
-  """
-  return [
-    name
-    for name, preset in presets.PRESETS.items()
-    if preset.robot == robot and preset.becomes and not preset.then
-  ]
-
-
-def become(
-  env: Any, other: Any, preset: str, onset: int = 25, seed: int = 0
-) -> certificate.Certificate:
-  """Certificate of a change of robots.
-
-  diff_1, diff_10 and diff_100 are of the episode that begins with it: `other` against `env` from
-  the same key and under the same signal, as in certificate.certify. When it begins to act is seen
-  in a stream that becomes `other` at its first end from `onset` on (transfer.Transfer, a policy
-  that has learnt nothing) beside the same stream that does not: `early` where a row before that end
-  differs, `first_step` counted from the end.
-  """
-  agent, key = (
-    Agent(PRESETS["tiny"].dreamer, len(env.spec.obs), len(env.spec.act)),
-    jax.random.key(seed),
-  )
-  params = jax.tree.map(lambda x: x[None], jax.jit(agent.init)(key).params)
-  none, others = faults_lib.none(env), faults_lib.none(other)
-  moves, stays = Transfer(env, other, agent, (others,)), Rollout(env, agent, (none,))
-  moving, staying = (
-    nest(begin, 0, 0)(key[None, None])
-    for begin in (
-      lambda k: moves.start(k, -1, faults_lib.plan(), onset),
-      lambda k: start(env, agent, (none,), k),
-    )
-  )
-  lives: tuple[list[np.ndarray], list[np.ndarray]]
-  lives = [], []
-  while int(moving.after.enter[0, 0]) == faults_lib.FOREVER or len(lives[0]) * CHUNK < int(
-    moving.after.enter[0, 0]
-  ) + max(certificate.AFTER):
-    moving, a = moves.chunk(params, moving, CHUNK)
-    staying, b = stays.chunk(params, staying, CHUNK)
-    for life, rows in zip(lives, (a, b)):
-      life.append(
-        np.concatenate(
-          [
-            np.asarray(x, np.float32).reshape(CHUNK, -1)
-            for x in (rows.final_obs, rows.reward, rows.terminated)
-          ],
-          1,
-        )
-      )
-  moved, stayed = (np.concatenate(life).view(np.uint32) for life in lives)
-  at = np.flatnonzero((moved != stayed).any(-1))
-  first = int(at[0]) - int(moving.after.enter[0, 0]) if at.size else None
-  signal, robots = jnp.asarray(certificate.actions(env, max(certificate.AFTER), seed)), []
-  for robot, fault in ((env, none), (other, others)):
-    alone = jax.jit(
-      lambda model, robot=robot, fault=fault: certificate.live(
-        robot, (fault,), model, key, faults_lib.begin(fault, key, faults_lib.plan()), signal
-      )[0]
-    )
-    robots.append(np.asarray(alone(faults_lib.owned_model((fault,), robot.model))))
-  size = np.sqrt(
-    np.mean(((robots[1] - robots[0]) / np.asarray([v.scale for v in env.spec.obs])) ** 2, -1)
-  )
-  return certificate.Certificate(  # type: ignore[call-arg]
-    env.spec.name,
-    preset,
-    "preset",
-    "preset",
-    1.0,
-    not at.size,
-    first is not None and first < 0,
-    first,
-    *(float(size[k - 1]) for k in certificate.AFTER),  # type: ignore[arg-type]
-    None,
-    "",
-    bool(np.isfinite(robots).all()),
-  )
-
-
-def certify(
-  name: str,
-  physics: str = "auto",
-  episodes: int = 20,
-  agent: str | None = None,
-  only: tuple[str, ...] = (),
-  progress: Callable[[str], Any] = lambda text: None,
-) -> list[dict]:
-  """Certificates of one robot as rows of results/certificates.parquet.
-
-  Args:
-    episodes: per lane for the cost; 0, or a robot without a shipped agent: no cost is measured
-      (null).
-    only: names of faults, or of presets that turn the robot into another one; () for all.
-  """
-  env = envs.make(name, physics)
-  moves = [preset for preset in changes(env.spec.name) if not only or preset in only]
-  named = tuple(fault for fault in only if fault not in moves)
-  faults = {k: f for k, f in faults_lib.available(env).items() if k != "none"}
-  for fault in named:
-    if not faults_lib.make(fault, env).owns:
-      raise UserError(
-        f"fault {fault!r} changes nothing by design; choose from: {', '.join(faults)}"
-      )
-  faults = {k: faults_lib.make(k, env) for k in named} if only else faults
-  trained = agents.of(env, agent) if episodes and (agent or agents.is_shipped(env)) else None
-  unknown = {
-    "physics": envs.physics_of(env).name,
-    "agent": None,
-    "episodes": 0,
-    "return_nominal": None,
-    "return_mean": None,
-    "return_lost": None,
-    "return_lost_low": None,
-    "return_lost_high": None,
-    "kl_nats": None,
-  }
-  rows = []
-  if faults:
-    progress(f"{name}: {len(faults)} faults, acting under the same commands")
-    rows = [c._asdict() | unknown for c in certificate.certify(env, faults)]
-    found = costs(env, trained, faults, episodes, progress) if trained else {}
-    for row in rows:
-      row |= found.get(certificate.Lane(row["fault"], row["target"], row["severity"]), {})
-  for preset in moves:
-    progress(f"{name}: {preset}")
-    other = envs.make(presets.PRESETS[preset].becomes, physics)  # type: ignore[arg-type]
-    row = become(env, other, preset)._asdict() | unknown
-    if trained:
-      whole = [
-        Cost(robot, trained, {"none": faults_lib.none(robot)}, episodes).live(
-          [certificate.Lane("none", "all", 0.0)]
-        )
-        for robot in (env, other)
-      ]
-      row |= price(trained, *((returns[0], logs[0]) for returns, logs in whole))
-    rows.append(row)
-  return rows
+  volumes = np.log(np.linalg.det(s0) / np.linalg.det(s1))
+  return float((np.trace(inverse @ s1) + (m0 - m1) @ inverse @ (m0 - m1) - 2 + volumes) / 2)
 
 
 def price(
@@ -299,8 +128,8 @@ def costs(
   chosen += [
     lane for lane in certificate.lanes(faults, targets=False) if lane.severity > 0
   ] + certificate.preset_lanes(env, faults)
-  found: dict[certificate.Lane, dict]
-  at_once, found = max(2, AT_ONCE // episodes), {}
+  at_once = max(2, AT_ONCE // episodes)
+  found: dict[certificate.Lane, dict] = {}
   nominal = None
   for i in range(0, len(chosen), at_once):
     part = chosen[i : i + at_once]
@@ -311,159 +140,156 @@ def costs(
   return found
 
 
-def old_rows(folder: pathlib.Path | str) -> list[dict]:
-  """Rows of certificates.parquet in `folder`, [] where there is none; FileError for one that is no
-  such table or a folder that cannot be written.
+def changes(robot: str) -> list[str]:
+  """Presets that turn this robot into another one and do no more; what others add later is
+  certified as a preset of that one.
   """
-  import pyarrow
-  import pyarrow.parquet
-
-  folder = pathlib.Path(folder)
-  path = folder / "certificates.parquet"
-  try:
-    folder.mkdir(parents=True, exist_ok=True)
-    probe = folder / "certificates.tmp"
-    probe.touch()
-    probe.unlink()
-    rows = pyarrow.parquet.read_table(path).to_pylist() if path.exists() else []
-  except OSError as e:
-    raise FileError(f"cannot write in {folder}: {e.strerror or e}") from None
-  except pyarrow.ArrowException as e:
-    raise FileError(
-      f"{path} is no table of certificates: {str(e).splitlines()[0]}; give another --out"
-    ) from None
-  if rows and set(rows[0]) != set(COLUMNS):
-    raise FileError(
-      f"{path} has the columns of another version; give another --out, or move it away"
-    )
-  return rows
-
-
-def guard(folder: pathlib.Path | str, names: tuple[str, ...], episodes: int) -> None:
-  """Refuses what would lose measured costs, before anything is measured."""
-  costly = {r["robot"] for r in old_rows(folder) if r["episodes"]} & {
-    envs.make(name).spec.name if ":" in name else name for name in names
-  }
-  if not episodes and costly:
-    raise UserError(
-      f"{folder} holds measured costs of {', '.join(sorted(costly))}; give --episodes above 0, "
-      "or another --out"
-    )
-
-
-def write(folder: pathlib.Path | str, rows: list[dict]) -> None:
-  """Writes certificates.parquet and certificates.md; rows of other robots, faults and backends that
-  are there already are kept.
-  """
-  folder = pathlib.Path(folder)
-  which = lambda r: (r["robot"], r["fault"], r["physics"])
-  new = {which(r) for r in rows}
-  rows = [r for r in old_rows(folder) if which(r) not in new] + rows
-  tables.write_table(folder / "certificates.parquet", {k: [r[k] for r in rows] for k in COLUMNS})
-  tmp = folder / "certificates.md.tmp"
-  tmp.write_text(table(rows))
-  tmp.replace(folder / "certificates.md")
-
-
-def table(rows: list[dict]) -> str:
-  """The certificates for a reader: one line per robot, fault and target, its greatest severity;
-  backends apart.
-  """
-  number = lambda x, form: "" if x is None else format(x, form)
-  out = [
-    "# Certificates: every fault acts",
-    "",
-    (
-      "Made by `mjx-cl certify`; all severities are in certificates.parquet. Each line is a "
-      "fault at severity 1 (a preset: its own). `first` is the first control"
-    ),
-    (
-      "step from the onset whose outcome differs under the same commands, `after 1, 10, 100` the "
-      "difference so many steps on (root mean square over the"
-    ),
-    (
-      "channels, in typical deviations). `return lost`: mean over episodes of the shipped agent, "
-      "which does not adapt, with its 95 % bootstrap interval over"
-    ),
-    "episodes. `KL`: normal fits to ln OPR, ln RPR against the nominal robot's, nats per step.",
-    "",
+  return [
+    name
+    for name, preset in presets.PRESETS.items()
+    if preset.robot == robot and preset.becomes and not preset.then
   ]
-  for robot, physics in dict.fromkeys((r["robot"], r["physics"]) for r in rows):
-    mine = [
-      r
-      for r in rows
-      if (r["robot"], r["physics"]) == (robot, physics)
-      and r["fault"] != "none"
-      and r["severity"] > 0
-    ]
-    top: dict[tuple[str, str], dict] = {}
-    for r in mine:
-      key = (r["fault"], r["target"])
-      if key not in top or r["severity"] > top[key]["severity"]:
-        top[key] = r
-    agent = next((r for r in mine if r["episodes"]), None)
-    several = len({r["physics"] for r in rows if r["robot"] == robot}) > 1
-    out += [
-      f"## {robot}" + (f", physics {physics}" if several else ""),
-      "",
-      "No agent is shipped for it, so no return is given."
-      if agent is None
-      else (
-        f"Nominal return {agent['return_nominal']:.0f} over {agent['episodes']} episodes of "
-        f"agent `{agent['agent']}`."
-      ),
-      "",
-      "| family | fault | target | severity | first | after 1 | 10 | 100 | return lost | KL |",
-      "|---|---|---|---|---|---|---|---|---|---|",
-    ]
-    for r in top.values():
-      lost = (
-        ""
-        if r["return_lost"] is None
-        else (
-          f"{r['return_lost']:.0f} [{number(r['return_lost_low'], '.0f')}, "
-          f"{number(r['return_lost_high'], '.0f')}]"
-        )
-      )
-      out.append(
-        f"| {r['family']} | {r['fault']} | {r['target']} | {r['severity']:.3g} | "
-        f"{number(r['first_step'], 'd')} | {number(r['diff_1'], '.2g')} | "
-        f"{number(r['diff_10'], '.2g')} | {number(r['diff_100'], '.2g')} | {lost} | "
-        f"{number(r['kl_nats'], '.2g')} |"
-      )
-    out.append("")
-  return "\n".join(out)
 
 
-def summary(rows: list[dict]) -> list[dict]:
-  """What `--json` prints: {name, value, unit, goal, holds} per robot."""
-  out = []
-  fields = certificate.Certificate._fields
-  for robot in dict.fromkeys(r["robot"] for r in rows):
-    mine = [certificate.Certificate(*(r[k] for k in fields)) for r in rows if r["robot"] == robot]
-    wrong = certificate.faulty(mine)
-    names = {c.fault for c in mine if c.fault != "none" and not presets.named(c.fault)}
-    out += [
-      {
-        "name": f"{robot}: faults certified",
-        "value": len(names),
-        "unit": "faults",
-        "goal": None,
-        "holds": None,
-      },
-      {
-        "name": f"{robot}: faults that fail",
-        "value": len(wrong),
-        "unit": "lanes",
-        "goal": "== 0",
-        "holds": not wrong,
-      },
-    ]
-  return out
+def become(
+  env: Any, other: Any, preset: str, onset: int = 25, seed: int = 0
+) -> certificate.Certificate:
+  """Certificate of a change of robots.
+
+  diff_1, diff_10 and diff_100 are of the episode that begins with it: `other` against `env` from
+  the same key and under the same signal, as in certificate.certify. When it begins to act is seen
+  in a stream that becomes `other` at its first end from `onset` on (transfer.Transfer, a policy
+  that has learnt nothing) beside the same stream that does not: `early` where a row before that end
+  differs, `first_step` counted from the end.
+  """
+  agent = Agent(PRESETS["tiny"].dreamer, len(env.spec.obs), len(env.spec.act))
+  key = jax.random.key(seed)
+  moved, stayed, enter = _lives(env, other, agent, key, onset)
+  at = np.flatnonzero((moved != stayed).any(-1))
+  first = int(at[0]) - enter if at.size else None
+  robots = _episodes(env, other, key, seed)
+  size = np.sqrt(
+    np.mean(((robots[1] - robots[0]) / np.asarray([v.scale for v in env.spec.obs])) ** 2, -1)
+  )
+  return certificate.Certificate(
+    robot=env.spec.name,
+    fault=preset,
+    family="preset",
+    target="preset",
+    severity=1.0,
+    identical=not at.size,
+    early=first is not None and first < 0,
+    first_step=first,
+    monotone=None,
+    reason="",
+    finite=bool(np.isfinite(robots).all()),
+    **{f"diff_{k}": float(size[k - 1]) for k in certificate.AFTER},
+  )
+
+
+def _lives(
+  env: Any, other: Any, agent: Agent, key: jax.Array, onset: int
+) -> tuple[np.ndarray, np.ndarray, int]:
+  """Rows as bits, uint32 (decisions, channels), of a stream that becomes `other` and of the same
+  that does not, and the control step at which it has become it.
+  """
+  params = jax.tree.map(lambda x: x[None], jax.jit(agent.init)(key).params)
+  healthy = (faults_lib.none(env),)
+  moves = Transfer(env, other, agent, (faults_lib.none(other),))
+  stays = Rollout(env, agent, healthy)
+  begin = lambda k: moves.start(k, -1, faults_lib.plan(), onset)
+  moving = nest(begin, 0, 0)(key[None, None])
+  staying = nest(lambda k: start(env, agent, healthy, k), 0, 0)(key[None, None])
+  enter = faults_lib.FOREVER
+  moved: list[np.ndarray] = []
+  stayed: list[np.ndarray] = []
+  while enter == faults_lib.FOREVER or len(moved) * CHUNK < enter + max(certificate.AFTER):
+    moving, rows = moves.chunk(params, moving, CHUNK)
+    moved.append(_channels(rows))
+    staying, rows = stays.chunk(params, staying, CHUNK)
+    stayed.append(_channels(rows))
+    enter = int(moving.after.enter[0, 0])
+  bits = lambda life: np.concatenate(life).view(np.uint32)
+  return bits(moved), bits(stayed), enter
+
+
+def _channels(rows: Row) -> np.ndarray:
+  """float32 (decisions, channels)."""
+  channels = (rows.final_obs, rows.reward, rows.terminated)
+  return np.concatenate([np.asarray(x, np.float32).reshape(CHUNK, -1) for x in channels], 1)
+
+
+def _episodes(env: Any, other: Any, key: jax.Array, seed: int) -> list[np.ndarray]:
+  """What both robots observe from the same key on under the same signal."""
+  signal, observed = jnp.asarray(certificate.actions(env, max(certificate.AFTER), seed)), []
+  for robot in (env, other):
+    none = faults_lib.none(robot)
+    alone = jax.jit(
+      lambda model, robot=robot, fault=none: certificate.live(
+        robot, (fault,), model, key, faults_lib.begin(fault, key, faults_lib.plan()), signal
+      )[0]
+    )
+    observed.append(np.asarray(alone(faults_lib.owned_model((none,), robot.model))))
+  return observed
+
+
+def certify(
+  name: str,
+  physics: str = "auto",
+  episodes: int = 20,
+  agent: str | None = None,
+  only: tuple[str, ...] = (),
+  progress: Callable[[str], Any] = lambda text: None,
+) -> list[dict]:
+  """Certificates of one robot as rows of results/certificates.parquet.
+
+  Args:
+    name: of the robot.
+    physics: auto, native or mjx.
+    episodes: per lane for the cost; 0, or a robot without a shipped agent: no cost is measured
+      (null).
+    agent: shipped name or folder; None: the shipped one, where there is one.
+    only: names of faults, or of presets that turn the robot into another one; () for all.
+    progress: called with each line for the user.
+  """
+  env = envs.make(name, physics)
+  moves = [preset for preset in changes(env.spec.name) if not only or preset in only]
+  named = tuple(fault for fault in only if fault not in moves)
+  faults = {k: f for k, f in faults_lib.available(env).items() if k != "none"}
+  for fault in named:
+    require(
+      faults_lib.make(fault, env).owns,
+      f"fault {fault!r} changes nothing by design; choose from: {', '.join(faults)}",
+    )
+  faults = {k: faults_lib.make(k, env) for k in named} if only else faults
+  trained = agents.of(env, agent) if episodes and (agent or agents.is_shipped(env)) else None
+  unknown = dict.fromkeys(COSTS) | {"physics": envs.physics_of(env).name, "episodes": 0}
+  rows = []
+  if faults:
+    progress(f"{name}: {len(faults)} faults, acting under the same commands")
+    rows = [c._asdict() | unknown for c in certificate.certify(env, faults)]
+    found = costs(env, trained, faults, episodes, progress) if trained else {}
+    for row in rows:
+      row |= found.get(certificate.Lane(row["fault"], row["target"], row["severity"]), {})
+  for preset in moves:
+    progress(f"{name}: {preset}")
+    other = envs.make(str(presets.PRESETS[preset].becomes), physics)
+    row = become(env, other, preset)._asdict() | unknown
+    if trained:
+      lives = []
+      for robot in (env, other):
+        cost = Cost(robot, trained, {"none": faults_lib.none(robot)}, episodes)
+        returns, logs = cost.live([certificate.Lane("none", "all", 0.0)])
+        lives.append((returns[0], logs[0]))
+      row |= price(trained, *lives)
+    rows.append(row)
+  return rows
 
 
 def check(names: tuple[str, ...]) -> None:
   """Raises UserError for an unknown robot."""
   for name in names:
-    if name not in envs.ENVS:
-      raise UserError(f"unknown environment {name!r}; choose from: {', '.join(sorted(envs.ENVS))}")
+    require(
+      name in envs.ENVS,
+      f"unknown environment {name!r}; choose from: {', '.join(sorted(envs.ENVS))}",
+    )

@@ -1,7 +1,5 @@
 """What a user is told before a run starts: its threshold, and what may not have been meant."""
 
-from __future__ import annotations
-
 import dataclasses
 import inspect
 
@@ -78,16 +76,19 @@ def doubts(config: RunConfig) -> list[str]:
       f"{least:,} steps (adapt.least, {CHUNK} adapt.patience)"
     )
   if warmup >= config.steps:
-    return said + [
-      (
-        f"the run ends at step {config.steps:,}, within adapt.warmup={warmup:,}: no alarm can "
-        "start anything"
-      )
-    ]
-  if warmup > config.onset and any(ARMS[arm].trigger.listens for arm in config.arms):
-    return said + [
+    said.append(
+      f"the run ends at step {config.steps:,}, within adapt.warmup={warmup:,}: no alarm can "
+      "start anything"
+    )
+  elif warmup > config.onset and any(ARMS[arm].trigger.listens for arm in config.arms):
+    said.append(
       f"onset {config.onset:,} lies within adapt.warmup={warmup:,}: an alarm before its end "
       "starts nothing, and without a reward before the onset no stream "
       "counts as affected or recovered; a later --onset or a smaller --adapt.warmup would do"
-    ]
+    )
   return said
+
+
+def notes(config: RunConfig) -> list[str]:
+  """Everything that a user is told, one line each."""
+  return [*filter(None, [watching(config)]), *doubts(config)]

@@ -2,35 +2,34 @@
 same.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import json
 import pathlib
-from typing import TYPE_CHECKING
+from typing import Any
 
 from mjx_cl import detectors, envs
 from mjx_cl.adapt.arms import ARMS
 from mjx_cl.config import AdaptConfig, RunConfig
-from mjx_cl.errors import FileError, UserError
+from mjx_cl.errors import FileError, UserError, require
 from mjx_cl.faults.presets import changes
 from mjx_cl.io import folders, plugins, tables
 from mjx_cl.runs.settings import check
 from mjx_cl.scoring import stop_rule
 from mjx_cl.training import agents
 
-if TYPE_CHECKING:
-  from typing import Any
-
 
 def arm_agents(config: RunConfig, env: Any) -> dict[str, agents.Trained]:
   """Arm -> its own agent, of the arms that bring one: the run's with the arm's word behind its
   name, or beside the folder that --agent gives.
 
+  Args:
+    config: of the run.
+    env: its robot.
+
   Raises:
-    UserError where there is no such agent, or it differs from the run's in size, obs_scale or
-    repeat.
+    UserError: where there is no such agent, or it differs from the run's in size, obs_scale
+      or repeat.
   """
   out = {}
   for arm in (a for a in config.arms if ARMS[a].agent):
@@ -42,10 +41,10 @@ def arm_agents(config: RunConfig, env: Any) -> dict[str, agents.Trained]:
     except UserError as e:
       raise type(e)(f"arm {arm!r}: {e}") from None
     same = lambda t: (t.agent.config.size, t.agent.config.obs_scale, int(t.card.get("repeat", 1)))
-    if same(other) != same(trained):
-      raise UserError(
-        f"arm {arm!r}: agent {name!r} differs from the run's in size, obs_scale or repeat"
-      )
+    require(
+      same(other) == same(trained),
+      f"arm {arm!r}: agent {name!r} differs from the run's in size, obs_scale or repeat",
+    )
     out[arm] = other
   return out
 
@@ -110,6 +109,21 @@ def differing(old: dict, values: dict) -> list[str]:
   return changed + ["threshold"] * ("threshold" in old and "threshold" not in values)
 
 
+def departure(old: dict, changed: list[str]) -> str:
+  """How the run whose config.json holds `old` differs, as the rest of a line that begins with its
+  folder; empty where it does not.
+
+  Args:
+    old: its config.json.
+    changed: see `differing`.
+  """
+  if changed == ["threshold"]:
+    return (
+      f"was begun when its detector {old.get('detector')} had another default threshold than today"
+    )
+  return f"was begun with another {', '.join(changed)}" if changed else ""
+
+
 def check_same(out: pathlib.Path, values: dict) -> None:
   """Refuses to resume with other settings than the run began with."""
   try:
@@ -117,13 +131,7 @@ def check_same(out: pathlib.Path, values: dict) -> None:
   except FileError as e:
     raise FileError(f"{e}; give --overwrite or another --out") from None
   changed = differing(old, values)
+  way = "give the same settings or --overwrite"
   if changed == ["threshold"]:
-    raise UserError(
-      f"--resume: {out} was begun when its detector {old.get('detector')} had another default "
-      "threshold than today; --overwrite begins anew"
-    )
-  if changed:
-    raise UserError(
-      f"--resume: {out} was begun with another {', '.join(changed)}; give the same settings or "
-      "--overwrite"
-    )
+    way = "--overwrite begins anew"
+  require(not changed, f"--resume: {out} {departure(old, changed)}; {way}")

@@ -9,12 +9,11 @@ was run. Tables that one piece lacks, as published ones lack their trace, are le
 were kept stay by arm and seed.
 """
 
-from __future__ import annotations
-
 import functools
+import itertools
 import pathlib
 import shutil
-from typing import TYPE_CHECKING
+from collections.abc import Iterable
 
 import numpy as np
 import pyarrow
@@ -22,19 +21,16 @@ import pyarrow
 from mjx_cl import envs
 from mjx_cl.adapt.arms import ARMS
 from mjx_cl.config import RunConfig
-from mjx_cl.errors import FileError, UserError
+from mjx_cl.errors import FileError, UserError, require
 from mjx_cl.io import folders as folder_lib
 from mjx_cl.io import tables as store
 from mjx_cl.render import figures
-from mjx_cl.runs import records
-from mjx_cl.runs.identity import arm_agents, differing, identity
-from mjx_cl.scoring import events
-from mjx_cl.scoring import stop_rule as stop
+from mjx_cl.runs import summary
+from mjx_cl.runs.identity import arm_agents, departure, differing, identity
+from mjx_cl.scoring import events, stop_rule
 from mjx_cl.training import agents
 
-if TYPE_CHECKING:
-  from collections.abc import Iterable
-
+# table -> what follows the stream
 ORDER = {
   "trace": "step",
   "events": "step",
@@ -43,17 +39,12 @@ ORDER = {
   "snapshots": "step",
   "stop": "since",
   "residuals": "step",
-}  # table -> what follows the stream
+}
 KEPT = ("git_commit", "machine", "python", "versions")
 SEEDS = ("seeds", "first_seed")  # settings that pieces do not share
-SAME = (
-  "physics",
-  "agent_card",
-  "arm_cards",
-  "repeat",
-  "control_s",
-)  # of config.json, beside the settings: one agent and one backend lived all the seeds
-
+# of config.json, beside the settings: one agent and one backend lived all the seeds
+SAME = ("physics", "agent_card", "arm_cards", "repeat", "control_s")
+# what `join` takes from summary.json
 SUMMED = (
   "env",
   "fault",
@@ -65,7 +56,7 @@ SUMMED = (
   "wall_s",
   "wall_s_arms",
   "wall_share",
-)  # what `join` takes from summary.json
+)
 
 
 def differs(folder: pathlib.Path | str, config: RunConfig, but: tuple[str, ...] = ()) -> str | None:
@@ -76,10 +67,12 @@ def differs(folder: pathlib.Path | str, config: RunConfig, but: tuple[str, ...] 
   far as today's can be read: a key that a card has gained since is no difference.
 
   Args:
+    folder: of the run.
+    config: to compare it with.
     but: settings that may differ.
 
   Raises:
-    FileError for a config.json or an agent that is broken.
+    FileError: for a config.json or an agent that is broken.
   """
   folder = pathlib.Path(folder)
   if not (folder / "config.json").exists():
@@ -90,20 +83,13 @@ def differs(folder: pathlib.Path | str, config: RunConfig, but: tuple[str, ...] 
     raise FileError(f"{e}; give another folder, or remove that one") from None
   values = {k: v for k, v in identity(config).items() if k not in ("physics", *but)}
   if "oracle_stops" in values:
-    values["oracle_stops"] = {
-      seed: stop
-      for seed, stop in values["oracle_stops"].items()
-      if int(seed) in _seeds(folder, old)
-    }
+    own = _seeds(folder, old)
+    values["oracle_stops"] = {k: v for k, v in values["oracle_stops"].items() if int(k) in own}
   changed = differing(old, values)
   for name, today in cards(config).items():
     if name in old and (keys := folder_lib.differing(today, old[name], deep=True)):
       changed.append(f"{name} ({', '.join(keys)})")
-  if changed == ["threshold"]:
-    return (
-      f"was begun when its detector {old.get('detector')} had another default threshold than today"
-    )
-  return f"was begun with another {', '.join(changed)}" if changed else None
+  return departure(old, changed) or None
 
 
 def cards(config: RunConfig) -> dict[str, dict]:
@@ -111,15 +97,12 @@ def cards(config: RunConfig) -> dict[str, dict]:
   as where it was moved.
 
   Raises:
-    FileError for a broken one.
+    FileError: for a broken one.
   """
   file = pathlib.Path(config.agent or "no agent by folder") / "card.json"
-  return _cards(
-    config.env,
-    config.agent,
-    tuple(arm for arm in config.arms if ARMS[arm].agent),
-    file.stat().st_mtime_ns if file.is_file() else None,
-  )
+  written = file.stat().st_mtime_ns if file.is_file() else None
+  arms = tuple(arm for arm in config.arms if ARMS[arm].agent)
+  return _cards(config.env, config.agent, arms, written)
 
 
 @functools.lru_cache(maxsize=64)
@@ -145,13 +128,14 @@ def seeds_of(folder: pathlib.Path | str, config: RunConfig) -> list[int] | None:
   no finished run.
 
   Raises:
-    UserError where it was run with other settings; FileError for a config.json that is not a run's.
+    UserError: where it was run with other settings.
+    FileError: for a config.json that is not a run's.
   """
   folder = pathlib.Path(folder)
   if not (folder / "config.json").exists() or not (folder / "summary.json").exists():
     return None
-  if text := differs(folder, config, SEEDS):
-    raise UserError(f"{folder} {text}; --overwrite of `mjx-cl run` begins it anew")
+  text = differs(folder, config, SEEDS)
+  require(not text, f"{folder} {text}; --overwrite of `mjx-cl run` begins it anew")
   return list(_seeds(folder, store.read_json(folder / "config.json")))
 
 
@@ -168,34 +152,30 @@ def choose(folders: Iterable[pathlib.Path | str], config: RunConfig) -> list[pat
   empty where none of them holds any.
 
   Raises:
-    UserError where one holds seeds that are not asked for, two hold the same seed, or one is in
+    UserError: where one holds seeds that are not asked for, two hold the same seed, or one is in
       none of them: the line names it.
   """
   wanted = range(config.first_seed, config.first_seed + config.seeds)
   found: dict[int, pathlib.Path] = {}
-  begins = {}
   for folder in map(pathlib.Path, folders):
-    own = seeds_of(folder, config)
-    if own is None:
-      continue
-    if not set(own) <= set(wanted):
-      raise UserError(
-        f"{folder} holds seeds {own[0]} to {own[-1]}, asked for are {wanted[0]} to "
-        f"{wanted[-1]}; give --first-seed and --seeds that hold them"
-      )
+    own = seeds_of(folder, config) or []
+    require(
+      set(own) <= set(wanted),
+      f"{folder} holds seeds {min(own, default='')} to {max(own, default='')}, asked for are "
+      f"{wanted[0]} to {wanted[-1]}; give --first-seed and --seeds that hold them",
+    )
     for seed in own:
       if seed in found:
         raise UserError(f"seed {seed} lies both in {found[seed]} and in {folder}; give one of them")
       found[seed] = folder
-    begins[folder] = own[0]
   missing = [seed for seed in wanted if seed not in found]
   if found and missing:
     raise UserError(
-      f"{', '.join(map(str, begins))}: no seed {', '.join(map(str, missing))}; run what is "
-      f"missing with --first-seed {missing[0]} --seeds N and "
-      "another --out, or ask for fewer --seeds"
+      f"{', '.join(map(str, dict.fromkeys(found.values())))}: no seed "
+      f"{', '.join(map(str, missing))}; run what is missing with --first-seed {missing[0]} "
+      "--seeds N and another --out, or ask for fewer --seeds"
     )
-  return sorted(begins, key=begins.get)  # type: ignore[arg-type]
+  return list(dict.fromkeys(found[seed] for seed in sorted(found)))
 
 
 def join(folders: Iterable[pathlib.Path], out: pathlib.Path | str, config: RunConfig) -> dict:
@@ -203,48 +183,67 @@ def join(folders: Iterable[pathlib.Path], out: pathlib.Path | str, config: RunCo
   value.
 
   Args:
-    folders: of finished runs, see `choose`. config: with the seeds of all of them.
+    folders: of finished runs, see `choose`.
+    out: folder of the joined run.
+    config: with the seeds of all of them.
 
   Raises:
-    UserError where pieces differ in their agent or physics; FileError for a piece that cannot be
-    read.
+    UserError: where pieces differ in their agent or physics.
+    FileError: for a piece that cannot be read.
   """
   folders, out = [pathlib.Path(f) for f in folders], pathlib.Path(out)
-  summaries, configs = [], []
-  for folder in folders:
-    summaries.append(store.read_json(folder / "summary.json"))
-    configs.append(store.read_json(folder / "config.json"))
-    lacks = [k for k in SUMMED if k not in summaries[-1]]
-    if lacks:
+  summaries = [store.read_json(folder / "summary.json") for folder in folders]
+  configs = [store.read_json(folder / "config.json") for folder in folders]
+  for folder, own in zip(folders, summaries):
+    if lacks := [k for k in SUMMED if k not in own]:
       raise FileError(f"{folder / 'summary.json'} is not a run's: it lacks {', '.join(lacks)}")
   first = {k: configs[0].get(k) for k in SAME}
-  differ = sorted({k for own in configs for k in folder_lib.differing(own, first)}, key=SAME.index)
-  if differ:
-    raise UserError(
-      f"{', '.join(map(str, folders))} are no pieces of one run: they differ in {', '.join(differ)}"
-    )
-  arms = list(config.arms)
-  number = {
-    (arm, config.first_seed + i): a * config.seeds + i
-    for a, arm in enumerate(arms)
-    for i in range(config.seeds)
-  }
+  differ = {k for own in configs for k in folder_lib.differing(own, first)}
+  require(
+    not differ,
+    f"{', '.join(map(str, folders))} are no pieces of one run: they differ in "
+    f"{', '.join(sorted(differ, key=SAME.index))}",
+  )
   out.mkdir(parents=True, exist_ok=True)
+  rows = _join_tables(folders, out, config)
+  value = _summary(summaries, configs, rows, config)
+  told = {seed: stop for own in configs for seed, stop in own.get("oracle_stops", {}).items()}
+  said = {"first_seed": config.first_seed, "seeds": config.seeds, "pieces": _pieces(configs)}
+  if told:
+    said["oracle_stops"] = told
+  store.write_json(out / "config.json", configs[0] | said)
+  for folder in folders:
+    copy_agents(folder, out)
+  if "trace" in rows:
+    figures.figure(out)
+  store.write_json(out / "summary.json", value)  # last: a folder with it is a finished run
+  return value
+
+
+def _join_tables(
+  folders: list[pathlib.Path], out: pathlib.Path, config: RunConfig
+) -> dict[str, pyarrow.Table]:
+  """Writes every table that all folders have, and returns them by name."""
+  seeds = range(config.first_seed, config.first_seed + config.seeds)
+  number = {at: k for k, at in enumerate(itertools.product(config.arms, seeds))}
   rows = {}
   for name, key in ORDER.items():
     files = [folder / f"{name}.parquet" for folder in folders]
-    if not all(file.exists() for file in files):
-      continue
-    read = events.read if name == "events" else store.read_arrow
-    tables = [read(file) for file in files]
-    table = joined(tables, number, key)
-    rows[name] = table
-    store.write_arrow(out / f"{name}.parquet", table)
+    if all(file.exists() for file in files):
+      read = events.read if name == "events" else store.read_arrow
+      rows[name] = joined([read(file) for file in files], number, key)
+      store.write_arrow(out / f"{name}.parquet", rows[name])
   if "runs" not in rows:
     raise FileError(f"no runs.parquet in one of {', '.join(map(str, folders))}")
-  runs = rows["runs"].to_pylist()
-  # what is a mean over control steps is weighted by streams; of seconds the sum counts, as if the
-  # pieces had been run one after another
+  return rows
+
+
+def _summary(
+  summaries: list[dict], configs: list[dict], rows: dict[str, pyarrow.Table], config: RunConfig
+) -> dict:
+  """summary.json of the joined run. What is a mean over control steps is weighted by streams; of
+  seconds the sum counts, as if the pieces had been run one after another.
+  """
   wall = [s["wall_s"] for s in summaries]
   mean = lambda values, weights: float(np.average(values, weights=weights))
   invalid = [
@@ -252,16 +251,14 @@ def join(folders: Iterable[pathlib.Path], out: pathlib.Path | str, config: RunCo
     for s, c in zip(summaries, configs)
     if s["invalid_share"] is not None
   ]
-  spec = envs.make(config.env).spec
-  value = {k: summaries[0][k] for k in SUMMED[:6]}
-  value |= records.by_arm(runs, config, spec.control_s)
   interval = None  # of streams, so it needs their trace
   if "trace" in rows:
-    interval = records.invalid(
-      rows["trace"]["valid"].to_numpy(zero_copy_only=False).reshape(len(number), -1).T,
-      int(configs[0]["repeat"]),
-    )[1]
-  value |= {
+    valid = rows["trace"]["valid"].to_numpy(zero_copy_only=False)
+    streams = len(config.arms) * config.seeds
+    interval = summary.invalid(valid.reshape(streams, -1).T, int(configs[0]["repeat"]))[1]
+  value = {
+    **{k: summaries[0][k] for k in SUMMED[:6]},
+    **summary.by_arm(rows["runs"].to_pylist(), config, envs.make(config.env).spec.control_s),
     "invalid_share": mean(*zip(*invalid)) if invalid else None,
     "invalid_share_ci": interval,
     "wall_s": float(sum(wall)),
@@ -275,31 +272,14 @@ def join(folders: Iterable[pathlib.Path], out: pathlib.Path | str, config: RunCo
   }
   if "stop" in rows:
     value["wall_s_snapshots"] = float(sum(s.get("wall_s_snapshots") or 0.0 for s in summaries))
-    value["stop_rule"] = stop.summarise(rows["stop"].to_pylist())
-  pieces = [
-    piece
-    for own in configs
-    for piece in own.get(
-      "pieces", [{k: own[k] for k in ("first_seed", "seeds", *KEPT) if k in own}]
-    )
-  ]
-  told = {seed: stop for own in configs for seed, stop in own.get("oracle_stops", {}).items()}
-  store.write_json(
-    out / "config.json",
-    configs[0]
-    | {
-      "first_seed": config.first_seed,
-      "seeds": config.seeds,
-      **({"oracle_stops": told} if told else {}),
-      "pieces": pieces,
-    },
-  )
-  for folder in folders:
-    copy_agents(folder, out)
-  if "trace" in rows:
-    figures.figure(out)
-  store.write_json(out / "summary.json", value)  # last: a folder with it is a finished run
+    value["stop_rule"] = stop_rule.summarise(rows["stop"].to_pylist())
   return value
+
+
+def _pieces(configs: list[dict]) -> list[dict]:
+  """When and on what each piece was run; those of a piece that was joined itself, one by one."""
+  own = lambda c: [{k: c[k] for k in ("first_seed", "seeds", *KEPT) if k in c}]
+  return [piece for c in configs for piece in c.get("pieces", own(c))]
 
 
 def copy_agents(folder: pathlib.Path, out: pathlib.Path) -> None:

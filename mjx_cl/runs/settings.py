@@ -1,12 +1,10 @@
 """Whether the settings of a whole run fit together: its fault, its robot, its arms."""
 
-from __future__ import annotations
-
 import dataclasses
 
 from mjx_cl.adapt.arms import ARMS, never_stops
 from mjx_cl.config import FOREVER, RunConfig
-from mjx_cl.errors import UserError, choose
+from mjx_cl.errors import UserError, choose, require
 from mjx_cl.faults import presets
 
 
@@ -15,15 +13,17 @@ def check(config: RunConfig) -> RunConfig:
   given.
 
   Raises:
-    UserError for an unknown preset, schedule or arm, a number out of range, or settings that
+    UserError: for an unknown preset, schedule or arm, a number out of range, or settings that
       exclude each other.
   """
   changes = presets.changes(config)
   moves = presets.becomes(config) is not None
   # a robot that becomes another one at an onset later than the last step never does
   last = FOREVER - 1 - max(c.after for c in changes) if moves else config.steps
-  if not 0 <= config.onset <= last:
-    raise UserError(f"onset must lie in 0..{'' if moves else 'steps='}{last}; got {config.onset}")
+  require(
+    0 <= config.onset <= last,
+    f"onset must lie in 0..{'' if moves else 'steps='}{last}; got {config.onset}",
+  )
   _check_arms(config, {c.after for c in changes} | {0} if moves else {c.after for c in changes})
   if config.severity is None and not presets.named(config.fault):
     return dataclasses.replace(config, severity=changes[0].severity)
@@ -36,22 +36,19 @@ def _check_arms(config: RunConfig, moments: set[int]) -> None:
   """
   for arm in config.arms:
     choose("arm", arm, ARMS)
-  if config.snapshots and not any(never_stops(ARMS[arm]) for arm in config.arms):
-    endless = ", ".join(name for name, arm in ARMS.items() if never_stops(arm))
-    raise UserError(
-      f"snapshots={config.snapshots} needs an arm that never stops by itself: {endless}"
-    )
+  endless = [name for name, arm in ARMS.items() if never_stops(arm)]
+  require(
+    not config.snapshots or set(endless) & set(config.arms),
+    f"snapshots={config.snapshots} needs an arm that never stops by itself: {', '.join(endless)}",
+  )
   told = [arm for arm in config.arms if ARMS[arm].end.told]
   if told and not config.stops:
     raise UserError(
       f"arm {told[0]!r} needs stops: the folder of a run of the same seeds with arm "
       "oracle-budget and snapshots, which finds their oracle stops"
     )
-  if config.stops and not told:
-    raise UserError(
-      f"stops={config.stops} needs an arm that ends there: "
-      f"{', '.join(name for name, arm in ARMS.items() if arm.end.told)}"
-    )
+  ends = ", ".join(name for name, arm in ARMS.items() if arm.end.told)
+  require(told or not config.stops, f"stops={config.stops} needs an arm that ends there: {ends}")
   if told and len(moments) > 1:
     raise UserError(
       f"arm {told[0]!r} takes a robot that changes once; {config.fault!r} changes it "

@@ -6,11 +6,10 @@ that it is what acted to the last bit. It lies in OUT/work until the run is over
 stream and step: a chunk that is lived again after a kill writes the same file again.
 """
 
-from __future__ import annotations
-
 import pathlib
 import time
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,22 +18,16 @@ import numpy as np
 from mjx_cl import faults as faults_lib
 from mjx_cl.adapt import decide as phase_lib
 from mjx_cl.adapt.arms import ARMS, never_stops
+from mjx_cl.adapt.loop import Digest
+from mjx_cl.config import RunConfig
 from mjx_cl.errors import FileError, UserError
+from mjx_cl.faults.presets import Change
 from mjx_cl.io import arrays, folders
 from mjx_cl.io.interrupt import Interruptible
 from mjx_cl.keys import OfSeed
-from mjx_cl.rollout.scan import Rollout, nest, start
+from mjx_cl.rollout.scan import Rollout, Stream, nest, start
+from mjx_cl.training import agents
 from mjx_cl.training.episodes import Episodes
-
-if TYPE_CHECKING:
-  from collections.abc import Callable
-  from typing import Any
-
-  from mjx_cl.adapt.loop import Digest
-  from mjx_cl.config import RunConfig
-  from mjx_cl.dreamer.agent import Agent
-  from mjx_cl.faults.presets import Change
-  from mjx_cl.rollout.scan import Stream
 
 ACTS = ("enc", "dyn", "pol")  # of the parameters: what Agent.act reads
 EPISODES = 5
@@ -45,8 +38,12 @@ LENGTH = 50  # decisions per call
 
 
 class Snapshot(NamedTuple):
-  """stream, since: control step at which its adaptation started, step: last control step before it
-  was taken.
+  """One snapshot.
+
+  Attributes:
+    stream: its number.
+    since: control step at which its adaptation started.
+    step: last control step before it was taken.
   """
 
   stream: int
@@ -68,9 +65,12 @@ def due(
     stream adapted in the chunk
 
   Args:
-    before: int (groups,), phase before the chunk. decision, since: int (groups,), of its end, see
-      phase.PhaseState. now: control steps done after it.
-    length: control steps of a chunk. every: control steps between two snapshots.
+    before: int (groups,), phase before the chunk.
+    decision: int (groups,), of its end, see decide.PhaseState.
+    since: int (groups,), likewise.
+    now: control steps done after it.
+    length: control steps of a chunk.
+    every: control steps between two snapshots.
 
   Returns:
     bool (groups,). The first one, at since itself, holds the weights that adaptation began with.
@@ -84,48 +84,40 @@ class Snapshots:
   """Snapshots of one run: taken chunk by chunk, evaluated when it is over.
 
   Args:
-    config: RunConfig. env, agent, faults, changes: the robot as it is once it has changed, and what
-      happens to it.
-    repeat: control steps per decision. labels: (arm, seed) of each stream. params: of the agent,
-      for their shapes.
-    folder: where they lie; made when the first is taken.
+    config: of the run.
+    env: the robot as it is once it has changed.
+    trained: its agent.
+    faults: of the robot.
+    changes: what happens to it.
+    labels: (arm, seed) of each stream.
+    folder: where the snapshots lie; made when the first is taken.
 
   Raises:
-    UserError where the run would take more than LIMIT_MIB of them.
+    UserError: where the run would take more than LIMIT_MIB of them.
   """
 
   def __init__(
     self,
     config: RunConfig,
     env: Any,
-    agent: Agent,
+    trained: agents.Trained,
     faults: tuple[faults_lib.Fault, ...],
     changes: tuple[Change, ...],
-    repeat: int,
     labels: list[tuple[str, int]],
-    params: Any,
-    folder: pathlib.Path | str,
+    folder: pathlib.Path,
   ) -> None:
-    self.config, self.env, self.agent, self.faults, self.changes, self.repeat = (
-      config,
-      env,
-      agent,
-      faults,
-      changes,
-      repeat,
-    )
-    self.labels, self.folder = labels, pathlib.Path(folder)
+    self.config, self.changes, self.labels, self.folder = config, changes, labels, folder
+    self.repeat = int(trained.card.get("repeat", 1))
+    self.setting = (env, trained.agent, faults)
     self.kept = np.array([never_stops(ARMS[arm]) for arm, _ in labels])
-    self.like = jax.tree.map(
-      lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), {k: params[k] for k in ACTS}
-    )
+    acts = {k: trained.train.params[k] for k in ACTS}
+    self.like = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), acts)
     self.bytes = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(self.like))
     streams, span = int(self.kept.sum()), max(0, config.steps - config.onset)
     need = streams * (span // config.snapshots + 1 + len(changes)) * self.bytes
     if need > LIMIT_MIB * 2**20:
-      fit = (
-        LIMIT_MIB * 2**20 // (self.bytes * streams) - 1 - len(changes)
-      )  # of one stream, besides the first of each adaptation
+      # of one stream, besides the first of each adaptation
+      fit = LIMIT_MIB * 2**20 // (self.bytes * streams) - 1 - len(changes)
       more = f"snapshots={span // (fit + 1) + 1} would fit" if fit >= 0 else "take fewer seeds"
       raise UserError(
         f"snapshots={config.snapshots} would take up to {need / 2**20:,.0f} MiB on the disk, "
@@ -138,26 +130,36 @@ class Snapshots:
     self,
     acting: Any,
     place: np.ndarray,
-    before: np.ndarray | jax.Array,
+    before: np.ndarray,
     digest: Digest,
     now: int,
     length: int,
   ) -> None:
-    """Writes the snapshots that are due. acting: parameters, those of stream g at place[g]; digest:
-    loop.Digest; the rest as in `due`.
+    """Writes the snapshots that are due.
+
+    Args:
+      acting: parameters, those of stream g at place[g].
+      place: int (groups,).
+      before: as in `due`.
+      digest: of the chunk.
+      now: as in `due`.
+      length: as in `due`.
     """
-    wanted = np.flatnonzero(
-      due(before, digest.decision, digest.since, now, length, self.config.snapshots) & self.kept
-    )
-    if not len(wanted):
+    wanted = self._due(before, digest.decision, digest.since, now, length)
+    if not wanted:
       return
-    weights = arrays.named({k: acting[k] for k in ACTS})
+    weights: dict[str, Any] = arrays.named({k: acting[k] for k in ACTS})
     weights = {name: np.asarray(leaf) for name, leaf in weights.items()}
-    for g in wanted:
-      self._write(
-        self._path(Snapshot(int(g), int(digest.since[g]), min(now, self.config.steps) - 1)),
-        {name: x[place[g]] for name, x in weights.items()},  # type: ignore[index]
-      )
+    for s in wanted:
+      self._write(self._path(s), {name: x[place[s.stream]] for name, x in weights.items()})
+
+  def _due(
+    self, before: np.ndarray, decision: Any, since: Any, now: int, length: int
+  ) -> list[Snapshot]:
+    """What is to be taken after a chunk; arguments as of `due`."""
+    hit = due(before, decision, since, now, length, self.config.snapshots) & self.kept
+    last = min(now, self.config.steps) - 1
+    return [Snapshot(int(g), int(since[g]), last) for g in np.flatnonzero(hit)]
 
   def _path(self, s: Snapshot) -> pathlib.Path:
     return self.folder / f"{s.stream:04d}-{s.step:09d}.npz"
@@ -168,8 +170,9 @@ class Snapshots:
 
   def _read(self, s: Snapshot) -> Any:
     path = self._path(s)
-    stored, like = arrays.read(path), arrays.named(self.like)
-    if {k: x.shape for k, x in stored.items()} != {k: x.shape for k, x in like.items()}:  # type: ignore[attr-defined]
+    like: dict[str, Any] = arrays.named(self.like)
+    stored = arrays.read(path)
+    if {k: x.shape for k, x in stored.items()} != {k: x.shape for k, x in like.items()}:
       raise FileError(f"snapshot {path} belongs to another size or robot")
     return jax.tree.unflatten(jax.tree.structure(self.like), [stored[k] for k in like])
 
@@ -177,24 +180,8 @@ class Snapshots:
     """All snapshots of a run, from its trace: `phase` (steps, groups), `decision`, `since` (chunks,
     groups); no other file counts.
     """
-    out = []
-    for c, (decision, since) in enumerate(zip(trace["decision"], trace["since"])):
-      hit = (
-        due(
-          trace["phase"][c * length],
-          decision,
-          since,
-          (c + 1) * length,
-          length,
-          self.config.snapshots,
-        )
-        & self.kept
-      )
-      out += [
-        Snapshot(int(g), int(since[g]), min((c + 1) * length, self.config.steps) - 1)
-        for g in np.flatnonzero(hit)
-      ]
-    return sorted(out)
+    chunks = enumerate(zip(trace["phase"][::length], trace["decision"], trace["since"]), 1)
+    return sorted(taken for k, at in chunks for taken in self._due(*at, k * length, length))
 
   # ---- when it is over ---------------------------------------------------------------------------
 
@@ -220,6 +207,7 @@ class Snapshots:
     beside the snapshots, so that what was cut off goes on with the next one.
 
     Args:
+      wanted: see `taken`.
       targets: int (groups, F), of each stream's faults.
       tell: called with a line after each batch.
 
@@ -231,9 +219,8 @@ class Snapshots:
     with Interruptible() as interrupt:
       for first in range(0, len(wanted), size):
         batch = wanted[first : first + size]
-        path, part = self.folder / f"scores-{first:06d}.npz", None
-        if path.exists():
-          part = arrays.read(path)
+        path = self.folder / f"scores-{first:06d}.npz"
+        part = arrays.read(path) if path.exists() else None
         if part is None or part["of"].tolist() != [list(s) for s in batch]:
           begin = time.perf_counter()
           program = program or self._program()
@@ -270,11 +257,10 @@ class Snapshots:
 
   def _program(self) -> tuple[Callable[..., Stream], Rollout]:
     begin = lambda key, target, severity: start(
-      self.env, self.agent, self.faults, key, target=target, plan=faults_lib.plan(severity)
+      *self.setting, key, target=target, plan=faults_lib.plan(severity)
     )
-    return jax.jit(nest(begin, (0, 0, 0), (0, None, None))), Rollout(
-      self.env, self.agent, self.faults, self.repeat, self.config.deterministic
-    )
+    rollout = Rollout(*self.setting, self.repeat, self.config.deterministic)
+    return jax.jit(nest(begin, (0, 0, 0), (0, None, None))), rollout
 
   def _live(
     self,

@@ -6,8 +6,6 @@ part; OUT/suite.json says what the part is. A worker saves and ends when its sta
 so that none outlives its parent.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import pathlib
@@ -16,10 +14,11 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from typing import Any
 
 import jax
 
-from mjx_cl.errors import FileError, UserError
+from mjx_cl.errors import FileError, UserError, require
 from mjx_cl.io.interrupt import Interruptible
 from mjx_cl.io.runtime import cores
 
@@ -32,8 +31,8 @@ def number(asked: int | None, needs: list[int], space: int) -> int:
     asked: the user's number, None: as many as that.
 
   Raises:
-    UserError where the user's number is below 1, above the cores, or does not fit. On an
-    accelerator, which each process would take whole, it is 1.
+    UserError: where the user's number is below 1, above the cores, or does not fit. On an
+      accelerator, which each process would take whole, it is 1.
   """
   limit, fits = len(cores()) if jax.default_backend() == "cpu" else 1, 0
   for need in sorted(needs, reverse=True):
@@ -41,13 +40,13 @@ def number(asked: int | None, needs: list[int], space: int) -> int:
     fits += space >= 0
   if asked is None:
     return max(1, min(limit, fits))
-  if not 1 <= asked <= limit:
-    raise UserError(f"--jobs must lie in 1..{limit} on this machine; got {asked}")
-  if min(asked, len(needs)) > max(1, fits):
-    raise UserError(
-      f"{asked} parts side by side do not fit into memory, {max(1, fits)} would; give --jobs "
-      f"{max(1, fits)} or fewer --seeds"
-    )
+  require(1 <= asked <= limit, f"--jobs must lie in 1..{limit} on this machine; got {asked}")
+  fits = max(1, fits)
+  require(
+    min(asked, len(needs)) <= fits,
+    f"{asked} parts side by side do not fit into memory, {fits} would; give --jobs {fits} or fewer "
+    "--seeds",
+  )
   return asked
 
 
@@ -72,7 +71,7 @@ class Worker:
     self.name, self.share, self.last = name, share, ""
     command = [sys.executable, "-m", module, str(out), name, ",".join(map(str, own))]
     # a session of its own: Ctrl-C reaches the parent alone, which then closes the input
-    self.process = subprocess.Popen(
+    self.process: Any = subprocess.Popen(
       command,
       stdin=subprocess.PIPE,
       stdout=subprocess.DEVNULL,
@@ -83,7 +82,7 @@ class Worker:
     )
 
     def listen() -> None:
-      for line in self.process.stderr:  # type: ignore[union-attr]
+      for line in self.process.stderr:
         if line.strip():
           self.last = line.strip()
           # where nobody listens any more a full pipe would stop the worker
@@ -97,13 +96,14 @@ class Worker:
     """Whether the part is finished.
 
     Raises:
-      UserError, FileError with what the worker said last, where it failed.
+      UserError: with what the worker said last, where it failed over settings.
+      FileError: likewise, over files, or where it was ended.
     """
     code = self.process.poll()
     if code is None:
       return False
     self.listener.join()
-    self.process.stdin.close()  # type: ignore[union-attr]
+    self.process.stdin.close()
     if code < 0:
       raise FileError(
         f"part {self.name} was ended by signal {-code}; where memory ran out, --jobs 1 needs "
@@ -137,14 +137,13 @@ def together(
     tell: called with each line that a part says.
 
   Raises:
-    UserError, FileError as soon as one fails; KeyboardInterrupt on a signal. Before either is
-    raised the others have saved what they had lived and ended.
+    UserError: as soon as one fails over settings. Before any of these is raised the others have
+      saved what they had lived and ended.
+    FileError: as soon as one fails otherwise.
+    KeyboardInterrupt: on a signal.
   """
-  waiting: list[str]
-  running: list[Worker]
-  out, waiting, running = pathlib.Path(out), list(names), []
-  all_cores = cores()
-  free = list(range(jobs))
+  waiting, free, all_cores = list(names), list(range(jobs)), cores()
+  running: list[Worker] = []
   try:
     with Interruptible() as stop:
       while waiting or running:
@@ -153,7 +152,9 @@ def together(
         free += [worker.share for worker in over]
         while waiting and free:
           share = free.pop(0)
-          running.append(Worker(module, out, waiting.pop(0), share, all_cores[share::jobs], tell))
+          running.append(
+            Worker(module, pathlib.Path(out), waiting.pop(0), share, all_cores[share::jobs], tell)
+          )
         for worker in over:
           finished(worker.name)
         stop.check()
@@ -161,6 +162,6 @@ def together(
   finally:
     running = [worker for worker in running if worker.process.poll() is None]
     for worker in running:  # all at once, then wait for all
-      worker.process.stdin.close()  # type: ignore[union-attr]
+      worker.process.stdin.close()
     for worker in running:
       worker.process.wait()

@@ -22,7 +22,8 @@ from test_run import saved  # noqa: F401  a fixture
 import mjx_cl
 from mjx_cl import detectors, envs, faults
 from mjx_cl.adapt.arms import ARMS
-from mjx_cl.cli import app, commands, display
+from mjx_cl.cli import app, results
+from mjx_cl.cli import tables as shown
 from mjx_cl.config import PRESETS, RunConfig
 from mjx_cl.errors import FileError
 from mjx_cl.faults import presets
@@ -147,6 +148,10 @@ def test_help_names_every_command(mjx):
   )
 
 
+def test_no_command_is_answered_by_the_help(mjx):
+  assert mjx() == (2, mjx("--help")[1], "")
+
+
 def test_version(capsys):
   with pytest.raises(SystemExit) as end:
     app.main(["--version"])
@@ -178,7 +183,8 @@ def test_list(mjx):
   assert all(name in text for table in tables.values() for name in table)
 
 
-def test_a_run_is_shown_as_a_table_with_intervals(capsys):
+def test_a_run_is_shown_as_a_table_with_intervals(capsys, monkeypatch):
+  monkeypatch.setenv("COLUMNS", "200")
   arm = {"seeds": 4, "affected": 4, "alarms": 4, "false_alarm_streams": 0, "converged": 3}
   arm |= {
     "aborted_by_rule": 1,
@@ -190,7 +196,7 @@ def test_a_run_is_shown_as_a_table_with_intervals(capsys):
   arm |= {"reward_final": 0.88, "reward_final_ci": [0.85, 0.92]}
   summary = {"env": "walker", "fault": "gear", "severity": 0.5, "onset": 4000, "steps": 13_000}
   summary |= {"detector": "cusum", "wall_s": 65.0, "wall_share": {"physics": 1.0}}
-  display.show_summary(summary | {"arms": {"detector": arm}}, "runs/x")
+  shown.show_summary(summary | {"arms": {"detector": arm}}, "runs/x")
   out = capsys.readouterr().out
   assert "walker, gear 0.5 at step 4,000 of 13,000, detector cusum; 1:05 wall" in out
   row, below = (
@@ -204,6 +210,22 @@ def test_a_run_is_shown_as_a_table_with_intervals(capsys):
   ]
   assert [cell for cell in below if cell] == ["[269, 537]", "[1.2, 3.82]", "[0.85, 0.92]"]
   assert "[steps]" in out and out.endswith("files in runs/x\n")
+
+
+@pytest.mark.parametrize("columns", [60, 80, 100, 200])
+def test_a_runs_table_keeps_to_the_terminal(capsys, monkeypatch, columns):
+  """What does not fit is named and lies in summary.json; an interval may have no upper end."""
+  monkeypatch.setenv("COLUMNS", str(columns))
+  summary = store.read_json(pathlib.Path(__file__).parents[2] / "results/walker_gear/summary.json")
+  arm = summary["arms"]["detector"]
+  arm |= {"latency_median_steps": 50.0, "latency_median_steps_ci": [20.0, None]}
+  shown.show_summary(summary, "runs/x")
+  first, *lines = capsys.readouterr().out.splitlines()
+  assert max(len(line) for line in lines if set(line) & set("│┃━─")) <= columns
+  text = "\n".join(lines)
+  assert all(name in text for name in ("detector", "none", "50", "[20, -]", "at last"))
+  assert ("not shown" in text) == (columns < 200)
+  assert "files in runs/x" in text
 
 
 def test_doctor(mjx):
@@ -260,7 +282,7 @@ def test_query(mjx, refused, tmp_path):
 
 
 def test_report_elsewhere_than_in_a_checkout_is_one_line(refused, tmp_path, monkeypatch):
-  monkeypatch.setattr(commands, "__file__", str(tmp_path / "mjx_cl" / "cli" / "commands.py"))
+  monkeypatch.setattr(results, "__file__", str(tmp_path / "mjx_cl" / "cli" / "results.py"))
   assert "checkout" in refused(2, "report", "--check")
 
 
@@ -312,7 +334,6 @@ RUN = {
 }
 OTHER = {
   "command": (["rnu"], ["rnu"]),
-  "no command": ([], ["run"]),
   "train: environment": (["train", "wlker"], ["wlker", "walker"]),
   "train: preset": (["train", "walker", "--preset", "huge"], ["huge", "cpu, paper, tiny"]),
   "train: setting": (["train", "walker", "--set", "lerning=3"], ["lerning", "lr"]),
@@ -634,7 +655,7 @@ def test_a_second_interrupt_ends_the_process_without_its_threads(tmp_path):
   """
   code = """
 import sys, threading, time, os, signal
-from mjx_cl.cli import app as cli, commands
+from mjx_cl.cli import app as cli
 from mjx_cl.io.interrupt import Interruptible
 def slow():
   time.sleep(300)

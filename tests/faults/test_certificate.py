@@ -16,7 +16,7 @@ from mjx_cl.errors import FileError, UserError
 from mjx_cl.faults import certificate, presets
 from mjx_cl.faults.certificate import Lane
 from mjx_cl.io import tables
-from mjx_cl.runs import certify
+from mjx_cl.runs import certificate_tables, certify
 
 LACKING = {  # what each robot cannot have, with the reason in the fault's own message
   "walker": {"velocity_limit": "task.velocity_limit", "lidar_loss": "lidar", "gap": "reality gap"},
@@ -228,7 +228,7 @@ def test_divergence_of_two_normals_against_the_closed_form():
 @pytest.mark.slow
 def test_certify_command_measures_the_cost(tmp_path):
   rows = certify.certify("walker", "native", episodes=3, only=("gear",))
-  certify.write(tmp_path, rows)
+  certificate_tables.write(tmp_path, rows)
   top = next(r for r in rows if r["fault"] == "gear" and r["severity"] == 1 and r["episodes"])
   assert (
     top["return_lost"] > 100
@@ -250,16 +250,16 @@ def test_files_keep_the_rows_of_other_robots(tmp_path, short):
     "return_lost_high": None,
     "kl_nats": None,
   }
-  assert set(extra) | set(certificate.Certificate._fields) == set(certify.COLUMNS)
+  assert set(extra) | set(certificate.Certificate._fields) == set(certificate_tables.COLUMNS)
   rows = [
     c._asdict() | extra
     for c in certificate.certify(
       short, have, onset=20, steps=140, sizes=(1.0,), severities=(0.0, 1.0)
     )
   ]
-  certify.write(tmp_path, [r | {"robot": "other"} for r in rows])
-  certify.write(tmp_path, rows)
-  certify.write(tmp_path, rows)
+  certificate_tables.write(tmp_path, [r | {"robot": "other"} for r in rows])
+  certificate_tables.write(tmp_path, rows)
+  certificate_tables.write(tmp_path, rows)
   import pyarrow.parquet
 
   kept = pyarrow.parquet.read_table(tmp_path / "certificates.parquet").to_pylist()
@@ -269,16 +269,16 @@ def test_files_keep_the_rows_of_other_robots(tmp_path, short):
     == [r["robot"] for r in kept].count("other")
   )
   with pytest.raises(UserError, match="measured costs of other"):
-    certify.write(
+    certificate_tables.write(
       tmp_path, [r | {"robot": "other", "episodes": 3, "return_nominal": 9.0} for r in rows]
     )
-    certify.guard(tmp_path, ("other",), 0)
-  certify.guard(tmp_path, ("other",), 2)
+    certificate_tables.guard(tmp_path, ("other",), 0)
+  certificate_tables.guard(tmp_path, ("other",), 2)
   text = (tmp_path / "certificates.md").read_text()
   assert "## car" in text and "## other" in text and "| sensor | noise | lidar | 1 |" in text
-  assert all(row["holds"] for row in certify.summary(rows) if row["goal"])
-  json.dumps(certify.summary(rows))
-  both = certify.table(
+  assert all(row["holds"] for row in certificate_tables.summary(rows) if row["goal"])
+  json.dumps(certificate_tables.summary(rows))
+  both = certificate_tables.table(
     [r | {"kl_nats": 1.0} for r in rows] + [r | {"physics": "mjx", "kl_nats": 7.0} for r in rows]
   )
   one, other = both.split("## car, physics ")[1:]
@@ -290,10 +290,10 @@ def test_files_keep_the_rows_of_other_robots(tmp_path, short):
 def test_what_is_in_the_way_is_said_before_anything_is_measured(tmp_path):
   (tmp_path / "file").write_text("x")
   with pytest.raises(FileError, match="cannot write in"):
-    certify.guard(tmp_path / "file", ("walker",), 20)
+    certificate_tables.guard(tmp_path / "file", ("walker",), 20)
   (tmp_path / "certificates.parquet").write_text("no table")
   with pytest.raises(FileError, match="is no table of certificates"):
-    certify.guard(tmp_path, ("walker",), 20)
+    certificate_tables.guard(tmp_path, ("walker",), 20)
   with pytest.raises(UserError, match="no agent 'nobody'"):
     certify.certify("car", episodes=1, agent="nobody")
   with pytest.raises(UserError, match="'none' changes nothing"):

@@ -263,22 +263,22 @@ def test_json_is_one_value_whatever_a_detector_prints(tmp_path, capsys):
 
 def test_what_a_run_takes_with_a_doubt_and_what_it_refuses(capsys, tmp_path):
   from mjx_cl.config import AdaptConfig, RunConfig, replace
-  from mjx_cl.runs import run
+  from mjx_cl.runs import doubts
 
   config = lambda **adapt: RunConfig(
     "walker", onset=600, steps=1500, adapt=replace(AdaptConfig(), **adapt)
   )
-  assert "onset 600 lies within adapt.warmup=1,000" in run.doubts(config())[0] and not run.doubts(
-    config(warmup=500)
-  )
-  assert "the run ends at step 1,500, within" in run.doubts(config(warmup=5000))[0]
-  assert not run.doubts(replace(config(), arms=("none",)))  # nobody listens
-  assert "before its fault at 1,500" in run.doubts(replace(config(), onset=1500))[
+  assert "onset 600 lies within adapt.warmup=1,000" in doubts.doubts(config())[
     0
-  ] and not run.doubts(replace(config(), onset=1500, fault="none"))
+  ] and not doubts.doubts(config(warmup=500))
+  assert "the run ends at step 1,500, within" in doubts.doubts(config(warmup=5000))[0]
+  assert not doubts.doubts(replace(config(), arms=("none",)))  # nobody listens
+  assert "before its fault at 1,500" in doubts.doubts(replace(config(), onset=1500))[
+    0
+  ] and not doubts.doubts(replace(config(), onset=1500, fault="none"))
   assert (
     "adapt.budget=3,000 ends every finetuning before"
-    in run.doubts(replace(config(warmup=500, budget=3000)))[0]
+    in doubts.doubts(replace(config(warmup=500, budget=3000)))[0]
   )
   for argv, words in (
     (("--adapt.warmup", "-1"), "warmup must be a whole number in 0"),
@@ -392,7 +392,7 @@ def test_a_detector_in_the_loop_has_the_boards_threshold(tmp_path, monkeypatch):
 )
 def test_what_a_detector_runs_with_is_said(robot, detector, change, text, tmp_path):
   from mjx_cl.config import RunConfig
-  from mjx_cl.runs import run
+  from mjx_cl.runs import doubts
 
   if detector.endswith("FILE"):
     (tmp_path / "rolling_sigma_mine.py").write_text(
@@ -400,7 +400,7 @@ def test_what_a_detector_runs_with_is_said(robot, detector, change, text, tmp_pa
       "cusum(threshold=threshold)\n"
     )
     detector = f"{tmp_path}/rolling_sigma_mine.py:mine"
-  said = run.watching(RunConfig(robot, fault="noise", detector=detector, **change))
+  said = doubts.watching(RunConfig(robot, fault="noise", detector=detector, **change))
   assert said is None if text is None else text in said
 
 
@@ -506,7 +506,7 @@ def test_robot_and_fault_of_a_file(tmp_path, capsys, tiny):
   from mjx_cl.config import RunConfig
   from mjx_cl.faults.presets import changes
   from mjx_cl.io import tables
-  from mjx_cl.runs import certify, run, settings
+  from mjx_cl.runs import certify, identity, run, settings
   from mjx_cl.training import agents
 
   (tmp_path / "mine.py").write_text(PLUG + "class Bare: pass\nrepr = repr\n")
@@ -565,14 +565,14 @@ def test_robot_and_fault_of_a_file(tmp_path, capsys, tiny):
   )
   (tmp_path / "run").mkdir(exist_ok=True)
   tables.write_json(tmp_path / "run" / "config.json", held)
-  unresolved = lambda: {k: v for k, v in run.identity(config).items() if k != "physics"}
-  run.check_same(tmp_path / "run", unresolved())
+  unresolved = lambda: {k: v for k, v in identity.identity(config).items() if k != "physics"}
+  identity.check_same(tmp_path / "run", unresolved())
   (tmp_path / "mine.py").write_text(PLUG + "class Bare: pass\nrepr = repr  # another one\n")
   with pytest.raises(
     UserError, match="another files"
   ):  # what the path holds now is not what the run began with
-    run.check_same(tmp_path / "run", unresolved())
-  assert "files" not in run.identity(RunConfig("walker"))
+    identity.check_same(tmp_path / "run", unresolved())
+  assert "files" not in identity.identity(RunConfig("walker"))
 
   for argv, words in (
     (("eval", f"{tmp_path}/mine.py:Nobody"), "nothing of the name 'Nobody'"),
@@ -614,7 +614,7 @@ def test_a_file_robot_that_is_a_shipped_one_by_another_path(tmp_path, capsys):
 
   from mjx_cl.io import tables
   from mjx_cl.leaderboard import record
-  from mjx_cl.runs import certify
+  from mjx_cl.runs import certificate_tables
   from mjx_cl.training import agents
 
   (tmp_path / "mine.py").write_text(
@@ -631,12 +631,15 @@ def test_a_file_robot_that_is_a_shipped_one_by_another_path(tmp_path, capsys):
     agents.of(heir)
   tables.write_table(
     tmp_path / "certificates.parquet",
-    {k: ["walker" if k == "robot" else 20 if k == "episodes" else None] for k in certify.COLUMNS},
+    {
+      k: ["walker" if k == "robot" else 20 if k == "episodes" else None]
+      for k in certificate_tables.COLUMNS
+    },
   )
   for name in ("walker", f"{tmp_path}/mine.py:Mine"):
     with pytest.raises(UserError, match="holds measured costs of walker"):
-      certify.guard(tmp_path, (name,), 0)
-    certify.guard(tmp_path, (name,), 20)
+      certificate_tables.guard(tmp_path, (name,), 0)
+    certificate_tables.guard(tmp_path, (name,), 20)
   name = f"{tmp_path}/mine.py:Mine"
   with pytest.raises(UserError, match="register it"):
     record.prepare(types.SimpleNamespace(name="s", robots={name: {}}), (), "auto", None)

@@ -16,7 +16,7 @@ from PIL import Image, ImageSequence
 from test_cli import mjx, refused  # noqa: F401  fixtures
 
 from mjx_cl import envs
-from mjx_cl.cli import app, commands
+from mjx_cl.cli import app, robots
 from mjx_cl.envs import adapters
 from mjx_cl.envs.course import Course
 from mjx_cl.errors import FileError, UserError
@@ -452,7 +452,7 @@ def test_the_shipped_agent_acts_by_default(monkeypatch, tmp_path):
     ),
   )
   monkeypatch.chdir(tmp_path)
-  commands.do_render(app.Render("walker", duration=7))
+  robots.do_render(app.Render("walker", duration=7))
   assert (
     type(taken["agent"]).__name__ == "Agent"
     and taken["params"]
@@ -460,7 +460,7 @@ def test_the_shipped_agent_acts_by_default(monkeypatch, tmp_path):
     and taken["duration"] == 7
     and taken["out"] == "walker.gif"
   )
-  commands.do_render(app.Render("walker", agent="none"))
+  robots.do_render(app.Render("walker", agent="none"))
   assert taken["agent"].spread == 0
 
 

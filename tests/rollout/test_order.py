@@ -70,7 +70,7 @@ def test_arms_live_the_same_life(tmp_path):
     runner.step()
   by_arm = lambda x: np.asarray(x).reshape((3, seeds) + x.shape[1:])
   carry = jax.tree.map(by_arm, runner.state.streams.agent._asdict())
-  trace = {k: np.asarray(v) for k, v in runner._trace().items() if k in ("reward", "opr", "rpr")}
+  trace = {k: np.asarray(v) for k, v in runner.trace().items() if k in ("reward", "opr", "rpr")}
   carry |= {k: by_arm(v.T) for k, v in trace.items()}
   assert all(np.isfinite(carry[k][:, :, 20:]).mean() > 0.8 for k in trace)
   assert len(np.unique(carry["reward"][0, :, -1])) == seeds

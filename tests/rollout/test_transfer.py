@@ -13,7 +13,7 @@ import pyarrow.parquet
 import pytest
 
 from mjx_cl import envs, faults
-from mjx_cl.config import PRESETS, AdaptConfig, RunConfig
+from mjx_cl.config import CHUNK, PRESETS, AdaptConfig, RunConfig
 from mjx_cl.dreamer.agent import Agent
 from mjx_cl.envs.car import Car
 from mjx_cl.envs.car_real import CarReal
@@ -581,7 +581,7 @@ def test_the_task_is_accepted_by_the_level_of_the_robot_that_there_is(whole):
   at = np.asarray([entered(trace, g) for g in range(4)])
   for i, level in enumerate(levels):
     np.testing.assert_array_equal(
-      level, np.where(at < (i + 1) * run.CHUNK, -1e9, 1e9).astype(np.float32)
+      level, np.where(at < (i + 1) * CHUNK, -1e9, 1e9).astype(np.float32)
     )
   stops = [(g, s) for g in (0, 1) for s, _ in events_of(out, g, "stop")]
   assert stops and all(s >= at[g] for g, s in stops)
@@ -606,8 +606,8 @@ def test_a_run_killed_before_during_and_after_the_change_ends_in_the_same_files(
   out = tmp_path / "cut"
   trace = by_stream(whole[0])
   at = sorted(entered(trace, g) for g in range(4))
-  during = at[0] // run.CHUNK + 1  # chunks after which the first stream has moved
-  cuts, what = [1, during, STEPS // run.CHUNK - 1], []
+  during = at[0] // CHUNK + 1  # chunks after which the first stream has moved
+  cuts, what = [1, during, STEPS // CHUNK - 1], []
   values = None
   for cut in cuts + [None]:
     runner = run.Runner(asked(saved), out)
@@ -625,11 +625,11 @@ def test_a_run_killed_before_during_and_after_the_change_ends_in_the_same_files(
       runner.checkpoints.close()
       what.append(
         [
-          int(x) < runner.done_chunks * run.CHUNK
+          int(x) < runner.done_chunks * CHUNK
           for x in np.asarray(runner.state.streams.after.enter)[:, 0]
         ]
       )
-  runner.finish()
+  run.finish(runner)
   assert not any(what[0]) and any(what[1]) and all(what[2])
   for name in ("trace", "events", "runs"):
     a, b = table(out, name), table(whole[0], name)

@@ -16,8 +16,8 @@ from test_cli import mjx, refused  # noqa: F401  fixtures
 from mjx_cl.config import RunConfig
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.io import tables
-from mjx_cl.runs import merge, records
-from mjx_cl.runs import suite as bench
+from mjx_cl.runs import bench, costs, merge, records, summary
+from mjx_cl.runs import suite as suites
 from mjx_cl.training import agents
 
 RESULTS = pathlib.Path(__file__).parents[2] / "results"
@@ -30,10 +30,10 @@ RUNS = {
 
 
 def part_of(suite, name, seeds=None):
-  known = suite in bench.shipped()
-  (part,) = bench.pick(
+  known = suite in suites.shipped()
+  (part,) = suites.pick(
     (
-      bench.suite(suite) if known else bench._published(RESULTS / suite, suite.replace("_", "-"))
+      suites.suite(suite) if known else bench._published(RESULTS / suite, suite.replace("_", "-"))
     ).parts,
     (name,),
   )
@@ -107,9 +107,10 @@ def test_what_is_taken_apart_and_joined_is_what_it_was(tmp_path, suite, name, mo
   assert merge.choose(folders[::-1], part.config) == folders  # in the order of their seeds
   value = merge.join(folders, tmp_path / "all", part.config)
   today = shutil.copytree(folder, tmp_path / "today")
-  summary = records.rescore(today) | {
-    "invalid_share_ci": None
-  }  # what is published may be older than a definition, and has no trace
+  rows = records.set_apart(*(tables.read_rows(today / f"{k}.parquet") for k in ("runs", "events")))
+  # what is published may be older than a definition, and has no trace
+  wanted = tables.read_json(today / "summary.json") | {"invalid_share_ci": None}
+  wanted |= summary.by_arm(rows, part.config, whole["control_s"])
   for file in today.glob("*.parquet"):
     want, got = (
       pyarrow.parquet.read_table(file),
@@ -123,14 +124,14 @@ def test_what_is_taken_apart_and_joined_is_what_it_was(tmp_path, suite, name, mo
         for t in (got, want)
       )
     assert got.to_pylist() == want.to_pylist() and got.schema.names == want.schema.names, file.name
-  close(value, summary)
+  close(value, wanted)
   assert json.loads((tmp_path / "all/summary.json").read_text()) == value
   config = json.loads((tmp_path / "all/config.json").read_text())
   assert [(p["first_seed"], p["seeds"], p["git_commit"]) for p in config.pop("pieces")] == [
     (s[0], len(s), f"of seed {s[0]}") for s in split
   ]
   assert config | {"git_commit": whole["git_commit"]} == whole
-  assert bench.finished(tmp_path, bench.Part("all", part.config))
+  assert suites.finished(tmp_path, suites.Part("all", part.config))
   # pieces of a joined piece are named one by one
   twice = cut(folder, tmp_path / "q", split[2])
   first = merge.join(folders[:2], tmp_path / "first", part_of(suite, name, k + 1).config)
@@ -311,6 +312,6 @@ def test_a_broken_agent_is_said_and_no_agent_is_none(tmp_path, broken):
   file.write_bytes(file.read_bytes()[:-100])
   with pytest.raises(FileError, match=broken):
     merge.cards(config)
-  part = bench.Part("x", config)
+  part = suites.Part("x", config)
   with pytest.raises(FileError, match=f"^part x: .*{broken}"):
-    bench.check(part)
+    costs.check(part, costs.Robots())

@@ -9,9 +9,8 @@ import shutil
 import pytest
 
 from mjx_cl.config import RunConfig
-from mjx_cl.errors import FileError
 from mjx_cl.io import tables
-from mjx_cl.runs import records
+from mjx_cl.runs import records, summary
 
 RESULTS = pathlib.Path(__file__).parents[2] / "results"
 
@@ -77,7 +76,7 @@ def test_it_is_neither_a_detection_nor_a_miss_and_recovers_all_the_same():
   rows = records.set_apart(
     [row(k, latency_steps=None if k == 2 else 100 + 500 * (k == 3)) for k in range(5)], EVENTS
   )
-  out = records.summarise(rows, RunConfig("walker"), 0.025)
+  out = summary.summarise(rows, RunConfig("walker"), 0.025)
   assert (
     out["seeds"],
     out["affected"],
@@ -89,7 +88,7 @@ def test_it_is_neither_a_detection_nor_a_miss_and_recovers_all_the_same():
   assert (
     out["miss_probability"] == pytest.approx(1 / 3) and out["latency_median_steps"] == 600
   )  # of 100, 600 and a miss
-  alone = records.summarise(records.set_apart([row(1), row(4)], EVENTS), RunConfig("walker"), 0.025)
+  alone = summary.summarise(records.set_apart([row(1), row(4)], EVENTS), RunConfig("walker"), 0.025)
   assert (
     alone["latency_median_steps"] is None
     and alone["miss_probability"] is None
@@ -98,7 +97,7 @@ def test_it_is_neither_a_detection_nor_a_miss_and_recovers_all_the_same():
 
 
 def test_every_aggregate_has_an_interval():
-  out = records.summarise(
+  out = summary.summarise(
     records.set_apart([row(k) for k in range(5)], EVENTS), RunConfig("walker"), 0.025
   )
   bare = {k for k in out if not k.endswith("_ci") and k + "_ci" not in out}
@@ -118,16 +117,13 @@ def test_published_results_are_scored_by_todays_definitions(tmp_path, part, apar
   """
   shutil.copytree(RESULTS / part, tmp_path / "run")
   before = json.loads((tmp_path / "run/summary.json").read_text())["arms"]["detector"]
-  after = records.rescore(tmp_path / "run")["arms"]["detector"]
+  config = tables.read_json(tmp_path / "run/config.json")
+  rows = [tables.read_rows(tmp_path / f"run/{name}.parquet") for name in ("runs", "events")]
+  rows = records.set_apart(*rows)
+  run = RunConfig(config["env"], steps=config["steps"], arms=tuple(config["arms"]))
+  after = summary.by_arm(rows, run, config["control_s"])["arms"]["detector"]
   assert after["adapting_at_onset"] == apart
   assert {k: v for k, v in after.items() if k in before and not k.endswith("_ci")} == {
     k: v for k, v in before.items() if not k.endswith("_ci")
   }
-  rows = tables.read_rows(tmp_path / "run/runs.parquet")
   assert sum(r["adapting_at_onset"] for r in rows if r["arm"] == "detector") == apart
-  assert records.rescore(tmp_path / "run")["arms"]["detector"] == after
-
-
-def test_what_is_no_run_is_not_scored(tmp_path):
-  with pytest.raises(FileError, match="config.json"):
-    records.rescore(tmp_path)

@@ -22,20 +22,21 @@ import pyarrow.parquet
 import pytest
 
 from mjx_cl import envs
-from mjx_cl.cli import app, commands
-from mjx_cl.config import AdaptConfig, RunConfig
+from mjx_cl.cli import app, runs
+from mjx_cl.config import CHUNK, AdaptConfig, RunConfig
 from mjx_cl.dreamer.agent import Agent
 from mjx_cl.envs.walker import Walker
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.io import tables
 from mjx_cl.render import figures
 from mjx_cl.runs import run, workers
+from mjx_cl.runs.run import ledger_of
 from mjx_cl.scoring import events, intervals
 from mjx_cl.training import agents
 
 STEPS, ONSET, EPISODE, SEEDS = 700, 300, 150, (3, 4)
 ENDS = [
-  min(STEPS, (i + 1) * run.CHUNK) - 1 for i in range(-(-STEPS // run.CHUNK))
+  min(STEPS, (i + 1) * CHUNK) - 1 for i in range(-(-STEPS // CHUNK))
 ]  # last step of each chunk
 # nominal levels from step 100, an alarm at any sample beyond three deviations of the last 100,
 # settled four chunks after it
@@ -266,7 +267,7 @@ def test_each_part_has_its_own_column(saved, tmp_path):
     "signals": np.zeros((1, 2, 6)),
     "parts": shape(8) + np.arange(8) + 100 * np.arange(2)[:, None],
   }
-  table = runner._ledger(["none", "none"]).trace(trace)
+  table = ledger_of(runner).trace(trace)
   for k, (name, at) in enumerate(runner.env.spec.watched):
     assert at
     np.testing.assert_array_equal(table[f"residual_{name}"], np.repeat([k, 100 + k], 64))
@@ -398,7 +399,7 @@ def test_starts_and_stops_have_their_reasons(whole):
     for (end, _), alarm in zip(starts, acted):
       assert end == min(e for e in ENDS if e >= alarm)  # decided at the end of the chunk
     for (start, _), (stop, _) in zip(starts, stops):
-      assert stop == min(start + 4 * run.CHUNK, STEPS - 1)
+      assert stop == min(start + 4 * CHUNK, STEPS - 1)
       assert set(trace["phase"][g, start + 1 : stop + 1]) == {"adapting"}
     first = starts[0][0]
     assert (
@@ -422,7 +423,7 @@ def test_both_arms_live_the_same_life_until_an_alarm_is_acted_on(whole):
     for name in ("reward", "opr", "rpr", "score", "alarm"):
       assert trace[name][g, :first].tobytes() == trace[name][g + 2, :first].tobytes(), name
     assert (
-      trace["reward"][g, first + run.CHUNK :] != trace["reward"][g + 2, first + run.CHUNK :]
+      trace["reward"][g, first + CHUNK :] != trace["reward"][g + 2, first + CHUNK :]
     ).any()  # then finetuning tells
 
 
@@ -779,7 +780,6 @@ class Stub:
   config_dict = lambda self: {}
   open = lambda self: None
   save = lambda self: self.notes.append("save")
-  finish = lambda self, tell: self.notes.append("finish")
 
 
 @pytest.mark.parametrize(
@@ -792,6 +792,7 @@ def test_an_interrupt_is_acted_on_between_two_chunks(tmp_path, monkeypatch, sign
   monkeypatch.setattr(
     run, "Runner", type("Stubbed", (Stub,), {"signals": signals, "notes": (notes := [])})
   )
+  monkeypatch.setattr(run, "finish", lambda runner, tell: runner.notes.append("finish"))
   call = lambda: run.execute(RunConfig("walker"), tmp_path / "x")
   if signals:
     with pytest.raises(KeyboardInterrupt):
@@ -819,9 +820,9 @@ def test_progress_that_nobody_reads_ends_no_work(monkeypatch, tmp_path):
     run, "Runner", type("Stubbed", (Stub,), {"signals": 1, "notes": (notes := [])})
   )
   monkeypatch.setattr(
-    commands,
+    runs,
     "RunDisplay",
-    lambda: contextlib.nullcontext(lambda p: commands.say("a line of progress")),
+    lambda: contextlib.nullcontext(lambda p: runs.say("a line of progress")),
   )
   monkeypatch.setattr(sys, "stderr", broken := Broken())
   assert app.main(["run", "walker", "--out", str(tmp_path / "x")]) == 130

@@ -120,7 +120,7 @@ def live(patch, tmp_path_factory):
       runner.save()
       shutil.copytree(whole, cut)
     runner.step()
-  runner.finish()
+  run.finish(runner)
   assert (
     runner.crew.loop._program._cache_size() == runner.rollout.chunk._cache_size() == 1
   )  # arrays that MJX binds to a device would be a second compilation of each

@@ -18,10 +18,11 @@ from mjx_cl.adapt.loop import Loop
 from mjx_cl.config import AdaptConfig, RunConfig
 from mjx_cl.envs.walker import Walker
 from mjx_cl.errors import FileError, UserError
+from mjx_cl.faults import presets
 from mjx_cl.io import tables
 from mjx_cl.keys import OfSeed
 from mjx_cl.rollout.scan import Rollout, nest, start
-from mjx_cl.runs import run, settings, snapshots, suite
+from mjx_cl.runs import run, scores, settings, snapshots
 from mjx_cl.runs.snapshots import Snapshots
 from mjx_cl.scoring import ablation, stop_rule
 from mjx_cl.training import agents
@@ -547,7 +548,7 @@ def test_the_rule_without_a_signal(lived):
     "lost_share",
   )
   assert {k: rows[0][k] for k in shared} == {k: judged[k] for k in shared}
-  assert suite.scores(out)["ablation"] == ablation.ablated(rows) and list(
+  assert scores.scores(out)["ablation"] == ablation.ablated(rows) and list(
     ablation.ablated(rows)
   ) == [r["left_out"] for r in rows]
 
@@ -743,7 +744,7 @@ def test_a_fault_that_is_not_there_yet_is_not_evaluated(config, tmp_path):
   make = lambda **kw: Snapshots.severities.__get__(type("S", (), kw)())
   of = make(
     config=dataclasses.replace(config, onset=500),
-    changes=run.changes(dataclasses.replace(config, duration=200)),
+    changes=presets.changes(dataclasses.replace(config, duration=200)),
   )
   assert [of(since) for since in (499, 500, 699, 700)] == [[0.0], [0.5], [0.5], [0.0]]
 
@@ -808,7 +809,7 @@ def test_an_arm_that_is_told_needs_to_be(config):
   together = dataclasses.replace(
     config, arms=("oracle-stop",), snapshots=0, stops="x", fault="any/all-easy", severity=None
   )
-  assert len(run.changes(together)) > 1  # several faults at once are one change
+  assert len(presets.changes(together)) > 1  # several faults at once are one change
 
 
 def test_it_lives_as_the_one_that_never_stops_until_then(lived, config, folder):

@@ -16,12 +16,12 @@ from test_cli import content, mjx, refused  # noqa: F401  fixtures
 from test_transfer import agent, saved  # noqa: F401  fixtures: a tiny agent of the car, whose programs hold no callback and are cached
 
 from mjx_cl.adapt.arms import ARMS, NEVER
-from mjx_cl.config import AdaptConfig, RunConfig
+from mjx_cl.config import CHUNK, AdaptConfig, RunConfig
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.io import folders, memory, tables
 from mjx_cl.render import figures
-from mjx_cl.runs import merge, run, settings
-from mjx_cl.runs import suite as bench
+from mjx_cl.runs import bench, costs, crew, merge, run, scores, settings
+from mjx_cl.runs import suite as suites
 from mjx_cl.scoring import stop_rule
 
 RESULTS = pathlib.Path(__file__).parents[2] / "results"
@@ -69,12 +69,12 @@ def write(tmp_path, text):
 # ---- suites --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", bench.shipped())
+@pytest.mark.parametrize("name", suites.shipped())
 def test_shipped_suites_fit_the_registries(name):
-  suite, robots = bench.suite(name), bench.Robots()
+  suite, robots = suites.suite(name), costs.Robots()
   assert suite.name == name and suite.about and suite.parts
   for part in suite.parts:
-    bench.check(part, robots)
+    costs.check(part, robots)
     assert (
       part.config.first_seed == (10 if name == "loop" else 0)
       # seeds 0 to 9 report, 100 to 109 tune; the detectors of `loop` were picked on a board of the
@@ -85,7 +85,7 @@ def test_shipped_suites_fit_the_registries(name):
 
 
 def test_the_paper_suite_is_the_papers_protocol():
-  parts = {p.name: p.config for p in bench.suite("paper").parts}
+  parts = {p.name: p.config for p in suites.suite("paper").parts}
   assert all(c.seeds == 10 and set(c.arms) >= {"detector", "none"} for c in parts.values())
   assert (parts["walker"].fault, parts["walker"].onset, parts["walker"].steps) == (
     "walker/gear-half",
@@ -121,7 +121,7 @@ env = "walker"
 fault = ["walker/gear-half", "none"]
 """,
   )
-  parts = bench.suite(path).parts
+  parts = suites.suite(path).parts
   assert [p.name for p in parts] == [
     "a/severity=0.25,adapt.ratio=4",
     "a/severity=0.25,adapt.ratio=16",
@@ -134,7 +134,7 @@ fault = ["walker/gear-half", "none"]
     "walker", severity=0.25, seeds=3, arms=("none", "detector"), adapt=AdaptConfig(ratio=16)
   )
   assert parts[4].config.adapt.ratio == 8 and parts[4].config.severity is None
-  assert {p.config.seeds for p in bench.suite(path, {"seeds": 1}).parts} == {1}
+  assert {p.config.seeds for p in suites.suite(path, {"seeds": 1}).parts} == {1}
 
 
 BAD = {
@@ -297,7 +297,7 @@ def test_updates_of_the_plan():
     arms=("always",),
     adapt=AdaptConfig(warmup=1000, start_windows=1024, ratio=16, batch=4),
   )
-  assert bench.estimate(bench.Part("a", c), 1e11).updates == pytest.approx(
+  assert costs.estimate(suites.Part("a", c), 1e11, costs.Robots()).updates == pytest.approx(
     3 * (5000 - 1000 - 1024 - 64) * 16 / (4 * 64)
   )
   for arm in ARMS:
@@ -309,12 +309,13 @@ def test_updates_of_the_plan():
       arms=(arm,),
       stops="told" if ARMS[arm].end.told else None,
     )
-    steps = sum(bench.finetunings(own, arm))
+    steps = sum(costs.finetunings(own, arm))
     assert 0 <= steps <= 19_000 and (steps == 0) == (
       ARMS[arm].trigger is NEVER or not ARMS[arm].breaks
     )
   slow, quick = (
-    bench.estimate(bench.Part("a", c), rate).seconds - bench.COMPILE_S for rate in (1e11, 2e11)
+    costs.estimate(suites.Part("a", c), rate, costs.Robots()).seconds - costs.COMPILE_S
+    for rate in (1e11, 2e11)
   )
   assert slow == pytest.approx(2 * quick)
 
@@ -330,20 +331,20 @@ def test_finetunings_of_the_plan():
     steps=28_000,
     arms=("detector", "oracle", "oracle-budget", "no-fault"),
   )
-  walker = bench.ADAPTS["walker"]
-  assert [bench.finetunings(twice, arm) for arm in twice.arms] == [
+  walker = costs.ADAPTS["walker"]
+  assert [costs.finetunings(twice, arm) for arm in twice.arms] == [
     [walker, walker, 3000],
     [walker, 3000],
     [19_000, 3000],
     [],
   ]  # broken, repaired, broken at 5,000, 15,000, 25,000
-  assert bench.finetunings(twice, "oracle-budget", most=700) == [700, 700]
-  assert bench.finetunings(RunConfig("walker", fault="any/all-easy"), "detector") == [
+  assert costs.finetunings(twice, "oracle-budget", most=700) == [700, 700]
+  assert costs.finetunings(RunConfig("walker", fault="any/all-easy"), "detector") == [
     walker
   ]  # six faults at once
-  assert bench.finetunings(
+  assert costs.finetunings(
     RunConfig("walker", severity=0.0), "detector"
-  ) == [] and bench.finetunings(RunConfig("walker", onset=200), "detector") == [walker]
+  ) == [] and costs.finetunings(RunConfig("walker", onset=200), "detector") == [walker]
   car = RunConfig(
     "car",
     fault="car/transfer-then-socks",
@@ -351,7 +352,7 @@ def test_finetunings_of_the_plan():
     steps=64_000,
     adapt=AdaptConfig(budget=40_000),
   )
-  assert bench.finetunings(car, "detector") == [bench.ADAPTS["car_real"], 12_000]
+  assert costs.finetunings(car, "detector") == [costs.ADAPTS["car_real"], 12_000]
 
 
 PLANNED = [
@@ -376,7 +377,7 @@ def test_the_plan_is_within_a_factor_of_two_of_what_was_lived(name, monkeypatch)
   folder, _, part_name = name.partition("/")
   (part,) = [p for p in published(folder).parts if p.name == part_name]
   lived = sum(r["updates"] for r in tables.read_rows(RESULTS / name / "runs.parquet"))
-  assert 0.5 < lived / bench.estimate(part, 1e11).updates < 2
+  assert 0.5 < lived / costs.estimate(part, 1e11, costs.Robots()).updates < 2
 
 
 def test_lengths_of_finetunings_are_those_of_the_published_suites():
@@ -395,7 +396,7 @@ def test_lengths_of_finetunings_are_those_of_the_published_suites():
   ):
     for part in published(suite).parts:
       if (RESULTS / suite / part.name / "events.parquet").exists():
-        own = lengths.setdefault(bench.becomes(part.config) or part.config.env, [])
+        own = lengths.setdefault(costs.becomes(part.config) or part.config.env, [])
         own += [
           (part.config.steps if s["stop"] is None else s["stop"] + 1) - s["since"]
           for s in stop_rule.spans(tables.read_rows(RESULTS / suite / part.name / "events.parquet"))
@@ -403,7 +404,7 @@ def test_lengths_of_finetunings_are_those_of_the_published_suites():
         ]
   assert {
     robot: pytest.approx(np.mean(own), rel=0.1) for robot, own in lengths.items()
-  } == bench.ADAPTS
+  } == costs.ADAPTS
 
 
 def published(folder):
@@ -414,14 +415,14 @@ def published(folder):
 
 
 def test_shards_are_a_partition():
-  parts = bench.suite("paper").parts
-  split = [bench.pick(parts, (), (k, 2)) for k in (0, 1)]
+  parts = suites.suite("paper").parts
+  split = [suites.pick(parts, (), (k, 2)) for k in (0, 1)]
   assert sorted(p.name for part in split for p in part) == sorted(p.name for p in parts) and all(
     split
   )
-  assert [p.name for p in bench.pick(parts, ("car",))] == ["car"]
+  assert [p.name for p in suites.pick(parts, ("car",))] == ["car"]
   with pytest.raises(UserError, match="0 <= K < N"):
-    bench.pick(parts, (), (1, 1))
+    suites.pick(parts, (), (1, 1))
 
 
 # ---- running -------------------------------------------------------------------------------------
@@ -456,7 +457,7 @@ def test_parts_run_once_go_on_and_merge(mjx, refused, mini, tmp_path, monkeypatc
   monkeypatch.setattr(run.Runner, "step", lambda self: lived.append(self.done_chunks) or step(self))
   assert mjx("bench", mini, "--out", out, "--only", "grip", "--jobs", "1")[0] == 0
   assert lived == [1, 2] + [0, 1, 2]  # the part that was cut off goes on, the other begins
-  config = bench.suite(str(mini)).parts[0].config
+  config = suites.suite(str(mini)).parts[0].config
   assert (
     run.Runner(config, tmp_path).crew.loop._program._cache_size() == 1
   )  # a run that goes on compiles nothing anew
@@ -537,32 +538,32 @@ def test_a_part_of_other_settings_that_was_not_asked_for_stops_nothing(mjx, refu
 
 def test_a_part_of_another_agent_of_the_same_name_is_not_finished(tmp_path):
   """By the card; one that has gained keys, or can no longer be read, is no other agent."""
-  plan = bench.suite("quick")
+  plan = suites.suite("quick")
   out = shutil.copytree(RESULTS / "quick", tmp_path / "out")
   card = json.loads((out / "walker/config.json").read_text())["agent_card"]
   changed(
     out / "walker", agent_card={k: v for k, v in card.items() if k != "eval"}
   )  # a key that came later
-  assert bench.standing(out, plan.parts) == (list(plan.parts), {})
+  assert suites.standing(out, plan.parts) == (list(plan.parts), {})
   changed(
     out / "walker",
     agent_card=card | {"updates": 7, "dreamer": card["dreamer"] | {"size": "size12m"}},
   )
-  assert bench.standing(out, plan.parts)[1] == {
+  assert suites.standing(out, plan.parts)[1] == {
     "walker": "was begun with another agent_card (dreamer.size, updates)"
   }
   with pytest.raises(UserError, match="another agent_card"):
-    bench.finished(out, plan.parts[0])
+    suites.finished(out, plan.parts[0])
   with pytest.raises(UserError, match="another agent_card"):
     merge.seeds_of(out / "walker", plan.parts[0].config)
   assert merge.cards(RunConfig("walker", agent="nowhere")) == {}
-  (triggers,) = bench.pick(bench.suite("arms").parts, ("triggers",))
+  (triggers,) = suites.pick(suites.suite("arms").parts, ("triggers",))
   shutil.copytree(RESULTS / "arms/triggers", tmp_path / "triggers")
-  assert bench.finished(tmp_path, triggers)
+  assert suites.finished(tmp_path, triggers)
   cards = json.loads((tmp_path / "triggers/config.json").read_text())["arm_cards"]
   changed(tmp_path / "triggers", arm_cards={"randomised": cards["randomised"] | {"seed": 9}})
   with pytest.raises(UserError, match=r"another arm_cards \(randomised.seed\)"):
-    bench.finished(tmp_path, triggers)
+    suites.finished(tmp_path, triggers)
 
 
 def test_an_agent_by_folder_is_read_anew_when_it_is_written_anew(saved, tmp_path):  # noqa: F811
@@ -580,7 +581,7 @@ def test_an_agent_by_folder_is_read_anew_when_it_is_written_anew(saved, tmp_path
 def test_what_is_published_counts(folder, monkeypatch):
   """But for what a later threshold or preset has made another run."""
   monkeypatch.chdir(RESULTS.parent)
-  own, others = bench.standing(pathlib.Path("results") / folder, published(folder).parts)
+  own, others = suites.standing(pathlib.Path("results") / folder, published(folder).parts)
   there = {
     str(p.parent.relative_to(RESULTS / folder)) for p in (RESULTS / folder).rglob("summary.json")
   }
@@ -589,7 +590,8 @@ def test_what_is_published_counts(folder, monkeypatch):
     f"{robot}/detector=hotelling" for robot in ("walker", "quadruped", "car")
   }
   assert all(
-    merge.seeds_of(pathlib.Path("results") / folder / p.name, p.config) == bench.part_seeds(p)
+    merge.seeds_of(pathlib.Path("results") / folder / p.name, p.config)
+    == list(range(p.config.first_seed, p.config.first_seed + p.config.seeds))
     for p in own
   )
 
@@ -615,9 +617,9 @@ def test_what_a_merge_refuses_is_named_and_the_rest_is_taken(mjx, tmp_path):  # 
     )
     for name in refused_
   )
-  parts, said = bench.suite("loop").parts, []
+  parts, said = suites.suite("loop").parts, []
   bench.take(out, parts, bench.offers(out, parts, [theirs], said.append))
-  own, others = bench.standing(out, parts)
+  own, others = suites.standing(out, parts)
   assert (
     {p.name for p in own} == {p.name for p in parts} - refused_ and not others and len(said) == 3
   )
@@ -697,7 +699,7 @@ def test_runs_of_one_kind_share_their_program(mini, tmp_path, programs):  # noqa
   """Severity, seeds, length and the numbers of AdaptConfig are not in it; detector, form and
   learning rate are.
   """
-  (part, _, _) = bench.suite(str(mini)).parts
+  (part, _, _) = suites.suite(str(mini)).parts
   program = lambda **change: (
     run.Runner(dataclasses.replace(part.config, **change), tmp_path).crew.loop._program
   )
@@ -731,15 +733,13 @@ def test_runs_of_one_kind_share_their_program(mini, tmp_path, programs):  # noqa
 )
 def test_replays_of_about_one_length_have_one_shape(steps, capacity):
   """Room for every record, a quarter more at most."""
-  assert (
-    run.capacity(steps, 1000) == capacity >= steps + steps // 1000 + 2 * run.CHUNK or steps < 1024
-  )
-  assert capacity <= max(1024, 1.25 * (steps + steps // 1000 + 3 * run.CHUNK))
+  assert crew.capacity(steps, 1000) == capacity >= steps + steps // 1000 + 2 * CHUNK or steps < 1024
+  assert capacity <= max(1024, 1.25 * (steps + steps // 1000 + 3 * CHUNK))
 
 
 def test_a_reward_that_is_no_number_ends_a_run_in_one_line(mini, tmp_path):  # noqa: F811
   """The stream is named, and what was saved before stays."""
-  (part,) = bench.pick(bench.suite(str(mini)).parts, ("healthy",))
+  (part,) = suites.pick(suites.suite(str(mini)).parts, ("healthy",))
   runner = run.Runner(part.config, tmp_path / "out")
   runner.open()
   runner.step()
@@ -772,7 +772,7 @@ def test_a_stream_whose_loss_fails_is_given_up_alone_and_named(mini, tmp_path, s
   """Seed 1's replay gets a reward that is no number: its weights stay as they were, it lives on,
   the other stream lives as if nothing had been.
   """
-  (part,) = bench.pick(bench.suite(str(mini)).parts, ("healthy",))
+  (part,) = suites.pick(suites.suite(str(mini)).parts, ("healthy",))
   config = dataclasses.replace(
     part.config,
     steps=448,
@@ -780,7 +780,7 @@ def test_a_stream_whose_loss_fails_is_given_up_alone_and_named(mini, tmp_path, s
     adapt=dataclasses.replace(part.config.adapt, start_windows=1, ratio=64.0),
   )
   sound, hurt = (run.Runner(config, tmp_path / name) for name in ("sound", "hurt"))
-  chunks = config.steps // run.CHUNK
+  chunks = config.steps // CHUNK
   for runner in (sound, hurt):
     runner.open()
     for i in range(chunks):
@@ -825,11 +825,11 @@ def test_a_stream_whose_loss_fails_is_given_up_alone_and_named(mini, tmp_path, s
   sound.step()
   fresh, new = (
     np.asarray(sound.state.loop[block].replay.data.deter).any(-1).reshape(-1),
-    run.CHUNK + 4,
+    CHUNK + 4,
   )  # records of one chunk, ends of episodes among them
   assert new < fresh.sum() < fresh.size
   tables.write_json(tmp_path / "hurt" / "config.json", hurt.config_dict())
-  summary = hurt.finish()["arms"]["always"]
+  summary = run.finish(hurt)["arms"]["always"]
   rows = {r["seed"]: r for r in tables.read_rows(tmp_path / "hurt" / "runs.parquet")}
   assert (
     (rows[1]["outcome"], rows[1]["reason"], rows[1]["adapt_stop"])
@@ -847,7 +847,7 @@ def test_a_stream_whose_loss_fails_is_given_up_alone_and_named(mini, tmp_path, s
 def test_a_table_of_unlike_parts_has_nulls(tmp_path):
   """Columns that only some parts have, such as those of a later version, are null elsewhere."""
   config = settings.check(RunConfig("walker"))
-  plan = bench.Suite("s", "", tuple(bench.Part(n, config) for n in "ab"))
+  plan = suites.Suite("s", "", tuple(suites.Part(n, config) for n in "ab"))
   own = {k: [v] for k, v in lived(0, "none", None, 0.9, affected=False).items()}
   for part, columns in zip(
     plan.parts, ({k: 2 * v for k, v in own.items()} | {"x": [1.0, 2.0]}, own | {"y": [3.0]})
@@ -856,7 +856,7 @@ def test_a_table_of_unlike_parts_has_nulls(tmp_path):
     tables.write_table(tmp_path / part.name / "runs.parquet", columns)
     tables.write_json(tmp_path / part.name / "summary.json", {})
     tables.write_json(tmp_path / part.name / "config.json", dataclasses.asdict(part.config))
-  assert bench.collect(tmp_path, plan)["finished"] == 2
+  assert scores.collect(tmp_path, plan)["finished"] == 2
   rows = pyarrow.parquet.read_table(tmp_path / "bench.parquet").to_pydict()
   assert (
     rows["part"] == ["a", "a", "b"]
@@ -867,7 +867,7 @@ def test_a_table_of_unlike_parts_has_nulls(tmp_path):
 
 def test_the_time_left_follows_what_parts_took(tmp_path, monkeypatch):
   """Parts that took twice as long as expected double what is left."""
-  plan = bench.Suite("s", "", tuple(bench.Part(n, RunConfig("walker")) for n in "abc"))
+  plan = suites.Suite("s", "", tuple(suites.Part(n, RunConfig("walker")) for n in "abc"))
   now, said = [0.0], []
   monkeypatch.setattr(bench.time, "monotonic", lambda: now[0])
 
@@ -875,7 +875,7 @@ def test_the_time_left_follows_what_parts_took(tmp_path, monkeypatch):
     now[0] += 1200.0
 
   monkeypatch.setattr(run, "execute", lived)
-  expected = {n: bench.Estimate(1, 1, 0.0, 600.0, 0) for n in "abc"}
+  expected = {n: costs.Estimate(1, 1, 0.0, 600.0, 0) for n in "abc"}
   bench.execute(plan, tmp_path, plan.parts, expected, said.append)  # with no display
   assert [s.split("about ")[1] for s in said] == ["30 min left", "40 min left", "20 min left"]
 
@@ -916,7 +916,7 @@ def test_what_arms_say_together(tmp_path):
   tables.write_json(
     tmp_path / "config.json", {"arms": ["detector", "none", "oracle"], "steps": 10_000}
   )
-  got = bench.scores(tmp_path)
+  got = scores.scores(tmp_path)
   assert got["normalised"]["detector"]["normalised"] == pytest.approx(0.6) and got["normalised"][
     "oracle"
   ]["normalised"] == pytest.approx(1.0)
@@ -958,7 +958,7 @@ def test_the_restricted_mean_ends_with_the_next_change(tmp_path):
   ]
   tables.write_table(tmp_path / "runs.parquet", {k: [r[k] for r in rows] for k in rows[0]})
   tables.write_json(tmp_path / "config.json", {"arms": ["detector", "none"], "steps": 30_000})
-  got = bench.scores(tmp_path)["recovery"]
+  got = scores.scores(tmp_path)["recovery"]
   assert {arm: (own["horizon"], own["restricted_mean_steps"]) for arm, own in got.items()} == {
     "detector": (5000, 1000.0),
     "none": (5000, 5000.0),
@@ -971,7 +971,7 @@ def test_arms_alone_say_nothing_together(tmp_path):
     {k: [v] for k, v in lived(0, "detector", None, 0.9, affected=None).items()},
   )
   tables.write_json(tmp_path / "config.json", {"arms": ["detector"], "steps": 10_000})
-  assert bench.scores(tmp_path) == {
+  assert scores.scores(tmp_path) == {
     "normalised": None,
     "against_oracle": None,
     "recovery": {"detector": None},
@@ -981,7 +981,7 @@ def test_arms_alone_say_nothing_together(tmp_path):
 def test_recovery_against_the_ratio_is_drawn_where_a_suite_has_several(tmp_path):
   adapt = lambda ratio: AdaptConfig(ratio=ratio)
   parts = [
-    bench.Part(
+    suites.Part(
       f"{ratio}", RunConfig("walker", severity=0.25, arms=("none", "oracle"), adapt=adapt(ratio))
     )
     for ratio in (4.0, 16.0)
@@ -993,7 +993,7 @@ def test_recovery_against_the_ratio_is_drawn_where_a_suite_has_several(tmp_path)
     "restricted_mean_steps_ci": [3000.0, 5000.0],
   }
   points = [
-    p for part in parts for p in bench._points(part, {"recovery": {"none": back, "oracle": back}})
+    p for part in parts for p in scores._points(part, {"recovery": {"none": back, "oracle": back}})
   ]
   assert points == [
     {
@@ -1006,7 +1006,7 @@ def test_recovery_against_the_ratio_is_drawn_where_a_suite_has_several(tmp_path)
     }
     for ratio in (4.0, 16.0)
   ]
-  assert bench._points(parts[0], {"recovery": {"none": back, "oracle": None}}) == []
+  assert scores._points(parts[0], {"recovery": {"none": back, "oracle": None}}) == []
   assert figures.ratios(tmp_path, points[:1] * 2) is None and not list(tmp_path.iterdir())
   assert (
     figures.ratios(tmp_path, points + [points[0] | {"line": "other", "ci": None}]).read_bytes()[:4]

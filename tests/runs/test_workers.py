@@ -19,8 +19,8 @@ from test_transfer import agent, saved  # noqa: F401  fixtures
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.io import checkpoints as checkpoint
 from mjx_cl.io import memory, tables
-from mjx_cl.runs import run, workers
-from mjx_cl.runs import suite as bench
+from mjx_cl.runs import run, scores, workers
+from mjx_cl.runs import suite as suites
 
 GB = 2**30
 
@@ -54,7 +54,7 @@ def compiled(suite, folder):
   """Lives one chunk of a suite's first part, whose programs then lie in the cache: two workers that
   begin together would both compile them.
   """
-  runner = run.Runner(bench.suite(str(suite)).parts[0].config, folder)
+  runner = run.Runner(suites.suite(str(suite)).parts[0].config, folder)
   folder.mkdir()
   runner.open()
   runner.step()
@@ -80,17 +80,17 @@ def test_side_by_side_is_as_one_after_the_other(mjx, refused, mini, tmp_path, mo
   assert any(
     line.startswith("grip/severity=0.5: step 192/192") for line in err.splitlines()
   )  # what a worker says is passed on
-  plan = bench.suite(str(mini))
-  bench.write_plan(plan, tmp_path / "one")
+  plan = suites.suite(str(mini))
+  suites.write_plan(plan, tmp_path / "one")
   monkeypatch.setattr(workers, "cores", lambda: own[-1:])
   workers.together(
     WORKER,
     tmp_path / "one",
-    [p.name for p in bench.pick(plan.parts, ("grip",))],
+    [p.name for p in suites.pick(plan.parts, ("grip",))],
     1,
     lambda name: None,
   )
-  bench.collect(tmp_path / "one", plan)
+  scores.collect(tmp_path / "one", plan)
   one, two = (
     pyarrow.parquet.read_table(tmp_path / name / "bench.parquet").to_pydict()
     for name in ("one", "two")
@@ -147,7 +147,7 @@ def lives(lines, *parts):
 def test_one_that_fails_is_named_and_none_goes_on(long, tmp_path, monkeypatch):
   own, ended = workers.cores(), []
   monkeypatch.setattr(workers, "cores", lambda: own[-1:] * 2)
-  bench.write_plan(bench.suite(str(long)), tmp_path)
+  suites.write_plan(suites.suite(str(long)), tmp_path)
   value = json.loads((tmp_path / "suite.json").read_text())
   value["parts"]["healthy"]["agent"] = str(tmp_path / "nowhere")
   tables.write_json(tmp_path / "suite.json", value)
@@ -157,7 +157,7 @@ def test_one_that_fails_is_named_and_none_goes_on(long, tmp_path, monkeypatch):
 
 
 def test_a_worker_that_is_killed_is_said(mini, tmp_path):  # noqa: F811
-  bench.write_plan(bench.suite(str(mini)), tmp_path)
+  suites.write_plan(suites.suite(str(mini)), tmp_path)
   worker = workers.Worker(WORKER, tmp_path, "healthy", 0, [], lambda text: None)
   worker.process.kill()
   worker.process.wait()

@@ -1,0 +1,162 @@
+"""The commands train and eval: agents made, and what they return."""
+
+import dataclasses
+import math
+import pathlib
+from typing import Any
+
+from mjx_cl import envs
+from mjx_cl.cli.flags import Eval, Train
+from mjx_cl.cli.live import TrainDisplay
+from mjx_cl.cli.output import command_line, emit, say
+from mjx_cl.config import (
+  PRESETS,
+  DreamerConfig,
+  TrainConfig,
+  check_seeds,
+  field_kinds,
+  replace,
+  settings,
+)
+from mjx_cl.errors import FileError, choose, require
+from mjx_cl.io import folders
+from mjx_cl.runs import run
+from mjx_cl.training import agents, evaluate, files, premises, trainer
+
+MOST_EPISODES = 10_000  # all at once in one program
+
+
+def do_train(args: Train) -> None:
+  """Trains agents."""
+  dreamer, config = chosen(args)
+  env = envs.make(args.env, args.physics)
+  # whatever can be refused is refused before an earlier training is touched
+  if args.demonstrator not in (None, "ppo"):
+    premises.expert(env, args.demonstrator)
+  premises.faults_of(env, config)
+  files.shown(config, args.out, args.demonstrator)
+  premises.check(env, dreamer, config, args.agent)
+  state = folders.claim_folder(args.out, args.resume, args.overwrite, done_marker="agent/card.json")
+  if state != "new":
+    updates = files.check_same(
+      args.out, env, dreamer, config, args.seed, args.seeds, args.demonstrator, args.agent
+    )
+  if state == "done":
+    require(
+      updates == config.updates,
+      f"{args.out}: this training has finished its {updates:,} updates; go on with --agent "
+      f"{pathlib.Path(args.out, 'agent')} and another --out",
+    )
+    say(f"{args.out}: this training is finished")
+    return
+  if state == "new" and args.overwrite:
+    clear(args)
+  training = files.build(
+    env,
+    dreamer,
+    config,
+    args.out,
+    args.seed,
+    args.seeds,
+    args.demonstrator,
+    args.agent,
+    args.preset,
+    command_line("train"),
+    state == "resume",
+  )
+  with TrainDisplay(config.updates) as display:
+    trainer.run(training, display, args.save_every_s)
+  card = files.export(training)
+  if args.json:
+    emit(card)
+  else:
+    say(
+      f"agent in {args.out}/agent, return {card['eval']['return_mean']:.0f} over "
+      f"{card['eval']['episodes']} episodes"
+    )
+
+
+def chosen(args: Train) -> tuple[DreamerConfig, TrainConfig]:
+  """Learner and schedule of the preset with the settings of --set.
+
+  Raises:
+    UserError: for an unknown preset or setting, or a value out of range.
+  """
+  preset = choose("preset", args.preset, PRESETS)
+  changes: dict[str, Any] = settings(args.set)
+  names = {f.name for f in dataclasses.fields(TrainConfig)}
+  known = {f.name for f in dataclasses.fields(DreamerConfig)}
+  own = {k: v for k, v in changes.items() if k in names}
+  rest = {k: v for k, v in changes.items() if k not in names}
+  field_kinds("--set", TrainConfig, own)
+  config = replace(preset.train, **own)
+  for name in rest:
+    choose("setting", name, dict.fromkeys(names | known))
+  field_kinds("--set", DreamerConfig, rest)
+  dreamer = replace(preset.dreamer, **rest)
+  require(args.seeds >= 1, f"seeds must be above 0; got {args.seeds}")
+  check_seeds(args.seed)
+  require(args.agent != "", "--agent is a shipped name or a folder; got an empty name")
+  every = args.save_every_s
+  require(0 < every < math.inf, f"--save-every-s must be above 0; got {every}")
+  return dreamer, config
+
+
+def clear(args: Train) -> None:
+  """Removes an earlier training in --out.
+
+  Raises:
+    UserError: where the new one needs something of it.
+  """
+  out = pathlib.Path(args.out)
+  own = [out / name for name in ("agent", "agents", "demonstrator", "checkpoints", "work")]
+  for name, given in (("agent", args.agent), ("demonstrator", args.demonstrator)):
+    require(
+      not given or not any(pathlib.Path(given).resolve().is_relative_to(x.resolve()) for x in own),
+      f"--overwrite removes --{name} {given} with {out}; give another --out",
+    )
+  run.clear(out)
+  files.clear(out)
+
+
+def do_eval(args: Eval) -> None:
+  """Prints what an agent returns."""
+  require(
+    1 <= args.episodes <= MOST_EPISODES,
+    f"episodes must lie in 1..{MOST_EPISODES:,}, which are lived side by side; got {args.episodes}",
+  )
+  check_seeds(args.seed, args.episodes)
+  require(args.agent != "", "--agent is a shipped name or a folder; got an empty name")
+  env = envs.make(args.env, args.physics)
+  trained = agents.of(env, args.agent)
+  result: dict[str, Any] = evaluate.evaluate(
+    env,
+    trained.agent,
+    trained.train.params,
+    args.episodes,
+    args.seed,
+    int(trained.card.get("repeat", 1)),
+    args.deterministic,
+  )
+  mean, interval = result["return_mean"], result["return_ci"]
+  if not math.isfinite(mean):
+    raise FileError(
+      f"agent {trained.path}: its return on {args.env} is {mean}; its weights or the robot give "
+      "what is no number"
+    )
+  result = {"env": args.env, "agent": pathlib.Path(trained.path).name, **result}
+  if args.json:
+    emit(result)
+    return
+  said = f"{args.env}: return {mean:.1f} in one episode"
+  if interval:
+    said = (
+      f"{args.env}: return {mean:.1f} (IQM {result['return_iqm']:.1f}, 95 % interval "
+      f"{interval[0]:.1f} to {interval[1]:.1f}) over {args.episodes} episodes, "
+      f"{result['terminations']} terminations"
+    )
+  print(said)
+  base = ("env", "agent", "episodes", "return_mean", "return_iqm", "terminations")
+  figures = {k: v for k, v in result.items() if isinstance(v, (int, float)) and k not in base}
+  if figures:
+    print("  " + ", ".join(f"{k} {v:.3g}" for k, v in figures.items()))

@@ -1,0 +1,33 @@
+"""The command detect: a log of one's own."""
+
+import sys
+
+from mjx_cl.cli.flags import Detect
+from mjx_cl.cli.output import emit, say
+from mjx_cl.cli.tables import show_detections
+from mjx_cl.config import settings
+from mjx_cl.logs import detect, results
+
+
+def do_detect(args: Detect) -> None:
+  """Watches a log."""
+  out = None if args.out is None else results.claim(args.out, args.overwrite)
+  result = detect.detect(
+    args.file,
+    args.nominal,
+    args.column,
+    args.detector,
+    args.arl0,
+    args.rate,
+    args.logarithm,
+    settings(args.set),
+    say if sys.stderr.isatty() else lambda text: None,
+  )
+  if out:
+    results.write(result, out)
+  for note in result.summary["notes"]:
+    say(f"mjx-cl: {note}")
+  if args.json:
+    emit(result.summary)
+  else:
+    show_detections(result.summary["detectors"])

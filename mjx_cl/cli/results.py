@@ -1,0 +1,114 @@
+"""The commands plot, query and report: what result files say. Free of JAX but where figures are
+drawn anew.
+"""
+
+import decimal
+import importlib
+import math
+import pathlib
+import sys
+import types
+from typing import Any
+
+from mjx_cl.cli.flags import Plot, Query, Report
+from mjx_cl.cli.output import emit
+from mjx_cl.cli.tables import console, table
+from mjx_cl.errors import FileError, require
+from mjx_cl.io import tables
+
+
+def do_plot(args: Plot) -> None:
+  """Draws the figure of a run anew."""
+  from mjx_cl.render import figures
+
+  require(
+    pathlib.Path(args.folder, "trace.parquet").exists(),
+    f"{args.folder} holds no finished run (no trace.parquet)",
+  )
+  print(figures.figure(args.folder))
+
+
+def do_query(args: Query) -> None:
+  """Answers SQL, or names the views."""
+  folder, sql = list(args.words[:-1]), args.words[-1] if args.words else None
+  if sql is not None and not folder and pathlib.Path(sql).is_dir():
+    folder, sql = [sql], None
+  require(
+    len(folder) <= 1, f"query takes [FOLDER] [SQL], the SQL in quotes; got {len(args.words)} words"
+  )
+  require(not (folder and args.within), "query takes a folder or --in, not both")
+  names, rows = tables.query(folder[0] if folder else tables.views(args.within), sql)
+  if args.json:
+    for k, name in enumerate(names):  # two columns of one name would be one in JSON
+      names[k] = name if name not in names[:k] else f"{name}_{k}"
+    emit([{n: json_value(x) for n, x in zip(names, r)} for r in rows])
+  else:
+    console().print(table(names, rows, left=names))
+
+
+def json_value(x: Any) -> Any:
+  """A database's value as JSON has it: decimals are numbers, what is not finite is null, keys of a
+  map and whatever else there is are text.
+  """
+  if isinstance(x, dict):
+    return {str(k): json_value(v) for k, v in x.items()}
+  if isinstance(x, (list, tuple)):
+    return [json_value(v) for v in x]
+  if isinstance(x, decimal.Decimal):
+    x = float(x)
+  if isinstance(x, float):
+    return x if math.isfinite(x) else None
+  return x if x is None or isinstance(x, (bool, int, str)) else str(x)
+
+
+def _writer() -> types.ModuleType:
+  """The program beside a checkout's package that writes its documents' numbers.
+
+  Raises:
+    UserError: where the package stands elsewhere.
+  """
+  checkout = pathlib.Path(__file__).parents[2]
+  require(
+    (checkout / "benchmarks" / "report" / "report.py").is_file(),
+    "report writes the documents of a checkout of mjx_cl; this package is installed without one",
+  )
+  if str(checkout) not in sys.path:
+    sys.path.append(str(checkout))
+  return importlib.import_module("benchmarks.report.report")
+
+
+def do_report(args: Report) -> None:
+  """Writes the documents' numbers anew."""
+  report = _writer()
+  pages = args.page or [str(p) for p in report.pages()] or ["README.md"]
+  # whatever is wrong is said before anything is written
+  found = {page: report.report(args.results, page, check=True) for page in pages}
+  require(
+    not (args.figures and args.check),
+    "--check writes nothing, --figures draws: give one of the two",
+  )
+  if not args.check:
+    for page in pages:
+      report.report(args.results, page)
+  if args.figures:
+    from mjx_cl.runs import bench
+
+    for file in bench.redraw(args.results):
+      print(f"{file}: drawn anew", file=sys.stderr)
+  stale: dict[str, str] = {}
+  for page, blocks in found.items():
+    if names := dict.fromkeys(b["name"] for b in blocks if not b["agrees"]):
+      stale[page] = ", ".join(names)
+  if args.json:
+    emit([{"page": page, **block} for page, blocks in found.items() for block in blocks])
+  else:
+    for page, blocks in found.items():
+      if not blocks:
+        print(f"{page}: no marked block")
+      elif page not in stale:
+        print(f"{page}: all {len(blocks)} blocks agree with {args.results}")
+      elif not args.check:
+        print(f"{page}: written anew: {stale[page]}")
+  if stale and args.check:
+    wrong = (f"{page} disagrees with {args.results} in: {names}" for page, names in stale.items())
+    raise FileError(f"{'; '.join(wrong)}; mjx-cl report writes them anew")

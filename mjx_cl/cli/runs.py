@@ -1,0 +1,149 @@
+"""The commands run and bench: one run, and suites of runs."""
+
+import dataclasses
+import pathlib
+import re
+from collections.abc import Collection, Mapping, Sequence
+
+from mjx_cl.cli.flags import Bench, Run
+from mjx_cl.cli.live import RunDisplay
+from mjx_cl.cli.output import clock, emit, say
+from mjx_cl.cli.tables import show_summary
+from mjx_cl.config import RunConfig
+from mjx_cl.errors import UserError, require
+from mjx_cl.io import folders, memory
+from mjx_cl.runs import bench, costs, run, workers
+from mjx_cl.runs.suite import Part, Suite, finished, pick, standing, suite
+
+
+def do_run(args: Run) -> None:
+  """Lives the loop and prints its table."""
+  config = RunConfig(**{f.name: getattr(args, f.name) for f in dataclasses.fields(RunConfig)})
+  with RunDisplay() as display:
+    summary = run.execute(config, args.out, args.resume, args.overwrite, display, tell=say)
+  if args.keep and not pathlib.Path(args.out, "agents").is_dir():
+    say("note: --keep wrote no agent, since no stream has finetuned")
+  if args.json:
+    emit(summary)
+  else:
+    show_summary(summary, args.out)
+
+
+def do_bench(args: Bench) -> None:
+  """Runs, plans, merges or publishes a suite."""
+  plan, parts = asked(args)
+  out = pathlib.Path(args.out or f"runs/bench/{plan.name}")
+  check_merge(args.merge, parts)
+  if args.publish:
+    bench.earlier(args.publish, plan)
+  done = {p.name for p in parts if finished(out, p)}
+  found = bench.offers(out, parts, args.merge, say)
+  robots = costs.Robots()
+  for part in parts:  # whatever can be refused is refused before the first part runs
+    if part.name not in done and part.name not in found:
+      costs.check(part, robots)
+  estimates = costs.estimates(parts, robots)
+  note_others(out, [p for p in plan.parts if p not in parts])
+  done |= set(found)
+  lines = plan_lines(plan, parts, done, estimates)
+  if args.plan:
+    rows = [
+      {"part": p.name, "finished": p.name in done, **estimates[p.name]._asdict()} for p in parts
+    ]
+    emit(rows) if args.json else print("\n".join(lines))
+    return
+  folders.make(out)
+  bench.take(out, parts, found)
+  for name in found:
+    say(f"{name}: taken over")
+  needs = [estimates[p.name].bytes for p in parts if p.name not in done]
+  most, space = max(needs, default=0), int(memory.MARGIN * memory.free())
+  require(
+    most <= space,
+    f"a part needs {most / 2**30:.1f} GiB, {space / 2**30:.1f} GiB may be used; fewer "
+    "--seeds would fit",
+  )
+  jobs = workers.number(args.jobs, needs, space)
+  for line in lines:
+    say(line)
+  value = bench.execute(
+    plan, out, parts, estimates, say, RunDisplay, jobs=jobs, worker="mjx_cl.cli.worker"
+  )
+  if args.publish:
+    bench.publish(out, plan, args.publish)
+  if args.json:
+    emit(value)
+    return
+  for name, summary in value["entries"].items():
+    print(f"{name}: ", end="")
+    show_summary(summary, str(out / name))
+  print(f"{value['finished']} of {value['parts']} parts finished; files in {out}")
+
+
+def asked(args: Bench) -> tuple[Suite, list[Part]]:
+  """The suite, and those of its parts that are to be run.
+
+  Raises:
+    UserError: for a suite, part or shard that is not there, jobs below 1.
+  """
+  change = {
+    "seeds": args.seeds,
+    "first_seed": args.first_seed,
+    "arms": list(args.arm) or None,
+    "physics": None if args.physics == "auto" else args.physics,
+  }
+  plan = suite(args.suite, {k: v for k, v in change.items() if v is not None})
+  shard = re.fullmatch("([0-9]+)/([0-9]+)", args.shard)
+  if not shard:
+    raise UserError(f"--shard takes K/N, such as 0/2; got {args.shard!r}")
+  require(args.jobs is None or args.jobs >= 1, f"--jobs must be above 0; got {args.jobs}")
+  return plan, pick(plan.parts, args.only, (int(shard[1]), int(shard[2])))
+
+
+def check_merge(others: Collection[str], parts: Sequence[Part]) -> None:
+  """Raises UserError for a folder that holds none of the parts."""
+  for folder in map(pathlib.Path, others):
+    require(folder.is_dir(), f"--merge: no folder {folder}")
+  names = f"{', '.join(p.name for p in parts[:3])}{' ...' * (len(parts) > 3)}"
+  for folder in map(pathlib.Path, others):
+    require(
+      any((folder / p.name / "config.json").is_file() for p in parts),
+      f"--merge: {folder} holds none of the parts {names}; it takes the OUT of a bench of this "
+      "suite",
+    )
+
+
+def note_others(out: pathlib.Path, parts: Sequence[Part]) -> None:
+  """Says which parts that are not asked for the folder holds with other settings than now."""
+  others: dict[str, list[str]] = {}
+  for name, text in standing(out, parts)[1].items():
+    others.setdefault(text, []).append(name)
+  if others:
+    which = "; ".join(f"{', '.join(names)} ({text})" for text, names in others.items())
+    say(
+      "note: left out of bench.json, with the folder as it is, for settings other than now "
+      f"and not asked for: {which}"
+    )
+
+
+def plan_lines(
+  plan: Suite, parts: Sequence[Part], done: Collection[str], estimates: Mapping[str, costs.Estimate]
+) -> list[str]:
+  """The plan of a suite for a reader."""
+  lines = [f"{plan.name}: {plan.about}"]
+  width = max([4, *(len(p.name) for p in parts)])
+  lines.append(f"  {'part':{width}s}  streams  stream-steps   updates  minutes    GiB")
+  for p in parts:
+    e = estimates[p.name]
+    minutes = "finished" if p.name in done else f"{e.seconds / 60:.0f}"
+    lines.append(
+      f"  {p.name:{width}s}  {e.streams:7,d}  {e.stream_steps:12,d}  {e.updates:8,.0f}  "
+      f"{minutes:>7s}  {e.bytes / 2**30:5.1f}"
+    )
+  todo = [p for p in parts if p.name not in done]
+  left = sum(estimates[p.name].seconds for p in todo)
+  lines.append(
+    f"  {len(done)} of {len(parts)} parts finished; about {clock(left)} left, by a one-second "
+    "measurement of this machine's matrix product"
+  )
+  return lines + [f"  note, {which}: {text}" for text, which in bench.notes(todo)]

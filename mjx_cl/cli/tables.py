@@ -1,0 +1,165 @@
+"""Tables for a reader, on standard output. Free of JAX."""
+
+import os
+import sys
+from collections.abc import Callable, Collection, Iterable, Sequence
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from mjx_cl.cli.output import clock
+
+# columns of a run's table, by heading; below each number its 95 % interval
+COLUMNS: dict[str, Callable[[dict], str]] = {
+  "streams": lambda arm: str(arm["seeds"]),
+  "affected": lambda arm: str(arm["affected"]),
+  "alarmed": lambda arm: str(arm["alarms"]),
+  "false\nalarms": lambda arm: str(arm["false_alarm_streams"]),
+  "latency\n[steps]": lambda arm: _cell(arm, "latency_median_steps", ".0f"),
+  "recovered\nin 10,000": lambda arm: _cell(arm, "recovered_within_10000", ".3g", "affected"),
+  "outcome": lambda arm: _outcomes(arm),
+  "reward\nat first": lambda arm: _cell(arm, "reward_pre", ".2f"),
+  "lost\nby fault": lambda arm: _cell(arm, "reward_drop", ".0%"),
+  "reward\nat last": lambda arm: _cell(arm, "reward_final", ".2f"),
+}
+# what a narrow terminal goes without, one after another
+DROPPED = (
+  "reward\nat first",
+  "lost\nby fault",
+  "streams",
+  "outcome",
+  "affected",
+  "false\nalarms",
+  "alarmed",
+)
+
+
+def table(
+  headings: Iterable[str],
+  rows: Iterable[Sequence[object]],
+  left: Collection[str] = (),
+  title: str | None = None,
+  **how: Any,
+) -> Table:
+  """A table of texts.
+
+  Args:
+    headings: of the columns.
+    rows: of cells.
+    left: headings of the columns that are set to the left; the others to the right.
+    title: above it.
+    **how: settings of rich.table.Table.
+  """
+  out = Table(title=title, title_justify="left", **how)
+  for heading in headings:
+    out.add_column(Text(heading), justify="left" if heading in left else "right", overflow="fold")
+  for row in rows:
+    out.add_row(*(Text(str(cell)) for cell in row))
+  return out
+
+
+def console() -> Console:
+  """Of standard output; as wide as a table likes where nothing says how wide a line may be."""
+  told = sys.stdout.isatty() or "COLUMNS" in os.environ
+  return Console(width=None if told else 200)
+
+
+def fits(shown: Table, on: Console) -> bool:
+  """Whether no cell of the table would be folded."""
+  return on.measure(shown, options=on.options.update(width=100_000)).maximum <= on.width
+
+
+def _cell(arm: dict, key: str, form: str, of: str | None = None) -> str:
+  """A number of an arm, out of how many, and its 95 % interval below it; - for what is unknown."""
+  number = lambda x: "-" if x is None else format(round(x, 9), form)
+  text, interval = number(arm[key]), arm.get(f"{key}_ci")
+  if of and arm[key] is not None:
+    text = f"{text} of {arm[of]}"
+  return f"{text}\n[{', '.join(map(number, interval))}]" if interval else text
+
+
+def _outcomes(arm: dict) -> str:
+  """How many streams ended how, those alone that are some."""
+  names = {
+    "converged": "converged",
+    "aborted_by_rule": "aborted by rule",
+    "aborted_by_budget": "by budget",
+    "ended": "ended",
+    "adapting": "adapting at the end",
+    "adapting_at_onset": "adapting at the onset",
+    "failed": "numeric failures",
+  }
+  return ", ".join(f"{arm[key]} {name}" for key, name in names.items() if arm.get(key)) or "-"
+
+
+def show_summary(s: dict, out: str) -> None:
+  """Prints a run's numbers for a reader: a row an arm. What does not fit into the line is left to
+  summary.json.
+  """
+  severity = "" if s["severity"] is None else f" {s['severity']:g}"
+  shares = ", ".join(f"{k} {v:.0%}" for k, v in s["wall_share"].items())
+  print(
+    f"{s['env']}, {s['fault']}{severity} at step {s['onset']:,} of {s['steps']:,}, detector "
+    f"{s['detector']}; {clock(s['wall_s'])} wall ({shares})"
+  )
+  on = console()
+  for dropped in range(len(DROPPED) + 1):
+    kept = {k: cell for k, cell in COLUMNS.items() if k not in DROPPED[:dropped]}
+    rows = [(name, *(cell(arm) for cell in kept.values())) for name, arm in s["arms"].items()]
+    shown = table(("arm", *kept), rows, left=("arm", "outcome"), show_lines=True)
+    if fits(shown, on):
+      break
+  on.print(shown)
+  print(
+    "streams in all but latency (median), rewards (a control step, interquartile mean); [95 % "
+    "interval]; more in summary.json"
+  )
+  if dropped:
+    left = ", ".join(name.replace("\n", " ") for name in DROPPED[:dropped])
+    print(f"not shown on a terminal this narrow, but in summary.json: {left}")
+  print(f"files in {out}")
+
+
+def show_detections(rows: list[dict]) -> None:
+  """Prints a detection's summary; where the columns that alarms are in do not fit into the line
+  they stand below, one line for all detectors that name the same.
+  """
+  on = console()
+  shown = detect_table(rows, True)
+  wide = not fits(shown, on)
+  on.print(detect_table(rows, False) if wide else shown)
+  groups: dict[str, list[str]] = {}
+  for row in rows if wide else ():
+    groups.setdefault(", ".join(row["columns"]) or "no column", []).append(row["detector"])
+  for columns, names in groups.items():
+    print(f"{', '.join(names)}: alarms in {columns}")
+  if any(row["calibrated"] is False for row in rows):
+    print("* not calibrated")
+
+
+def detect_table(rows: list[dict], columns: bool) -> Table:
+  """Rows of a detection's summary, with or without the columns that alarms are in."""
+  shown = []
+  for row in rows:
+    mark = "" if row["calibrated"] else " own" if row["calibrated"] is None else " *"
+    threshold = "-" if row["threshold"] is None else f"{row['threshold']:.4g}"
+    counts = [
+      "-" if x is None else f"{x:,}" if isinstance(x, int) else f"{x:,.3f}"
+      for x in (row["first_alarm"], row["first_alarm_s"], row["alarms"])
+    ]
+    alarms = [", ".join(row["columns"])] * columns
+    shown.append(
+      (row["detector"], threshold + mark, f"{row['nominal_alarms']:,}", *counts, *alarms)
+    )
+  names = (
+    "detector",
+    "threshold",
+    "nominal\nalarms",
+    "first\nalarm",
+    "at [s]",
+    "alarms",
+    "columns",
+  )
+  return table(names[: 6 + columns], shown, left=("detector", "columns"))

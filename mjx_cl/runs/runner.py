@@ -1,0 +1,382 @@
+"""The life of a run: all its streams, chunk by chunk, and its checkpoints."""
+
+import itertools
+import pathlib
+import sys
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_cl import envs, faults
+from mjx_cl.adapt import decide as phase_lib
+from mjx_cl.adapt.arms import ARMS, FOREVER, never_stops
+from mjx_cl.adapt.loop import Choices, Digest, LoopState, Programs, choices
+from mjx_cl.config import CHUNK, RunConfig
+from mjx_cl.dreamer.agent import CAUSES, EXPLODED
+from mjx_cl.errors import FileError
+from mjx_cl.faults.presets import becomes, changes
+from mjx_cl.io import arrays, checkpoints, runtime
+from mjx_cl.keys import OfSeed
+from mjx_cl.rollout.order import Lanes
+from mjx_cl.rollout.scan import Rollout, Row, nest, start
+from mjx_cl.rollout.transfer import Transfer
+from mjx_cl.runs.crew import crew
+from mjx_cl.runs.identity import arm_agents, identity
+from mjx_cl.runs.records import acts
+from mjx_cl.runs.settings import check
+from mjx_cl.runs.snapshots import Snapshots
+from mjx_cl.runs.trace import at_end, columns
+from mjx_cl.scoring import stop_rule
+from mjx_cl.training import agents
+
+
+class State(NamedTuple):
+  """All arrays of a run.
+
+  Attributes:
+    streams: the robots, a Stream, or a Moving where they become others.
+    loop: everything else, in blocks of streams, see adapt/blocks.py.
+  """
+
+  streams: Any
+  loop: list[LoopState]
+
+
+class Progress(NamedTuple):
+  """What a display needs after each chunk.
+
+  Attributes:
+    step: control steps done.
+    steps: of the run.
+    seconds: of wall time.
+    arms: of each stream.
+    seeds: of each stream.
+    phase: int (groups,), index into decide.PHASES.
+    reward: float (groups,), mean of the chunk.
+    alarms: int (groups,), so far.
+    updates: int (groups,), so far.
+    note: what else is under way.
+  """
+
+  step: int
+  steps: int
+  seconds: float
+  arms: list[str]
+  seeds: list[int]
+  phase: np.ndarray | jax.Array
+  reward: np.ndarray | jax.Array
+  alarms: np.ndarray
+  updates: np.ndarray | jax.Array
+  note: str = ""
+
+
+def held(state: LoopState) -> dict:
+  """Its fields by name, without those that this run has no use for: a checkpoint of a version that
+  did not know them yet goes on.
+  """
+  return {name: value for name, value in state._asdict().items() if value is not None}
+
+
+def entered(streams: Any) -> np.ndarray:
+  """Int (groups,), control step at which each robot became the other one; FOREVER: not known."""
+  return np.asarray(streams.after.enter)[:, 0]
+
+
+class Runner:
+  """Runs one RunConfig into the folder `out`.
+
+  Streams are ordered arm by arm, seed by seed. A stream's keys come from its seed alone, so the
+  same seed lives the same life in every arm until an alarm is acted on, bit for bit: see
+  rollout/order.py. Another number of arms or seeds is another program, which rounds otherwise.
+  """
+
+  def __init__(
+    self, config: RunConfig, out: pathlib.Path | str, programs: Programs | None = None
+  ) -> None:
+    self.config = config = check(config)
+    self.out = pathlib.Path(out)
+    self.work = self.out / "work"
+    # the robots, their agents and what befalls them
+    self.env = envs.make(config.env, config.physics)
+    into = becomes(config)
+    self.other = None if into is None else envs.make(into, config.physics)
+    self.robots = [self.env] if self.other is None else [self.env, self.other]
+    adapt = ("lr", "policy_lr", "anchor", "last_starts", "batch")
+    departures = {name: getattr(config.adapt, name) for name in adapt}
+    self.trained = agents.of(self.env, config.agent, **departures)
+    self.repeat = int(self.trained.card.get("repeat", 1))
+    self.others = arm_agents(config, self.env)
+    self.changes = changes(config)
+    self.stops = stop_rule.told(config)
+    self.faults, plan, target = faults.build(self.changes, self.robots[-1], config.onset)
+    # the streams
+    seeds = range(config.first_seed, config.first_seed + config.seeds)
+    self.labels = list(itertools.product(config.arms, seeds))
+    self.groups = len(self.labels)
+    self.lanes = Lanes(len(config.arms), config.seeds)
+    arms = [ARMS[arm] for arm in config.arms]
+    self.endless = any(never_stops(arm) for arm in arms)
+    self.breaks = np.asarray([ARMS[arm].breaks for arm, _ in self.labels])
+    self.chunk_steps = CHUNK * self.repeat
+    self.chunks = -(-config.steps // self.chunk_steps)
+    # what moves them
+    keys = jnp.stack([jax.random.key(seed) for _, seed in self.labels])[:, None]
+    self.keys = jax.vmap(lambda k: jax.random.fold_in(k, OfSeed.ADAPTATION))(keys[:, 0])
+    self.rollout, begin = self._rollout(plan, target)
+    self.crew = crew(config, self.robots, self.trained, self.groups, programs)
+    trains = [self.others.get(arm, self.trained).train for arm, _ in self.labels]
+    self.state = State(
+      nest(begin, (0, 0), (0, None))(keys, jnp.asarray(self.breaks)),
+      self.crew.init(trains, any(arm.rollback for arm in arms)),
+    )
+    self.acting = self.crew.acting(self.state.loop, self.lanes)
+    self.choices = self._choices(self.state.streams)
+    # what has been lived
+    self.done_chunks = 0
+    self.compiled = False  # the first chunk of this process compiles
+    self.seconds = {"physics": 0.0, "acting": 0.0, "digest": 0.0, "other": 0.0}
+    self.quiet: list[float] = []  # digest time of chunks without an update
+    self.parts: list[dict] = []
+    self.stream_seconds: np.ndarray = np.zeros(self.groups)
+    self._updates: Any = np.zeros(self.groups, int)
+    self._alarms: Any = np.zeros(self.groups, int)
+    self._phase: Any = np.zeros(self.groups, int)
+    self.snapshots: Snapshots | None = None
+    if config.snapshots:
+      what = (self.robots[-1], self.trained, self.faults, self.changes, self.labels)
+      self.snapshots = Snapshots(config, *what, self.work / "snapshots")
+
+  def _rollout(self, plan: faults.Plan, target: Any) -> tuple[Any, Callable[..., Any]]:
+    """The rollout, and what begins a stream of it, given its key and whether its robot breaks."""
+    env, agent, own, onset = self.env, self.trained.agent, self.faults, self.config.onset
+    how = (self.repeat, self.config.deterministic)
+    # without any severity for a robot that does not break
+    spared = lambda breaks: plan._replace(severity=jnp.where(breaks, plan.severity, 0.0))
+    if self.other is None:
+      begin = lambda key, breaks: start(env, agent, own, key, target=target, plan=spared(breaks))
+      return Rollout(env, agent, own, *how), begin
+    moves = Transfer(env, self.other, agent, own, *how)
+    due = lambda breaks: jnp.where(breaks, onset, FOREVER)
+    return moves, lambda key, breaks: moves.start(key, target, spared(breaks), due(breaks))
+
+  def open(self) -> None:
+    """Makes the working folder; before that nothing in `out` is touched."""
+    self.checkpoints = checkpoints.Checkpoints(self.work / "checkpoints")
+
+  # ---- one chunk ---------------------------------------------------------------------------------
+
+  def step(self) -> Progress:
+    """Lives one chunk and logs it."""
+    begin = time.perf_counter()
+    physics = self._physics_seconds()
+    streams, rows = self.rollout.chunk(self.acting, self.lanes.spread(self.state.streams), CHUNK)
+    streams, rows = self.lanes.gather(streams), self.lanes.gather_rows(jax.block_until_ready(rows))
+    acted = time.perf_counter()
+    physics = self._physics_seconds() - physics
+    now = (self.done_chunks + 1) * self.chunk_steps
+    if self.other is not None:
+      self.choices = self._choices(streams)  # robots have changed in this chunk
+    accepted = self._acceptance(streams, now)
+    loop, digest = self.crew.digest(
+      self.state.loop, rows, jnp.int32(now), self.choices, self.keys, accepted
+    )
+    digested = time.perf_counter()
+    self.state = State(streams, loop)
+    # weights are what they were in every other stream
+    changed = (digest.updates != self._updates) | (digest.decision > 0)
+    # the only block's own arrays are used up by its next digest
+    if changed.any() or len(loop) == 1:
+      self.acting = self.crew.acting(loop, self.lanes)
+    before = self._phase
+    self._log(rows, digest)
+    updates = digest.updates - self._updates
+    self._updates = digest.updates
+    self._alarms = self._alarms + digest.fired.sum(0)
+    self.done_chunks += 1
+    self._notice_failures(digest, now)
+    if self.snapshots:
+      self.snapshots.take(self.acting, self.lanes.place, before, digest, now, self.chunk_steps)
+    self._account(acted - begin, physics, digested - acted, np.asarray(updates))
+    self.seconds["other"] += time.perf_counter() - digested
+    arms, seeds = map(list, zip(*self.labels))
+    return Progress(
+      min(now, self.config.steps),
+      self.config.steps,
+      sum(self.seconds.values()),
+      arms,
+      seeds,
+      digest.phase,
+      digest.signals[:, phase_lib.SIGNALS.index("reward")],
+      self._alarms,
+      digest.updates,
+    )
+
+  def _account(self, acting: float, physics: float, digest: float, updates: np.ndarray) -> None:
+    """Adds a chunk's seconds, those of compiling apart, and shares them among the streams: what
+    learning took among those that learnt.
+    """
+    learnt = updates.sum()
+    if self.compiled:
+      self.seconds["physics"] += physics
+      self.seconds["acting"] += acting - physics
+      self.seconds["digest"] += digest
+      if not learnt:
+        self.quiet.append(digest)
+    else:
+      self.seconds["other"] += acting + digest
+      self.compiled = True
+    learning = max(0.0, digest - float(np.median(self.quiet))) if self.quiet and learnt else 0.0
+    all_share = (acting + digest - learning) / self.groups
+    self.stream_seconds += all_share + learning * updates / max(1, learnt)
+
+  def _notice_failures(self, digest: Digest, now: int) -> None:
+    """Says which streams are given up for a loss at fault; they live on without learning. A reward
+    that is no number would spoil every figure: that ends the run.
+    """
+    lost = np.flatnonzero(~np.isfinite(digest.signals[:, phase_lib.SIGNALS.index("reward")]))
+    if len(lost):
+      raise FileError(
+        f"numeric failure at step {now} in stream {self.labels[lost[0]]}: its reward is not "
+        "finite; the last checkpoint is intact"
+      )
+    for g in np.flatnonzero(digest.decision == phase_lib.ABORT_NUMERIC):
+      bad = int(digest.failed[g])
+      wrong = [
+        name for name, x in zip(phase_lib.SIGNALS[3:], digest.signals[g, 3:]) if not np.isfinite(x)
+      ]
+      term = CAUSES[bad] if bad >= 0 else wrong[0]
+      arm, seed = self.labels[g]
+      print(
+        f"mjx-cl: numeric failure at step {now} of arm {arm}, seed {seed}: {term} is not "
+        f"finite, or above {EXPLODED:g}; it learns no more, the others go on",
+        file=sys.stderr,
+        flush=True,
+      )
+
+  def _physics_seconds(self) -> float:
+    # robots of one model share a host
+    clocks = {id(getattr(p, "host", p)): p for p in map(envs.physics_of, self.robots)}
+    return sum(getattr(p, "seconds", 0.0) for p in clocks.values())
+
+  def _acceptance(self, streams: Any, now: int) -> jax.Array | None:
+    """Level (groups,) of the robot that each stream has after `now` control steps; None where
+    robots stay what they are.
+    """
+    if self.other is None:
+      return None
+    levels = [jnp.float32(robot.spec.acceptance) for robot in (self.other, self.env)]
+    return jnp.where(streams.after.enter[:, 0] < now, *levels)
+
+  def _choices(self, streams: Any) -> Choices:
+    """The arms, with every true onset of their robots that is known by now; arms that are told one
+    begin there even where the fault's severity is 0.
+    """
+    c = self.config
+    onsets = tuple(c.onset + change.after for change in self.changes if change.fault != "none")
+    known = [onsets] * self.groups
+    if self.other is not None:
+      known = [(step, *onsets) for step in entered(streams).tolist()]
+    return choices(self.labels, c.adapt, c.steps, known, self.stops)
+
+  def onsets(self) -> list[int | None]:
+    """Each stream's onset; where the robot becomes another one: as far as it is known. None: not in
+    this run, an arm whose robot is spared, or a run without a fault or with one of severity 0,
+    which changes nothing.
+    """
+    steps, onset = self.config.steps, self.config.onset
+    if self.other is not None:
+      return [step if step < steps else None for step in entered(self.state.streams).tolist()]
+    met = onset < steps and any(acts(change) for change in self.changes)
+    return [onset if breaks and met else None for breaks in self.breaks]
+
+  def _log(self, rows: Row, digest: Digest) -> None:
+    """Keeps a chunk's rows, (control steps, groups), and its chunk values (groups,)."""
+    part = columns(rows, digest, self._phase, self._updates, self.repeat)
+    if self.config.parts:
+      part["parts"] = at_end(digest.residual.groups, self.repeat)
+    if self.config.residuals:
+      part["variables"] = at_end(digest.residual.variables, self.repeat)
+    if self.endless:  # what the stop rule reads besides the signals
+      level: Any = self.config.adapt.acceptance
+      if level is None:
+        level = self._acceptance(self.state.streams, (self.done_chunks + 1) * self.chunk_steps)
+      level = np.float32(self.env.spec.acceptance if level is None else level)
+      index = (self.env.spec.posture or (0, 0.0))[0]
+      part["posture"] = np.asarray(rows.final_obs)[:, :, 0, index].mean(0)[None]
+      part["acceptance"] = np.broadcast_to(level, (1, self.groups)).copy()
+    self._phase = digest.phase
+    self.parts.append(part)
+
+  # ---- kill and resume ---------------------------------------------------------------------------
+
+  def save(self) -> None:
+    """Trace so far and state, so that a killed run goes on from here."""
+    number = self.done_chunks
+    if self.checkpoints.latest() == number:
+      return
+    begin = time.perf_counter()
+    arrays.write(self.work / f"trace-{number:06d}.npz", self.trace())
+    self.seconds["other"] += time.perf_counter() - begin
+    meta = {
+      "seconds": self.seconds,
+      "quiet": self.quiet,
+      "stream_seconds": self.stream_seconds.tolist(),
+      "updates": self._updates.tolist(),
+      "alarms": self._alarms.tolist(),
+      "phase": self._phase.tolist(),
+    }
+    state: Any = (self.state.streams, held(self.crew.join(self.state.loop)))
+    self.checkpoints.save(number, State(*state), meta)
+    runtime.give_back()
+    for old in sorted(self.work.glob("trace-*.npz"))[:-2]:
+      old.unlink()
+
+  def trace(self) -> dict[str, np.ndarray]:
+    """Everything that has been logged, (control steps, groups) or (chunks, groups)."""
+    names = self.parts[0] if self.parts else ()
+    return {name: np.concatenate([part[name] for part in self.parts]) for name in names}
+
+  def resume(self) -> None:
+    """Goes on from the newest checkpoint; without one, from the start."""
+    number = self.checkpoints.latest()
+    if number is None:
+      return
+    like: Any = (self.state.streams, held(self.crew.shapes(self.state.loop)))
+    # what the run began with need not lie beside what it goes on with
+    del self.state, self.acting
+    (streams, loop), meta = self.checkpoints.load(State(*like))
+    self.state = State(streams, self.crew.split(LoopState(**loop)))
+    self.acting = self.crew.acting(self.state.loop, self.lanes)
+    self.parts = [arrays.read(self.work / f"trace-{number:06d}.npz")]
+    self.done_chunks = number
+    self.seconds, self.quiet = meta["seconds"], meta["quiet"]
+    self.stream_seconds, self._updates, self._alarms, self._phase = (
+      np.asarray(meta[k]) for k in ("stream_seconds", "updates", "alarms", "phase")
+    )
+
+  @property
+  def done(self) -> bool:
+    """All chunks have been lived."""
+    return self.done_chunks >= self.chunks
+
+  def config_dict(self) -> dict:
+    """What config.json holds."""
+    return {
+      "command": "run",
+      **identity(self.config),
+      "physics": "+".join(dict.fromkeys(envs.physics_of(robot).name for robot in self.robots)),
+      "agent_card": self.trained.card,
+      **(
+        {"arm_cards": {arm: other.card for arm, other in self.others.items()}}
+        if self.others
+        else {}
+      ),
+      "agent_path": pathlib.Path(self.trained.path).name,
+      "repeat": self.repeat,
+      "control_s": self.env.spec.control_s,
+      **runtime.provenance(),
+    }
