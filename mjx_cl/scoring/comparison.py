@@ -142,8 +142,8 @@ def _drawn(rows: list[dict], reps: int) -> np.ndarray | None:
       raise UserError(
         f"the faults of robot {robot!r} must have the same seeds; got {streams} streams"
       )
-    weights = bootstrap.weights(streams[0], reps, seed)
-    drawn = drawn + sum(map(_values, mine)) @ weights.T / len(rows)
+    sums: Any = sum(map(_values, mine))
+    drawn = drawn + sums @ bootstrap.weights(sums.shape[1], reps, seed).T / len(rows)
   return drawn
 
 
