@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int, Key
 
 from mjx_cl.faults.presets import FOREVER, Change, place
 
-Numbers = ArrayLike | Sequence[float]
+Numbers = ArrayLike | Sequence[float | int]
 
 
 class Plan(NamedTuple):

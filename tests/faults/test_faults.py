@@ -307,7 +307,7 @@ def test_what_a_map_returns_beside_its_own_leaves_is_refused(short_walker):
       ports_of(short_walker, obs=False),
     )
   with pytest.raises(ValueError, match="sensors are read at another moment"):
-    faults.fault("two", short_walker, ("ctrl", "obs"), ("all",), print)
+    faults.fault("two", short_walker, ("ctrl", "obs"), ("all",), lambda *_: None)
 
 
 def test_every_documented_fault_states_severity_target_and_leaves(short_walker):
