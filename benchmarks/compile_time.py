@@ -45,7 +45,7 @@ def digest():
     RunConfig(env="walker", seeds=2, arms=("detector",), steps=10_000), tempfile.gettempdir()
   )
   _, rows = runner.rollout.chunk(runner.acting, runner.state.streams, CHUNK)
-  first, loop = runner.crew.blocks[0], runner.crew.loop
+  first, loop = runner.loops.blocks[0], runner.loops.loop
   return loop._program, (
     runner.state.loop[0],
     cut(rows, first, 1),

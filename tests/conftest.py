@@ -47,11 +47,11 @@ def resident_gib() -> float:
 @pytest.fixture(scope="session", autouse=True)
 def programs():
   """All runs of a test process share their compiled programs, as the parts of a suite do."""
-  from mjx_cl.runs import crew, run
+  from mjx_cl.runs import loops, run
 
   kept = run.Programs()
   with pytest.MonkeyPatch.context() as patch:
-    for module in (crew, run):
+    for module in (loops, run):
       patch.setattr(module, "Programs", lambda: kept)
     yield kept
 

@@ -15,8 +15,8 @@ from mjx_cl.errors import UserError
 from mjx_cl.faults.presets import becomes, changes
 from mjx_cl.io import memory
 from mjx_cl.rollout.order import Lanes
-from mjx_cl.runs.crew import capacity
 from mjx_cl.runs.identity import arm_agents
+from mjx_cl.runs.loops import capacity
 from mjx_cl.runs.records import acts
 from mjx_cl.runs.suite import Part
 from mjx_cl.scoring import stop_rule

@@ -231,7 +231,7 @@ def keep(runner: Runner) -> None:
   seed, control steps of the run, updates taken.
   """
   config, folder = runner.config, runner.out / "agents"
-  for block, loop in zip(runner.crew.blocks, runner.state.loop):
+  for block, loop in zip(runner.loops.blocks, runner.state.loop):
     for at, g in enumerate(range(block.start, block.stop)):
       arm, seed = runner.labels[g]
       updates = int(runner._updates[g])

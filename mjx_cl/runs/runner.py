@@ -24,8 +24,8 @@ from mjx_cl.keys import OfSeed
 from mjx_cl.rollout.order import Lanes
 from mjx_cl.rollout.scan import Rollout, Row, nest, start
 from mjx_cl.rollout.transfer import Transfer
-from mjx_cl.runs.crew import crew
 from mjx_cl.runs.identity import arm_agents, identity
+from mjx_cl.runs.loops import loops
 from mjx_cl.runs.records import acts
 from mjx_cl.runs.settings import check
 from mjx_cl.runs.snapshots import Snapshots
@@ -127,13 +127,13 @@ class Runner:
     keys = jnp.stack([jax.random.key(seed) for _, seed in self.labels])[:, None]
     self.keys = jax.vmap(lambda k: jax.random.fold_in(k, OfSeed.ADAPTATION))(keys[:, 0])
     self.rollout, begin = self._rollout(plan, target)
-    self.crew = crew(config, self.robots, self.trained, self.groups, programs)
+    self.loops = loops(config, self.robots, self.trained, self.groups, programs)
     trains = [self.others.get(arm, self.trained).train for arm, _ in self.labels]
     self.state = State(
       nest(begin, (0, 0), (0, None))(keys, jnp.asarray(self.breaks)),
-      self.crew.init(trains, any(arm.rollback for arm in arms)),
+      self.loops.init(trains, any(arm.rollback for arm in arms)),
     )
-    self.acting = self.crew.acting(self.state.loop, self.lanes)
+    self.acting = self.loops.acting(self.state.loop, self.lanes)
     self.choices = self._choices(self.state.streams)
     # what has been lived
     self.done_chunks = 0
@@ -181,7 +181,7 @@ class Runner:
     if self.other is not None:
       self.choices = self._choices(streams)  # robots have changed in this chunk
     accepted = self._acceptance(streams, now)
-    loop, digest = self.crew.digest(
+    loop, digest = self.loops.digest(
       self.state.loop, rows, jnp.int32(now), self.choices, self.keys, accepted
     )
     digested = time.perf_counter()
@@ -190,7 +190,7 @@ class Runner:
     changed = (digest.updates != self._updates) | (digest.decision > 0)
     # the only block's own arrays are used up by its next digest
     if changed.any() or len(loop) == 1:
-      self.acting = self.crew.acting(loop, self.lanes)
+      self.acting = self.loops.acting(loop, self.lanes)
     before = self._phase
     self._log(rows, digest)
     updates = digest.updates - self._updates
@@ -329,7 +329,7 @@ class Runner:
       "alarms": self._alarms.tolist(),
       "phase": self._phase.tolist(),
     }
-    state: Any = (self.state.streams, held(self.crew.join(self.state.loop)))
+    state: Any = (self.state.streams, held(self.loops.join(self.state.loop)))
     self.checkpoints.save(number, State(*state), meta)
     runtime.give_back()
     for old in sorted(self.work.glob("trace-*.npz"))[:-2]:
@@ -345,12 +345,12 @@ class Runner:
     number = self.checkpoints.latest()
     if number is None:
       return
-    like: Any = (self.state.streams, held(self.crew.shapes(self.state.loop)))
+    like: Any = (self.state.streams, held(self.loops.shapes(self.state.loop)))
     # what the run began with need not lie beside what it goes on with
     del self.state, self.acting
     (streams, loop), meta = self.checkpoints.load(State(*like))
-    self.state = State(streams, self.crew.split(LoopState(**loop)))
-    self.acting = self.crew.acting(self.state.loop, self.lanes)
+    self.state = State(streams, self.loops.split(LoopState(**loop)))
+    self.acting = self.loops.acting(self.state.loop, self.lanes)
     self.parts = [arrays.read(self.work / f"trace-{number:06d}.npz")]
     self.done_chunks = number
     self.seconds, self.quiet = meta["seconds"], meta["quiet"]

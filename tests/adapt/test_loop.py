@@ -447,7 +447,7 @@ def tell(kind, config=EAGER, used=0, block=1):
   """Lives the script with an agent of class `kind` whose optimiser state is `used` more than fresh:
   (start, [Told of each chunk]).
 
-  block: streams in a block of the crew, which has two threads; one, as on a CPU: any number of
+  block: streams in a block; there are two threads; one, as on a CPU: any number of
   blocks shares a program.
   """
   agent = kind(dataclasses.replace(PRESETS["tiny"].dreamer, batch=4, length=8, imagine=4), 24, 6)
@@ -472,22 +472,22 @@ def tell(kind, config=EAGER, used=0, block=1):
   keys, chosen = jax.random.split(jax.random.key(1), 3), choices(ARMS, config, CHUNKS * STEPS)
   copy = lambda tree: jax.tree.map(lambda x: np.array(x), tree)
   begin, told = copy(state), []
-  crew = Blocks(loop, 3, block, threads=2)
-  states = crew.split(state._replace(replay=[cut(state.replay, own, 0) for own in crew.blocks]))
+  loops = Blocks(loop, 3, block, threads=2)
+  states = loops.split(state._replace(replay=[cut(state.replay, own, 0) for own in loops.blocks]))
   whole = lambda joined: joined._replace(
     replay=jax.tree.map(lambda *x: np.concatenate(x), *joined.replay)
   )
   for c in range(CHUNKS):
-    states, digest = crew.digest(
+    states, digest = loops.digest(
       states, hand_rows(c * STEPS), jnp.int32((c + 1) * STEPS), chosen, keys
     )
-    told.append(Told(whole(copy(crew.join(states))), digest))
-  joined = copy(crew.join(states))
-  jax.tree.map(np.testing.assert_array_equal, copy(crew.acting(states)), joined.acting)
+    told.append(Told(whole(copy(loops.join(states))), digest))
+  joined = copy(loops.join(states))
+  jax.tree.map(np.testing.assert_array_equal, copy(loops.acting(states)), joined.acting)
   jax.tree.map(
-    np.testing.assert_array_equal, copy(crew.join(crew.split(joined))), joined
+    np.testing.assert_array_equal, copy(loops.join(loops.split(joined))), joined
   )  # what a checkpoint holds, and back
-  assert jax.tree.map(lambda x: (x.shape, x.dtype), crew.shapes(states)) == jax.tree.map(
+  assert jax.tree.map(lambda x: (x.shape, x.dtype), loops.shapes(states)) == jax.tree.map(
     lambda x: (x.shape, x.dtype), joined
   )
   return begin, told

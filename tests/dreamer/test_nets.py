@@ -267,7 +267,7 @@ def test_policy_density_and_bounds():
   np.testing.assert_allclose(
     nets.normal_entropy(jnp.asarray(std)), scipy.stats.norm.entropy(mean, std).sum(-1), rtol=1e-5
   )  # float32 sum
-  low, high = nets.normal(0.0, jnp.array([-1e3, 1e3]))[1]
+  low, high = nets.normal(jnp.zeros(2), jnp.array([-1e3, 1e3]))[1]
   np.testing.assert_allclose([low, high], [0.1, 1.0], rtol=1e-6)  # one ulp
 
 

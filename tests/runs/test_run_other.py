@@ -122,7 +122,7 @@ def live(patch, tmp_path_factory):
     runner.step()
   run.finish(runner)
   assert (
-    runner.crew.loop._program._cache_size() == runner.rollout.chunk._cache_size() == 1
+    runner.loops.loop._program._cache_size() == runner.rollout.chunk._cache_size() == 1
   )  # arrays that MJX binds to a device would be a second compilation of each
   step, later = run.Runner.step, []
   patch.setattr(run.Runner, "step", lambda self: (later.append(self.done_chunks), step(self))[1])

@@ -406,10 +406,10 @@ def lived(config, folder):
   def watched(self):
     progress = step(self)
     jax.tree.map(
-      np.testing.assert_array_equal, self.acting, self.crew.acting(self.state.loop)
+      np.testing.assert_array_equal, self.acting, self.loops.acting(self.state.loop)
     )  # what acts is never out of date
     acted[progress.step - 1] = jax.tree.map(
-      lambda x: np.array(x[3]), {k: self.crew.acting(self.state.loop)[k] for k in snapshots.ACTS}
+      lambda x: np.array(x[3]), {k: self.loops.acting(self.state.loop)[k] for k in snapshots.ACTS}
     )
     return progress
 

@@ -20,7 +20,7 @@ from mjx_cl.config import CHUNK, AdaptConfig, RunConfig
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.io import folders, memory, tables
 from mjx_cl.render import figures
-from mjx_cl.runs import bench, costs, crew, merge, run, scores, settings
+from mjx_cl.runs import bench, costs, loops, merge, run, scores, settings
 from mjx_cl.runs import suite as suites
 from mjx_cl.scoring import stop_rule
 
@@ -459,7 +459,7 @@ def test_parts_run_once_go_on_and_merge(mjx, refused, mini, tmp_path, monkeypatc
   assert lived == [1, 2] + [0, 1, 2]  # the part that was cut off goes on, the other begins
   config = suites.suite(str(mini)).parts[0].config
   assert (
-    run.Runner(config, tmp_path).crew.loop._program._cache_size() == 1
+    run.Runner(config, tmp_path).loops.loop._program._cache_size() == 1
   )  # a run that goes on compiles nothing anew
   del begun[:], lived[:]
 
@@ -701,7 +701,7 @@ def test_runs_of_one_kind_share_their_program(mini, tmp_path, programs):  # noqa
   """
   (part, _, _) = suites.suite(str(mini)).parts
   program = lambda **change: (
-    run.Runner(dataclasses.replace(part.config, **change), tmp_path).crew.loop._program
+    run.Runner(dataclasses.replace(part.config, **change), tmp_path).loops.loop._program
   )
   first = program()
   adapt = dataclasses.replace(part.config.adapt, budget=300, ratio=4.0, near=2.0)
@@ -712,7 +712,7 @@ def test_runs_of_one_kind_share_their_program(mini, tmp_path, programs):  # noqa
     {"adapt": dataclasses.replace(part.config.adapt, lr=1e-3)},
   ):
     assert program(**other) is not first
-  unhashable = run.Runner(part.config, tmp_path).crew.loop
+  unhashable = run.Runner(part.config, tmp_path).loops.loop
   own = type(unhashable)(
     unhashable.agent,
     unhashable.monitor,
@@ -724,7 +724,7 @@ def test_runs_of_one_kind_share_their_program(mini, tmp_path, programs):  # noqa
   )
   assert own._program is not first  # what has no hash shares nothing
   assert 1 < len(programs.kept) <= programs.most
-  assert run.Runner(part.config, tmp_path, type(programs)()).crew.loop._program is not first
+  assert run.Runner(part.config, tmp_path, type(programs)()).loops.loop._program is not first
 
 
 @pytest.mark.parametrize(
@@ -733,7 +733,9 @@ def test_runs_of_one_kind_share_their_program(mini, tmp_path, programs):  # noqa
 )
 def test_replays_of_about_one_length_have_one_shape(steps, capacity):
   """Room for every record, a quarter more at most."""
-  assert crew.capacity(steps, 1000) == capacity >= steps + steps // 1000 + 2 * CHUNK or steps < 1024
+  assert (
+    loops.capacity(steps, 1000) == capacity >= steps + steps // 1000 + 2 * CHUNK or steps < 1024
+  )
   assert capacity <= max(1024, 1.25 * (steps + steps // 1000 + 3 * CHUNK))
 
 
@@ -744,13 +746,13 @@ def test_a_reward_that_is_no_number_ends_a_run_in_one_line(mini, tmp_path):  # n
   runner.open()
   runner.step()
   runner.save()
-  digest = runner.crew.digest
+  digest = runner.loops.digest
 
   def broken(*given):
     state, value = digest(*given)
     return state, value._replace(signals=np.asarray(value.signals) * [[1.0], [np.nan]])
 
-  runner.crew.digest = broken
+  runner.loops.digest = broken
   with pytest.raises(
     FileError,
     match=(
@@ -786,7 +788,7 @@ def test_a_stream_whose_loss_fails_is_given_up_alone_and_named(mini, tmp_path, s
     for i in range(chunks):
       if runner is hurt and i == 3:
         assert (runner._updates > 0).all()
-        (block,) = [k for k, b in enumerate(runner.crew.blocks) if b.start == 1]
+        (block,) = [k for k, b in enumerate(runner.loops.blocks) if b.start == 1]
         loop = runner.state.loop[block]
         data = loop.replay.data
         at = jax.tree.map(np.array, loop.train)

@@ -24,7 +24,7 @@ def capacity(steps: int, episode: int, repeat: int = 1) -> int:
   return replay.room((chunks + 2) * CHUNK + steps // episode)
 
 
-def crew(
+def loops(
   config: RunConfig,
   robots: list[Any],
   trained: agents.Trained,
