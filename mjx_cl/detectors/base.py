@@ -6,9 +6,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
 from mjx_cl.errors import UserError
+from mjx_cl.types import Array
 
 Flag = Bool[Array, ""]
 Count = Int[Array, ""]

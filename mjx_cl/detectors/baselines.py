@@ -6,10 +6,11 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Key, UInt32
+from jaxtyping import Key, UInt32
 
 from mjx_cl.detectors.base import Alarm, Detector, Setting, above, demand, judged
 from mjx_cl.rollout.monitor import Residual
+from mjx_cl.types import Array
 
 
 def reference(factory: Callable[..., Detector]) -> Callable[..., Detector]:

@@ -24,7 +24,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Float32, Int32
+from jaxtyping import Float, Float32, Int32
 
 from mjx_cl.detectors import multivariate
 from mjx_cl.detectors.base import (
@@ -39,6 +39,7 @@ from mjx_cl.detectors.base import (
   whole,
 )
 from mjx_cl.rollout.monitor import Residual
+from mjx_cl.types import Array
 
 Drawn = Int32[np.ndarray, "repetitions drawn"]
 Noise = Float32[np.ndarray, "repetitions drawn"]

@@ -15,9 +15,10 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from mjx_cl.detectors.base import Detector, Number, Real, Setting, above, chart, demand, scalar
+from mjx_cl.types import Array
 
 FAR = 1e3  # samples are cut here [warm-up std]
 LEAST = -1e4  # log-probability of what no run length stands for [nats]

@@ -9,11 +9,12 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from mjx_cl.detectors.base import Alarm, Count, Detector, Flag, demand, keep
 from mjx_cl.errors import UserError
 from mjx_cl.rollout.monitor import CHANNELS, Residual
+from mjx_cl.types import Array
 
 NAMES = f"{', '.join(CHANNELS)}, variable_0 and so on"
 

@@ -16,9 +16,10 @@ import math
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from mjx_cl.detectors.base import Detector, Number, Real, Setting, above, chart, demand, scalar
+from mjx_cl.types import Array
 
 FORMS = ("sum", "max")
 Bets = Float[Array, "bets"]

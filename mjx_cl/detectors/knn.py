@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from mjx_cl.detectors.base import (
   Alarm,
@@ -20,6 +20,7 @@ from mjx_cl.detectors.base import (
 )
 from mjx_cl.detectors.multivariate import Trail, once, push, restart, trail
 from mjx_cl.rollout.monitor import LATENT, Residual
+from mjx_cl.types import Array
 
 Latents = Float[Array, "references latent"]
 

@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float, Int, UInt32
+from jaxtyping import Float, Int, UInt32
 
 from mjx_cl.detectors.base import (
   Alarm,
@@ -34,6 +34,7 @@ from mjx_cl.detectors.base import (
   demand,
   scalar,
 )
+from mjx_cl.types import Array
 
 
 class KswinState(NamedTuple):

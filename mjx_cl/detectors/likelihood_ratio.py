@@ -6,12 +6,13 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from mjx_cl.detectors.base import Alarm, Detector, Number, Setting, above, demand, judged, whole
 from mjx_cl.detectors.multivariate import Rows, pick
 from mjx_cl.errors import UserError
 from mjx_cl.rollout.monitor import CHANNELS, Residual
+from mjx_cl.types import Array
 
 
 class LikelihoodRatioState(NamedTuple):

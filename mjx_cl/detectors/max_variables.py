@@ -2,10 +2,11 @@
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from mjx_cl.detectors.base import Detector, Number, Setting, whole
 from mjx_cl.detectors.multivariate import Rows, split, standing
+from mjx_cl.types import Array
 
 
 def corrected(z: Float[Array, "*rows"], charts: int, two_sided: bool) -> Float[Array, "*rows"]:

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from mjx_cl.detectors.base import (
   Alarm,
@@ -28,6 +28,7 @@ from mjx_cl.detectors.base import (
 from mjx_cl.detectors.combine import NAMES, is_channel, read
 from mjx_cl.errors import UserError
 from mjx_cl.rollout.monitor import CHANNELS, Residual
+from mjx_cl.types import Array
 
 ALONE = ("reward", "surprise")  # known where the residuals are not
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from mjx_cl.detectors.base import (
   Alarm,
@@ -29,6 +29,7 @@ from mjx_cl.detectors.base import (
   keep,
 )
 from mjx_cl.errors import UserError
+from mjx_cl.types import Array
 
 Ring = Float[Array, "samples"]
 

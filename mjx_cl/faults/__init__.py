@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Int
+from jaxtyping import Int
 
 from mjx_cl.errors import PluginError, UserError, choose
 from mjx_cl.faults.actuator import ACTUATOR
@@ -37,6 +37,7 @@ from mjx_cl.faults.sensor import SENSOR
 from mjx_cl.faults.task import TASK
 from mjx_cl.faults.transfer import TRANSFER
 from mjx_cl.io.plugins import Registry, line
+from mjx_cl.types import Array
 
 FAMILIES = {
   "actuator": ACTUATOR,

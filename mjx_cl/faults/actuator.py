@@ -10,11 +10,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Key
+from jaxtyping import Float, Key
 
 from mjx_cl.errors import UserError
 from mjx_cl.faults.base import Fault, Ports, Severity, actuator_targets
 from mjx_cl.faults.kinds import late, leafwise, loss, scaled, signal, steady
+from mjx_cl.types import Array
 
 LOCK = (10.0, 1000.0)  # [kg m^2], [N m s/rad] at severity 1
 

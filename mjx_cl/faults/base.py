@@ -12,12 +12,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Bool, Float, Int, Key
 
 from mjx_cl.errors import UserError
 from mjx_cl.faults import schedule
 from mjx_cl.keys import OfFaults
-from mjx_cl.types import Model
+from mjx_cl.types import Array, Model
 
 Severity = Float[Array, ""]
 Values = tuple[Any, dict[str, Array]]  # of `act`: (memory', {owned leaf: new value})

@@ -8,12 +8,13 @@ from typing import Any
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
 from mjx_cl.errors import UserError
 from mjx_cl.faults.actuator import dofs
 from mjx_cl.faults.base import Fault, Severity, actuator_targets, masks
 from mjx_cl.faults.kinds import along, leafwise
+from mjx_cl.types import Array
 
 MASSES = ("mj.body_mass", "mj.body_inertia")
 

@@ -11,13 +11,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Key
+from jaxtyping import Bool, Float, Key
 
 from mjx_cl import faults as faults_lib
 from mjx_cl.faults import presets, schedule
 from mjx_cl.faults.lanes import SEVERITIES, WIDTH, Lane, lanes, parts, plans, preset_lanes
 from mjx_cl.keys import OfStep
-from mjx_cl.types import Model
+from mjx_cl.types import Array, Model
 
 AFTER = (1, 10, 100)  # control steps at which the size of the difference is reported
 # largest relative difference of the same nominal robot in two programs: XLA folds constants, which

@@ -7,12 +7,13 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Array, Float, Int, Key
+from jaxtyping import Float, Int, Key
 
 from mjx_cl.errors import UserError
 from mjx_cl.faults.base import Fault, Ports, Severity, Values, fault, masks, read
 from mjx_cl.faults.body import force_map, heading_targets
 from mjx_cl.faults.kinds import leafwise, scaled
+from mjx_cl.types import Array
 
 HEADINGS = ("forward", "backward", "left", "right")
 

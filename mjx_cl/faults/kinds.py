@@ -7,7 +7,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Key, Shaped
+from jaxtyping import Bool, Float, Key, Shaped
 
 from mjx_cl.faults.base import (
   Fault,
@@ -19,6 +19,7 @@ from mjx_cl.faults.base import (
   fault,
   read,
 )
+from mjx_cl.types import Array
 
 MOST_DELAY = 9  # control steps at severity 1: the hard level of realworldrl_suite
 

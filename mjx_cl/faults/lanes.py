@@ -5,10 +5,11 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int
+from jaxtyping import Int
 
 from mjx_cl.faults import presets, schedule
 from mjx_cl.faults.base import Fault
+from mjx_cl.types import Array
 
 SEVERITIES = (0.0, 0.25, 0.5, 0.75, 1.0)
 # lanes at a time: XLA cuts a wide batch into shares and their rests, which scalar code computes

@@ -8,9 +8,10 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float, Int, Key
+from jaxtyping import Float, Int, Key
 
 from mjx_cl.faults.presets import FOREVER, Change, place
+from mjx_cl.types import Array
 
 Numbers = ArrayLike | Sequence[float | int]
 

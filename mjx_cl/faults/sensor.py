@@ -10,11 +10,12 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, Key
+from jaxtyping import Float, Int, Key
 
 from mjx_cl.errors import UserError
 from mjx_cl.faults.base import Fault, Ports, Severity
 from mjx_cl.faults.kinds import late, leafwise, loss, signal, steady
+from mjx_cl.types import Array
 
 # at severity 1: probability that one begins, control steps that it lasts; the hard level of
 # realworldrl_suite

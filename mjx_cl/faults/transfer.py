@@ -3,10 +3,11 @@
 from typing import Any
 
 import jax.numpy as jnp
-from jaxtyping import Array, Int, Key
+from jaxtyping import Int, Key
 
 from mjx_cl.errors import UserError
 from mjx_cl.faults.base import Fault, Ports, Severity, Values, fault, read
+from mjx_cl.types import Array
 
 
 def gap(env: Any) -> Fault:
