@@ -68,16 +68,14 @@ def spread(plan: Plan, faults: int) -> Plan:
   return Plan(*(jnp.broadcast_to(x, (faults,)) for x in plan))
 
 
-def abrupt(
-  t: Int[Array, ""], onset: Int[Array, "*f"], duration: Int[Array, "*f"]
-) -> Float[Array, "*f"]:
+def abrupt(t: Step, onset: Int[Array, "*f"], duration: Int[Array, "*f"]) -> Float[Array, "*f"]:
   """1 for onset <= t < onset + duration, else 0. `onset`, `duration` in control steps; FOREVER is
   never repaired.
   """
   return ((t >= onset) & (t - onset < duration)).astype(jnp.float32)
 
 
-def factor(plan: Plan, walk: Float[Array, "*f"], t: Int[Array, ""]) -> Float[Array, "*f"]:
+def factor(plan: Plan, walk: Float[Array, "*f"], t: Step) -> Float[Array, "*f"]:
   """Share of the severity that is in force at control step t.
 
     abrupt 1;  ramp min(1, (since + 1) / period);  intermittent 1 if (since mod period) < share
@@ -97,14 +95,12 @@ def factor(plan: Plan, walk: Float[Array, "*f"], t: Int[Array, ""]) -> Float[Arr
   return jnp.where(abrupt(t, plan.onset, plan.duration) > 0, chosen, 0.0)
 
 
-def severity(plan: Plan, walk: Float[Array, "*f"], t: Int[Array, ""]) -> Float[Array, "*f"]:
+def severity(plan: Plan, walk: Float[Array, "*f"], t: Step) -> Float[Array, "*f"]:
   """Severity in force, in [0, 1]."""
   return plan.severity * factor(plan, walk, t)
 
 
-def walk(
-  plan: Plan, value: Float[Array, "*f"], t: Int[Array, ""], key: Key[Array, ""]
-) -> Float[Array, "*f"]:
+def walk(plan: Plan, value: Float[Array, "*f"], t: Step, key: Key[Array, ""]) -> Float[Array, "*f"]:
   """Where the random walk stands at control step t: a new step at the onset and every `period`
   after it, reflected at 0 and 1.
   """
