@@ -231,7 +231,7 @@ def begin(
 def drive(
   faults: Fault | Iterable[Fault],
   injection: Injection,
-  t: Step,
+  t: schedule.Step,
   key: Key[Array, ""],
   ports: Ports,
 ) -> tuple[Injection, Ports, Float[Array, " faults"]]:
@@ -251,7 +251,7 @@ def drive(
 def sense(
   faults: Fault | Iterable[Fault],
   injection: Injection,
-  t: Step,
+  t: schedule.Step,
   key: Key[Array, ""],
   model: Model,
   obs: Float[Array, " obs"],
@@ -276,7 +276,7 @@ def sense(
 def _apply(
   faults: tuple[Fault, ...],
   injection: Injection,
-  t: Step,
+  t: schedule.Step,
   key: Key[Array, ""],
   ports: Ports,
   severity: Float[Array, " faults"],

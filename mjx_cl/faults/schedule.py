@@ -14,6 +14,7 @@ from mjx_cl.faults.presets import FOREVER, Change, place
 from mjx_cl.types import Array
 
 Numbers = ArrayLike | Sequence[float | int]
+Step = Int[Array, ""] | int  # control step
 
 
 class Plan(NamedTuple):
