@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Key, UInt32
+from jaxtyping import PRNGKeyArray, UInt32
 
 from mjx_cl.detectors.base import Alarm, Detector, Setting, above, demand, judged
 from mjx_cl.rollout.monitor import Residual
@@ -105,7 +105,7 @@ def periodic(threshold: Setting = math.log(10_000)) -> Detector:
   return Detector(lambda: PeriodicState(jnp.uint32(0), jnp.uint32(0), jnp.bool_(False)), update)
 
 
-def _told_apart(seed: UInt32[Array, "2"], residual: Residual) -> Key[Array, ""]:
+def _told_apart(seed: UInt32[Array, "2"], residual: Residual) -> PRNGKeyArray:
   """A key of seed and the bits of a row: streams start from one state, and would otherwise all draw
   the same.
   """

@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Float, Int, Key
+from jaxtyping import Float, Int, PRNGKeyArray
 
 from mjx_cl.config import DreamerConfig
 from mjx_cl.dreamer import behaviour, losses, nets, optim, rssm, stepwise
@@ -80,7 +80,7 @@ class Agent(Networks):
     self.discount = 1.0 - 1.0 / config.horizon
     self.optimizer = optim.laprop(config.lr, config.warmup, config.agc)
 
-  def init(self, key: Key[Array, ""]) -> TrainState:
+  def init(self, key: PRNGKeyArray) -> TrainState:
     """Fresh parameters, moments and counters from `key`."""
     params = self.init_params(key)
     slow = jax.tree.map(jnp.copy, params["val"])
@@ -94,7 +94,7 @@ class Agent(Networks):
     slow: Any,
     range_: Float[Array, "2"],
     batch: Record,
-    key: Key[Array, ""],
+    key: PRNGKeyArray,
     weights: Weights = Weights(),
   ) -> tuple[Float[Array, ""], tuple[dict[str, Array], Array, Array, Array]]:
     """The joint objective.
@@ -178,7 +178,7 @@ class Agent(Networks):
     deter: Float[Array, "steps batch deter"],
     stoch: Float[Array, "steps batch stoch"],
     seen: Record,
-    key: Key[Array, ""],
+    key: PRNGKeyArray,
   ) -> tuple[behaviour.Behaviour, Float[Array, "replayed batch"]]:
     """Losses on dreams from the last `last_starts` states of each sequence, and of the value on
     these states themselves. No gradient passes from dreams into the dynamics; the features of the
@@ -239,7 +239,7 @@ class Agent(Networks):
   # ---- update ------------------------------------------------------------------------------------
 
   def update(
-    self, state: TrainState, batch: Record, key: Key[Array, ""], weights: Weights = Weights()
+    self, state: TrainState, batch: Record, key: PRNGKeyArray, weights: Weights = Weights()
   ) -> tuple[TrainState, dict[str, Array], tuple[Array, Array]]:
     """One gradient step. Where a loss or the gradient is at fault (`culprit`) nothing changes, the
     counter included.

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Float, Key
+from jaxtyping import Float, PRNGKeyArray
 
 from mjx_cl.dreamer import heads, nets
 from mjx_cl.dreamer.losses import lambda_return, update_range
@@ -93,7 +93,7 @@ def imagine(
   slow: Any,
   deter: Float[Array, "rows deter"],
   stoch: Float[Array, "rows stoch"],
-  key: Key[Array, ""],
+  key: PRNGKeyArray,
 ) -> Imagined:
   """`Imagined` from the stacked states of `agent.imagine`."""
   deter, stoch, action = agent.imagine(params, deter, stoch, key, agent.config.imagine)
@@ -152,7 +152,7 @@ def losses(
   range_: Float[Array, "2"],
   deter: Float[Array, "rows deter"],
   stoch: Float[Array, "rows stoch"],
-  key: Key[Array, ""],
+  key: PRNGKeyArray,
   imagine: Callable[..., Imagined],
   sums: Callable[..., Sums],
 ) -> Behaviour:

@@ -17,7 +17,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Key
+from jaxtyping import Float, PRNGKeyArray
 
 from mjx_cl.types import Array
 
@@ -32,7 +32,7 @@ def symexp(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
   return jnp.sign(x) * jnp.expm1(jnp.abs(x))
 
 
-def in_a_row(draw: Callable, key: Key[Array, ""], shape: tuple[int, ...]) -> Float[Array, "..."]:
+def in_a_row(draw: Callable, key: PRNGKeyArray, shape: tuple[int, ...]) -> Float[Array, "..."]:
   """`draw(key, shape)`, the same numbers, drawn as one row: loops over short axes are unrolled,
   which LLVM is slow to compile.
   """

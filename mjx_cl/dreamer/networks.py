@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int, Key
+from jaxtyping import Float, Int, PRNGKeyArray
 
 from mjx_cl.config import DreamerConfig
 from mjx_cl.dreamer import heads, nets, rssm
@@ -57,7 +57,7 @@ class Networks:
 
   # ---- parameters --------------------------------------------------------------------------------
 
-  def init_params(self, key: Key[Array, ""]) -> dict[str, Any]:
+  def init_params(self, key: PRNGKeyArray) -> dict[str, Any]:
     """Fresh parameters from `key`."""
     keys = jax.random.split(key, 7)
     deter, stoch = jnp.zeros((1, self.size.deter)), jnp.zeros((1, self.stoch_size))
@@ -111,7 +111,7 @@ class Networks:
     params: Any,
     carry: Carry,
     obs: Float[Array, "obs"],
-    key: Key[Array, ""],
+    key: PRNGKeyArray,
     deterministic: bool = False,
   ) -> tuple[Carry, Float[Array, "act"]]:
     """One posterior step and an action for one robot.
@@ -138,7 +138,7 @@ class Networks:
   # ---- world model -------------------------------------------------------------------------------
 
   def observe(
-    self, params: Any, batch: Record, key: Key[Array, ""]
+    self, params: Any, batch: Record, key: PRNGKeyArray
   ) -> tuple[
     Float[Array, "steps batch deter"],
     Float[Array, "steps batch stoch"],
@@ -179,7 +179,7 @@ class Networks:
     params: Any,
     deter: Float[Array, "rows deter"],
     stoch: Float[Array, "rows stoch"],
-    key: Key[Array, ""],
+    key: PRNGKeyArray,
     steps: int,
   ) -> tuple[
     Float[Array, "states rows deter"],
@@ -207,7 +207,7 @@ class Networks:
     return sg(jax.tree.map(lambda x, final: jnp.concatenate([x, final[None]]), states, last))
 
   def draws(
-    self, key: Key[Array, ""], steps: int, rows: int
+    self, key: PRNGKeyArray, steps: int, rows: int
   ) -> tuple[Float[Array, "steps rows variables"], Float[Array, "states rows act"]]:
     """Uniform numbers (steps, rows, stoch) for the prior and normal ones (steps + 1, rows, A) for
     the policy.
@@ -267,7 +267,7 @@ class Networks:
     deter: Float[Array, "rows deter"],
     stoch: Float[Array, "rows stoch"],
     actions: Float[Array, "steps rows act"],
-    key: Key[Array, ""],
+    key: PRNGKeyArray,
   ) -> tuple[Float[Array, "steps rows obs"], Float[Array, "steps rows"]]:
     """Predictions of the next n steps from rows, actions given, one prior sample each; never looks
     at an observation.
@@ -322,7 +322,7 @@ class Networks:
     deter: Float[Array, "rows deter"],
     stoch: Float[Array, "rows stoch"],
     steps: int,
-    key: Key[Array, ""],
+    key: PRNGKeyArray,
   ) -> tuple[Float[Array, "steps rows obs"], Float[Array, "steps rows"]]:
     """As `open_loop`, with the actions that the policy imagines for itself."""
     deters, stochs, _ = self.imagine(params, deter, stoch, key, steps)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Bool, Int, Key, Shaped
+from jaxtyping import Bool, Int, PRNGKeyArray, Shaped
 
 from mjx_cl.dreamer.state import Record
 from mjx_cl.types import Array
@@ -102,7 +102,7 @@ def windows(replay: Replay, length: int) -> Int[Array, ""]:
 
 def sample(
   replay: Replay,
-  key: Key[Array, ""],
+  key: PRNGKeyArray,
   batch: int,
   length: int,
   only: Int[Array, ""] | None = None,

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Float, Key
+from jaxtyping import Float, PRNGKeyArray
 
 from mjx_cl.dreamer import behaviour, heads, nets
 from mjx_cl.dreamer.behaviour import Imagined, States, Sums, readings
@@ -78,7 +78,7 @@ def imagine(
   slow: Any,
   deter: Float[Array, "rows deter"],
   stoch: Float[Array, "rows stoch"],
-  key: Key[Array, ""],
+  key: PRNGKeyArray,
 ) -> Imagined:
   """`Imagined` with the heads read inside the scan; the same draws as `agent.imagine`."""
   uniform, noise = agent.draws(key, agent.config.imagine, len(deter))

@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Key
+from jaxtyping import Float, PRNGKeyArray
 
 from mjx_cl.errors import UserError
 from mjx_cl.faults.base import Fault, Ports, Severity, actuator_targets
@@ -124,7 +124,7 @@ def stuck(env: Any) -> Fault:
   """
 
   def change(
-    held: Float[Array, " act"], severity: Severity, key: Key[Array, ""], ports: Ports
+    held: Float[Array, " act"], severity: Severity, key: PRNGKeyArray, ports: Ports
   ) -> tuple[Float[Array, " act"], Float[Array, " act"]]:
     held = jnp.where((severity > 0) & ~ports.first, held, ports.ctrl)
     return held, (1.0 - severity) * ports.ctrl + severity * held

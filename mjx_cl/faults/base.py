@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Bool, Float, Int, Key
+from jaxtyping import Bool, Float, Int, PRNGKeyArray
 
 from mjx_cl.errors import UserError
 from mjx_cl.faults import schedule
@@ -162,7 +162,7 @@ def fault(
     raise UserError(f"fault {name!r} finds nothing to act on in robot {env.spec.name!r}")
   count = drawn or len(targets)
 
-  def init(key: Key[Array, ""], target: ArrayLike = -1) -> State:
+  def init(key: PRNGKeyArray, target: ArrayLike = -1) -> State:
     target = jnp.asarray(target)
     index = jnp.where(target < 0, jax.random.randint(key, (), 0, count), target).astype(jnp.int32)
     return State(
@@ -170,7 +170,7 @@ def fault(
     )
 
   def apply(
-    state: State, severity: Severity, key: Key[Array, ""], ports: Ports
+    state: State, severity: Severity, key: PRNGKeyArray, ports: Ports
   ) -> tuple[State, Ports]:
     kept, values = act(state.row, state.memory, severity, key, ports)
     if set(values) != set(owns):
@@ -216,7 +216,7 @@ def as_tuple(faults: Fault | Iterable[Fault]) -> tuple[Fault, ...]:
 
 def begin(
   faults: Fault | Iterable[Fault],
-  key: Key[Array, ""],
+  key: PRNGKeyArray,
   plan: schedule.Plan,
   target: ArrayLike = -1,
 ) -> Injection:
@@ -232,7 +232,7 @@ def drive(
   faults: Fault | Iterable[Fault],
   injection: Injection,
   t: schedule.Step,
-  key: Key[Array, ""],
+  key: PRNGKeyArray,
   ports: Ports,
 ) -> tuple[Injection, Ports, Float[Array, " faults"]]:
   """Applies every fault that acts on the driven robot, in order, in control step t.
@@ -252,7 +252,7 @@ def sense(
   faults: Fault | Iterable[Fault],
   injection: Injection,
   t: schedule.Step,
-  key: Key[Array, ""],
+  key: PRNGKeyArray,
   model: Model,
   obs: Float[Array, " obs"],
   first: Bool[ArrayLike, ""] = False,
@@ -277,7 +277,7 @@ def _apply(
   faults: tuple[Fault, ...],
   injection: Injection,
   t: schedule.Step,
-  key: Key[Array, ""],
+  key: PRNGKeyArray,
   ports: Ports,
   severity: Float[Array, " faults"],
   senses: bool,

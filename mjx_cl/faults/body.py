@@ -174,9 +174,7 @@ DIRECTIONS = {
 }
 
 
-def heading_targets(
-  env: Any, names: Iterable[str]
-) -> tuple[tuple[str, ...], Float[Array, "targets 3"]]:
+def heading_targets(env: Any, names: Iterable[str]) -> tuple[tuple[str, ...], Float[Array, "..."]]:
   """Names and unit vectors of the directions in which the robot's trunk is free to move."""
   free = np.abs(force_map(env)).sum(1) > 0
   kept = [n for n in names if free[np.flatnonzero(DIRECTIONS[n])[0]]]

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Key
+from jaxtyping import Bool, Float, PRNGKeyArray
 
 from mjx_cl import faults as faults_lib
 from mjx_cl.faults import presets, schedule
@@ -89,7 +89,7 @@ def live(
   env: Any,
   faults: tuple,
   model: Model,
-  key: Key[Array, ""],
+  key: PRNGKeyArray,
   injection: faults_lib.Injection,
   signal: Float[Array, "steps act"],
 ) -> Life:
@@ -132,7 +132,7 @@ def program(env: Any, faults: tuple) -> Callable[..., Any]:
   none = faults_lib.none(env)
 
   def run(
-    model: Model, key: Key[Array, ""], plans: schedule.Plan, targets: Array, signal: Array
+    model: Model, key: PRNGKeyArray, plans: schedule.Plan, targets: Array, signal: Array
   ) -> tuple[tuple[Array, ...], Life]:
     one = lambda plan, target: live(
       env, faults, model, key, faults_lib.begin(faults, jax.random.key(0), plan, target), signal

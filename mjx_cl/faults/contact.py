@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Float, Int, Key
+from jaxtyping import Float, Int, PRNGKeyArray
 
 from mjx_cl.errors import UserError
 from mjx_cl.faults.base import Fault, Ports, Severity, Values, fault, masks, read
@@ -127,7 +127,7 @@ def push(env: Any) -> Fault:
   blows = 1.5 * whole_mass(env) / (PUSH_FOR * env.spec.control_s) * directions @ force_map(env)
 
   def act(
-    target: Any, memory: Int[Array, ""], severity: Severity, key: Key[Array, ""], ports: Ports
+    target: Any, memory: Int[Array, ""], severity: Severity, key: PRNGKeyArray, ports: Ports
   ) -> Values:
     phase = jnp.mod(ports.since, PUSH_EVERY)
     which = jnp.where(phase == 0, jax.random.randint(key, (), 0, directions.shape[0]), memory)

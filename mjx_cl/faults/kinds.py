@@ -7,7 +7,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Bool, Float, Key, Shaped
+from jaxtyping import Bool, Float, PRNGKeyArray, Shaped
 
 from mjx_cl.faults.base import (
   Fault,
@@ -50,7 +50,7 @@ def leafwise(
   """
   names, rows, drawn = targets
 
-  def act(row: Any, memory: Any, severity: Severity, key: Key[Array, ""], ports: Ports) -> Values:
+  def act(row: Any, memory: Any, severity: Severity, key: PRNGKeyArray, ports: Ports) -> Values:
     return memory, {leaf: new(read(ports, leaf), row, severity) for leaf, new in maps.items()}
 
   return fault(name, env, tuple(maps), names, act, (), drawn, not_monotone, rows)
@@ -75,7 +75,7 @@ def signal(
   name: str,
   env: Any,
   port: str,
-  change: Callable[[Any, Severity, Key[Array, ""], Ports], tuple[Any, Array]],
+  change: Callable[[Any, Severity, PRNGKeyArray, Ports], tuple[Any, Array]],
   memory: Any = (),
   not_monotone: str = "",
 ) -> Fault:
@@ -93,7 +93,7 @@ def signal(
   names, mask, drawn = (actuator_targets if port == "ctrl" else channel_targets)(env)
 
   def act(
-    hit: Bool[Array, " n"], memory: Any, severity: Severity, key: Key[Array, ""], ports: Ports
+    hit: Bool[Array, " n"], memory: Any, severity: Severity, key: PRNGKeyArray, ports: Ports
   ) -> Values:
     memory, value = change(memory, severity, key, ports)
     return memory, {port: jnp.where(hit, value, read(ports, port))}
@@ -102,7 +102,7 @@ def signal(
 
 
 def steady(
-  name: str, env: Any, port: str, change: Callable[[Array, Severity, Key[Array, ""]], Array]
+  name: str, env: Any, port: str, change: Callable[[Array, Severity, PRNGKeyArray], Array]
 ) -> Fault:
   """A `signal` without memory; change: (the signal, severity, key) -> the signal where it hits."""
   return signal(
@@ -122,7 +122,7 @@ def late(name: str, env: Any, port: str, not_monotone: str) -> Fault:
   """A signal arrives ceil(9 severity) control steps late; an episode's start fills the line."""
 
   def change(
-    line: Float[Array, "steps n"], severity: Severity, key: Key[Array, ""], ports: Ports
+    line: Float[Array, "steps n"], severity: Severity, key: PRNGKeyArray, ports: Ports
   ) -> tuple[Float[Array, "steps n"], Float[Array, " n"]]:
     value = read(ports, port)
     line = jnp.where(

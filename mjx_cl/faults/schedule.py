@@ -8,7 +8,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
-from jaxtyping import Float, Int, Key
+from jaxtyping import Float, Int, PRNGKeyArray
 
 from mjx_cl.faults.presets import FOREVER, Change, place
 from mjx_cl.types import Array
@@ -101,7 +101,7 @@ def severity(plan: Plan, walk: Float[Array, "*f"], t: Step) -> Float[Array, "*f"
   return plan.severity * factor(plan, walk, t)
 
 
-def walk(plan: Plan, value: Float[Array, "*f"], t: Step, key: Key[Array, ""]) -> Float[Array, "*f"]:
+def walk(plan: Plan, value: Float[Array, "*f"], t: Step, key: PRNGKeyArray) -> Float[Array, "*f"]:
   """Where the random walk stands at control step t: a new step at the onset and every `period`
   after it, reflected at 0 and 1.
   """

@@ -10,7 +10,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Float, Int, Key
+from jaxtyping import Float, Int, PRNGKeyArray
 
 from mjx_cl.errors import UserError
 from mjx_cl.faults.base import Fault, Ports, Severity
@@ -50,7 +50,7 @@ def drift(env: Any) -> Fault:
   scale = scales(env)
 
   def change(
-    m: Any, severity: Severity, key: Key[Array, ""], ports: Ports
+    m: Any, severity: Severity, key: PRNGKeyArray, ports: Ports
   ) -> tuple[Any, Float[Array, " obs"]]:
     return m, ports.obs + 2.0 * severity * scale * jnp.clip(
       (ports.since + 1) / DRIFT_STEPS, 0.0, 1.0
@@ -112,7 +112,7 @@ def freeze(env: Any) -> Fault:
   """
 
   def change(
-    held: Float[Array, " obs"], severity: Severity, key: Key[Array, ""], ports: Ports
+    held: Float[Array, " obs"], severity: Severity, key: PRNGKeyArray, ports: Ports
   ) -> tuple[Float[Array, " obs"], Float[Array, " obs"]]:
     hold = (jax.random.uniform(key, ports.obs.shape) < severity) & ~jnp.asarray(ports.first)
     value = jnp.where(hold, held, ports.obs)
@@ -122,7 +122,7 @@ def freeze(env: Any) -> Fault:
 
 
 def _burst(
-  left: Int[Array, " obs"], severity: Severity, key: Key[Array, ""], ports: Ports
+  left: Int[Array, " obs"], severity: Severity, key: PRNGKeyArray, ports: Ports
 ) -> Int[Array, " obs"]:
   """Control steps that the burst of each channel still lasts, this one included; a new one may
   begin where none is under way.
@@ -145,7 +145,7 @@ def dropout_burst(env: Any) -> Fault:
   """
 
   def change(
-    left: Int[Array, " obs"], severity: Severity, key: Key[Array, ""], ports: Ports
+    left: Int[Array, " obs"], severity: Severity, key: PRNGKeyArray, ports: Ports
   ) -> tuple[Int[Array, " obs"], Float[Array, " obs"]]:
     left = _burst(left, severity, key, ports)
     return jnp.maximum(left - 1, 0), jnp.where(left > 0, 0.0, ports.obs)
@@ -166,7 +166,7 @@ def freeze_burst(env: Any) -> Fault:
   def change(
     memory: tuple[Int[Array, " obs"], Float[Array, " obs"]],
     severity: Severity,
-    key: Key[Array, ""],
+    key: PRNGKeyArray,
     ports: Ports,
   ) -> tuple[tuple[Int[Array, " obs"], Float[Array, " obs"]], Float[Array, " obs"]]:
     left, held = memory

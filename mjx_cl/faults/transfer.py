@@ -3,7 +3,7 @@
 from typing import Any
 
 import jax.numpy as jnp
-from jaxtyping import Int, Key
+from jaxtyping import Int, PRNGKeyArray
 
 from mjx_cl.errors import UserError
 from mjx_cl.faults.base import Fault, Ports, Severity, Values, fault, read
@@ -28,7 +28,7 @@ def gap(env: Any) -> Fault:
   leaves = tuple(sorted({item.leaf for item in items.values()}))
 
   def act(
-    target: Int[Array, ""], memory: Any, severity: Severity, key: Key[Array, ""], ports: Ports
+    target: Int[Array, ""], memory: Any, severity: Severity, key: PRNGKeyArray, ports: Ports
   ) -> Values:
     model = ports.model
     for i, name in enumerate(items):

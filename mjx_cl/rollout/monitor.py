@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int, Key
+from jaxtyping import Bool, Float, Int, Key, PRNGKeyArray
 
 from mjx_cl.dreamer import rssm
 from mjx_cl.errors import UserError
@@ -227,7 +227,7 @@ class Monitor:
     return jax.tree.map(lambda x: x[-(self.n - 1) :], seq) if self.n > 1 else history
 
   def _group(
-    self, params: Any, seq: History, key: Key[Array, ""]
+    self, params: Any, seq: History, key: PRNGKeyArray
   ) -> tuple[
     Float[Array, "steps members"],
     Float[Array, "steps members"],

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
-from jaxtyping import Bool, Float, Key
+from jaxtyping import Bool, Float, Key, PRNGKeyArray
 
 from mjx_cl import faults as faults_lib
 from mjx_cl.dreamer.state import Carry, Record
@@ -108,7 +108,7 @@ def start(
   env: Any,
   agent: Any,
   fault: faults_lib.Fault | tuple[faults_lib.Fault, ...],
-  key: Key[Array, ""],
+  key: PRNGKeyArray,
   severity: ArrayLike | Sequence[Any] = 0.0,
   onset: ArrayLike | Sequence[Any] = 0,
   duration: ArrayLike | Sequence[Any] = faults_lib.FOREVER,
@@ -226,7 +226,7 @@ class Rollout:
     return stream._replace(env=env_state, t=t, injection=injection), out, jnp.max(severity)
 
   def _drive(
-    self, stream: Any, now: Key[Array, ""], action: Float[Array, "act"]
+    self, stream: Any, now: PRNGKeyArray, action: Float[Array, "act"]
   ) -> tuple[faults_lib.Injection, faults_lib.Ports, Array]:
     ports = faults_lib.Ports(self.model, ctrl=action, first=stream.first)
     return faults_lib.drive(

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Float, Int, Key
+from jaxtyping import Float, Int, PRNGKeyArray
 
 from mjx_cl import faults as faults_lib
 from mjx_cl.dreamer.state import Carry
@@ -137,9 +137,7 @@ class Transfer:
     self.after = Arriving(after, agent, faults, 1, deterministic)
     self._part, self._merge = jax.jit(part), jax.jit(merge)
 
-  def start(
-    self, key: Key[Array, ""], target: Any, plan: faults_lib.Plan, due: ArrayLike
-  ) -> Moving:
+  def start(self, key: PRNGKeyArray, target: Any, plan: faults_lib.Plan, due: ArrayLike) -> Moving:
     """A fresh stream.
 
     Args:

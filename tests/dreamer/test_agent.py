@@ -672,7 +672,7 @@ def test_least_deviation_of_the_actions(plain):
   above it by max_std.
   """
   agent, _, state = plain
-  low, high = nets.normal(jnp.zeros(1), jnp.array([-50.0, 50.0]), 0.02, 0.3)[1]
+  low, high = nets.normal(jnp.zeros(2), jnp.array([-50.0, 50.0]), 0.02, 0.3)[1]
   np.testing.assert_allclose([low, high], [0.02, 0.3], rtol=1e-6)
   params = {
     **state.params,

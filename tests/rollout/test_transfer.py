@@ -24,7 +24,8 @@ from mjx_cl.io import tables
 from mjx_cl.rollout import transfer as transfer_lib
 from mjx_cl.rollout.scan import Rollout, nest, start
 from mjx_cl.rollout.transfer import Transfer
-from mjx_cl.runs import certify, run, settings
+from mjx_cl.runs import certify, loops, run, settings
+from mjx_cl.runs import runner as runner_lib
 from mjx_cl.training import agents
 
 EPISODE, SEEDS, ONSET, CHUNK, CHUNKS = 50, 5, 70, 64, 5
@@ -395,10 +396,10 @@ def short():
   """
   with pytest.MonkeyPatch.context() as patch:
     made = {}
-    for name in ("Transfer", "Loop"):
-      build = getattr(run, name)
+    for module, name in ((runner_lib, "Transfer"), (loops, "Loop")):
+      build = getattr(module, name)
       patch.setattr(
-        run,
+        module,
         name,
         lambda *args, name=name, build=build, **kw: (
           made.setdefault(name, None) or made.update({name: build(*args, **kw)}) or made[name]

@@ -22,7 +22,8 @@ from mjx_cl.faults import presets
 from mjx_cl.io import tables
 from mjx_cl.keys import OfSeed
 from mjx_cl.rollout.scan import Rollout, nest, start
-from mjx_cl.runs import run, scores, settings, snapshots
+from mjx_cl.runs import loops, run, scores, settings, snapshots
+from mjx_cl.runs import runner as runner_lib
 from mjx_cl.runs.snapshots import Snapshots
 from mjx_cl.scoring import ablation, stop_rule
 from mjx_cl.training import agents
@@ -372,9 +373,9 @@ def config(tiny, folder):
     {},
     Snapshots._program,
   )  # every run of this module is of one configuration, and shares what is compiled
-  patch.setattr(run, "Rollout", lambda *args: kept.setdefault("rollout", Rollout(*args)))
+  patch.setattr(runner_lib, "Rollout", lambda *args: kept.setdefault("rollout", Rollout(*args)))
   patch.setattr(
-    run, "Loop", lambda *args, **settings: kept.setdefault("loop", Loop(*args, **settings))
+    loops, "Loop", lambda *args, **settings: kept.setdefault("loop", Loop(*args, **settings))
   )
   patch.setattr(Snapshots, "_program", lambda self: kept.setdefault("program", program(self)))
   yield RunConfig(
