@@ -19,9 +19,9 @@ from typing import NamedTuple
 from benchmarks.report import paper
 from benchmarks.report.paper import number, span
 from mjx_cl.config import CHUNK, named
+from mjx_cl.config.sizes import SIZES
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.io import folders
-from mjx_cl.sizes import SIZES
 
 WIDTH = 150
 

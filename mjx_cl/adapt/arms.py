@@ -3,7 +3,7 @@
 An arm is a set of choices and holds no code of its own: what starts adaptation, what ends it, what
 learns, which weights it starts from, and whether the robot breaks at all. `choices` turns the
 arms of a run into arrays over its streams, so that one compiled program serves any mix of them.
-Free of JAX, as config.py.
+Free of JAX, as config.
 """
 
 from __future__ import annotations

@@ -12,10 +12,10 @@ import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray
 
 from mjx_cl.config import DreamerConfig
+from mjx_cl.config.sizes import SIZES
 from mjx_cl.dreamer import heads, nets, rssm
 from mjx_cl.dreamer.state import Carry, Latent, Record
 from mjx_cl.errors import UserError
-from mjx_cl.sizes import SIZES
 from mjx_cl.types import Array
 
 sg = jax.lax.stop_gradient

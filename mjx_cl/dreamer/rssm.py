@@ -11,8 +11,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
+from mjx_cl.config.sizes import Size
 from mjx_cl.dreamer.nets import MLP, Hidden, Linear, kernel_init, mean_square, parameter
-from mjx_cl.sizes import Size
 from mjx_cl.types import Array
 
 UNIMIX = 0.01

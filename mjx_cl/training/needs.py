@@ -8,11 +8,11 @@ from typing import NamedTuple
 import jax
 
 from mjx_cl.config import DreamerConfig
+from mjx_cl.config.sizes import SIZES
 from mjx_cl.dreamer import replay
 from mjx_cl.dreamer.agent import Agent, parameter_count
 from mjx_cl.errors import UserError
 from mjx_cl.io import memory, runtime
-from mjx_cl.sizes import SIZES
 
 
 class Need(NamedTuple):

@@ -25,12 +25,12 @@ from mjx_cl.adapt.arms import ARMS
 from mjx_cl.cli import app, results
 from mjx_cl.cli import tables as shown
 from mjx_cl.config import PRESETS, RunConfig
+from mjx_cl.config.sizes import SIZES
 from mjx_cl.errors import FileError
 from mjx_cl.faults import presets
 from mjx_cl.io import folders
 from mjx_cl.io import tables as store
 from mjx_cl.runs import run
-from mjx_cl.sizes import SIZES
 from mjx_cl.training import agents
 
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import scipy.stats
 
+from mjx_cl.config.sizes import SIZES
 from mjx_cl.dreamer import heads, nets, rssm
-from mjx_cl.sizes import SIZES
 
 TINY = SIZES["tiny"]
 ROWS = 3

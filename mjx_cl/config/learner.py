@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from mjx_cl.checks import fraction, given, not_below_0, positive, whole
+from mjx_cl.config.checks import fraction, given, not_below_0, positive, whole
+from mjx_cl.config.sizes import SIZES
 from mjx_cl.errors import choose, require
-from mjx_cl.sizes import SIZES
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,6 @@
-"""What can be chosen of a run: frozen dataclasses. Free of JAX, so that `--help` is quick."""
+"""What can be chosen of a run and of its learner: frozen dataclasses. Imports errors alone, no JAX, so
+that `--help` is quick.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +11,7 @@ from typing import Annotated
 
 import tyro
 
-from mjx_cl.checks import (  # noqa: F401  some for those who import them from here
+from mjx_cl.config.checks import (  # noqa: F401  some for those who import them from here
   FOREVER,
   check_seeds,
   field_kinds,
@@ -24,8 +26,8 @@ from mjx_cl.checks import (  # noqa: F401  some for those who import them from h
   settings,
   whole,
 )
+from mjx_cl.config.learner import PRESETS, DreamerConfig, Preset, TrainConfig  # noqa: F401
 from mjx_cl.errors import require
-from mjx_cl.learner import PRESETS, DreamerConfig, Preset, TrainConfig  # noqa: F401
 
 # decisions between two rounds of updates, of a training as of a run, where the stop rule looks as
 # often
