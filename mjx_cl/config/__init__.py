@@ -1,5 +1,5 @@
-"""What can be chosen of a run and of its learner: frozen dataclasses. Imports errors alone, no JAX, so
-that `--help` is quick.
+"""What can be chosen of a run and of its learner, as frozen dataclasses. Imports errors alone, no
+JAX, so that `--help` is quick.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ import jax
 
 from mjx_cl.config import kinds
 from mjx_cl.detectors import combine
-from mjx_cl.detectors.base import Detector, Real, Setting, Written
+from mjx_cl.detectors.base import Detector, Real, Setting
 from mjx_cl.detectors.paper_rule import CALIBRATED, calibrated_rule, one_threshold, paper_rule
 from mjx_cl.detectors.rolling_sigma import rolling_sigma
 from mjx_cl.detectors.table import factory, split
@@ -118,7 +118,7 @@ def _figures(name: str, build: Callable[..., Any], robot: str | None, shared: bo
   return {k: v for k, v in handed.items() if v is not None and k in taken}
 
 
-def _built(name: str, build: Callable[..., Any], patience: Written, settings: dict) -> Detector:
+def _built(name: str, build: Callable[..., Any], patience: int, settings: dict) -> Detector:
   """The detector of a factory, whose refusals become one line."""
   try:
     if patience == 1:
@@ -147,9 +147,9 @@ def make(
   name: str,
   channel: str | None = None,
   log: bool | None = None,
-  whiten: Written = 0,
-  patience: Written = 1,
-  cool_down: Written = 0,
+  whiten: int = 0,
+  patience: int = 1,
+  cool_down: int = 0,
   robot: str | None = None,
   shared: bool = False,
   **settings: Any,

@@ -23,7 +23,6 @@ from mjx_cl.detectors.base import (
   Number,
   Real,
   Setting,
-  Written,
   above,
   judged,
   keep,
@@ -176,7 +175,7 @@ class Window:
 def rolling_sigma(
   window: int = 1000,
   threshold: Setting = 3.0,
-  patience: Written = 1,
+  patience: int = 1,
   two_sided: bool = True,
   warmup: int = 500,
   smooth: int = 1,
@@ -230,7 +229,7 @@ def rolling_sigma(
 def _ruled(
   sums: Window,
   threshold: Setting,
-  patience: Written,
+  patience: int,
   two_sided: bool,
   warmup: int,
   smooth: int,
