@@ -1,5 +1,6 @@
 """The run-time check of shapes in annotations (pyproject.toml names it): a whole number is legal
-where a float is, as it is to type checkers. What a user wrote is checked by `detectors.make` itself.
+where a float is, as it is to type checkers. What a user wrote is checked by `detectors.make`
+itself.
 """
 
 import beartype

@@ -18,8 +18,6 @@ Number = Float[Array, ""]
 Real = float | int
 # settings as a caller may write them: also whole, or traced in a calibration
 Setting = float | int | Array
-# a setting as a user wrote it; whoever takes it checks it
-Written = Any
 
 
 class Alarm(NamedTuple):

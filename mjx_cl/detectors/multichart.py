@@ -5,7 +5,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from mjx_cl.detectors.base import Alarm, Detector, Real, Setting, Written, above, demand, whole
+from mjx_cl.detectors.base import Alarm, Detector, Real, Setting, above, demand, whole
 from mjx_cl.detectors.combine import any_of
 from mjx_cl.detectors.thresholds import board
 from mjx_cl.errors import UserError
@@ -33,7 +33,7 @@ def in_units(detector: Detector, unit: Real, threshold: Setting) -> Detector:
 def multichart(
   make: Callable[..., Detector],
   threshold: Setting = 1.0,
-  charts: Written = CHARTS,
+  charts: Any = CHARTS,
   robot: str | None = None,
 ) -> Detector:
   """Charts that look at different things, side by side; the alarm of any counts.

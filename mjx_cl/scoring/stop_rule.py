@@ -1,5 +1,4 @@
-"""Is the stop rule right? Stops and aborts against the best stop that the same seed could have had,
-and the rule with each signal left out.
+"""Is the stop rule right? Stops and aborts against the best stop that the same seed could have had.
 
 The best stop is known afterwards, from snapshots of an arm that never stops (snapshots.py). With
 five episodes a snapshot its own reward is noise, and the best of twenty is the luckiest of them

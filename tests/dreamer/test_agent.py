@@ -10,7 +10,8 @@ import quick
 
 from mjx_cl.config import DreamerConfig, replace
 from mjx_cl.dreamer import nets, rssm
-from mjx_cl.dreamer.agent import Agent, Record, Weights, parameter_count
+from mjx_cl.dreamer.agent import Agent, Record, parameter_count
+from mjx_cl.dreamer.state import Weights
 
 OBS, ACT, ROWS, LENGTH, IMAGINE = 5, 2, 3, 4, 3
 SMALL = dict(size="tiny", batch=ROWS, length=LENGTH, imagine=IMAGINE, warmup=20)
