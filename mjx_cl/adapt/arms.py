@@ -74,6 +74,11 @@ class Arm:
   breaks: bool = True
   agent: str = ""
 
+  @property
+  def learns(self) -> bool:
+    """Something may start an adaptation."""
+    return self.trigger is not NEVER
+
 
 def _random(adapt: AdaptConfig, onsets: tuple[int, ...], steps: int, seed: int) -> tuple[int, ...]:
   """One step, uniform over those from which a whole adaptation fits into the run."""

@@ -260,6 +260,15 @@ def update(
   return state._replace(since=since), decision, ok
 
 
+def rest(
+  state: PhaseState, signals: jax.Array, now: jax.Array | int, config: AdaptConfig
+) -> PhaseState:
+  """One chunk of one stream that has begun no adaptation and begins none; arguments as of
+  `update`.
+  """
+  return _remember(state, signals, state.posture[0], jnp.bool_(False), now, config)
+
+
 def _remember(
   state: PhaseState,
   signals: jax.Array,

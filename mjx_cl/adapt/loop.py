@@ -7,15 +7,18 @@ no update.
 
 from __future__ import annotations
 
-from collections.abc import Hashable
-from typing import Any
+import threading
+import time
+from collections.abc import Callable, Hashable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from mjx_cl.adapt import act, decide, learn, watch
 from mjx_cl.adapt.choices import WIDTH, Choices, choices
-from mjx_cl.adapt.state import Digest, LoopState
+from mjx_cl.adapt.state import Digest, Frozen, LoopState
+from mjx_cl.adapt.watch import Minds, Sight, Watched
 from mjx_cl.config import AdaptConfig
 from mjx_cl.detectors.base import Detector
 from mjx_cl.dreamer import replay as replay_lib
@@ -24,7 +27,7 @@ from mjx_cl.rollout.monitor import Monitor, unknown
 from mjx_cl.rollout.scan import Row
 from mjx_cl.types import Spec
 
-__all__ = ["WIDTH", "Choices", "Digest", "Loop", "LoopState", "Programs", "choices"]
+__all__ = ["WIDTH", "Choices", "Digest", "Loop", "LoopState", "Once", "Programs", "choices"]
 
 
 class Programs:
@@ -48,6 +51,52 @@ class Programs:
     while len(self.kept) > self.most:
       del self.kept[next(iter(self.kept))]
     return program
+
+
+class Once:
+  """A jitted function that threads may call at the same time: the first call, which compiles, is
+  made alone.
+  """
+
+  def __init__(self, function: Callable[..., Any]) -> None:
+    self.function = function
+    self.seconds = 0.0  # of the first call
+    self._lock, self._warm = threading.Lock(), False
+
+  def __call__(self, *args: Any) -> Any:
+    """What the function gives."""
+    if self._warm:
+      return self.function(*args)
+    with self._lock:
+      begin = time.perf_counter()
+      out = self.function(*args)
+      if not self._warm:
+        self.seconds, self._warm = time.perf_counter() - begin, True
+    return out
+
+
+class Jitted(NamedTuple):
+  """The programs of a Loop.
+
+  Attributes:
+    watch: of every stream, see Loop.watch.
+    rest: of streams that have not begun to learn.
+    learn: of those that have.
+  """
+
+  watch: Once
+  rest: Once
+  learn: Once
+
+
+def strong(tree: Any) -> Any:
+  """Without weak types: those would be a second trace, also of a run that goes on."""
+  return jax.tree.map(lambda x: jnp.asarray(x, x.dtype) if x.weak_type else x, tree)
+
+
+def _split(keys: jax.Array, now: jax.Array) -> jax.Array:
+  """Keys (groups, 3) of a chunk: of the monitor, the signals and the updates."""
+  return jax.vmap(lambda key: jax.random.split(jax.random.fold_in(key, now), 3))(keys)
 
 
 class Loop:
@@ -83,9 +132,13 @@ class Loop:
   ) -> None:
     self.agent, self.monitor, self.detector, self.spec = agent, monitor, detector, spec
     self.config, self.repeat, self.capacity = config, repeat, capacity
-    self._program = jax.jit(self._digest, donate_argnums=0)
-    if same is not None and programs is not None:
-      self._program = programs.share((same, repeat), self._program)
+    own = Jitted(
+      Once(jax.jit(self._watch)),
+      Once(jax.jit(self._rest)),
+      Once(jax.jit(self._learn, donate_argnums=0)),
+    )
+    shared = same is not None and programs is not None
+    self.programs = programs.share((same, repeat), own) if shared and programs else own
 
   def init(self, train: TrainState, groups: int, rollback: bool = False) -> LoopState:
     """State before the first step.
@@ -117,8 +170,44 @@ class Loop:
       executed=jnp.zeros(groups, jnp.int32),
       before=act.Before(params(), none(), none(), jnp.zeros(groups, bool)) if rollback else None,
     )
-    # a weak type would be a second trace, also of a run that goes on
-    return jax.tree.map(lambda x: jnp.asarray(x, x.dtype) if x.weak_type else x, state)
+    return strong(state)
+
+  def frozen(self) -> Frozen:
+    """A life before its first step."""
+    sight = Sight(
+      self.monitor.init(1, 1),
+      jax.tree.map(lambda x: jnp.asarray(x)[None], self.detector.init()),
+      unknown((max(1, self.config.refit // self.repeat), 1), self.agent.obs_size),
+    )
+    phase = jax.tree.map(lambda x: jnp.asarray(x)[None], decide.init(self.config))
+    return strong(Frozen(sight, phase))
+
+  def watch(
+    self, minds: Minds, sight: Sight, rows: Row, now: jax.Array, keys: jax.Array
+  ) -> tuple[Watched, Sight]:
+    """What a chunk says, jitted; arguments as of `digest`."""
+    return self.programs.watch(minds, sight, rows, now, keys)
+
+  def rest(
+    self, phase: decide.PhaseState, seen: Watched, now: jax.Array
+  ) -> tuple[decide.PhaseState, Digest]:
+    """A chunk of streams that begin no adaptation and have begun none, jitted."""
+    return self.programs.rest(phase, seen, now, self.config)
+
+  def learn(
+    self,
+    state: LoopState,
+    seen: Watched,
+    sight: Sight,
+    rows: Row,
+    now: jax.Array,
+    choices: Choices,
+    keys: jax.Array,
+    acceptance: jax.Array | None = None,
+  ) -> tuple[LoopState, Digest]:
+    """What follows from a chunk that has been watched, jitted; arguments as of `digest`."""
+    state = state._replace(**sight._asdict())
+    return self.programs.learn(state, seen, rows, now, choices, keys, acceptance, self.config)
 
   def digest(
     self,
@@ -129,7 +218,7 @@ class Loop:
     keys: jax.Array,
     acceptance: jax.Array | None = None,
   ) -> tuple[LoopState, Digest]:
-    """One chunk, jitted; `state` is used up.
+    """One chunk, watched and learnt from; `state` is used up.
 
     Args:
       state: before the chunk.
@@ -144,11 +233,32 @@ class Loop:
     Returns:
       (state', Digest).
     """
-    return self._program(state, rows, now, choices, keys, acceptance, self.config)
+    seen, sight = self.watch(state.minds, state.sight, rows, now, keys)
+    return self.learn(state, seen, sight, rows, now, choices, keys, acceptance)
 
-  def _digest(
+  def _watch(
+    self, minds: Minds, sight: Sight, rows: Row, now: jax.Array, keys: jax.Array
+  ) -> tuple[Watched, Sight]:
+    split = _split(keys, now)[:, :2]
+    return watch.watch(
+      self.agent, self.monitor, self.detector, self.spec, minds, sight, rows, split
+    )
+
+  def _rest(
+    self, phase: decide.PhaseState, seen: Watched, now: jax.Array, config: AdaptConfig
+  ) -> tuple[decide.PhaseState, Digest]:
+    was = phase.phase
+    phase = jax.vmap(decide.rest, (0, 0, None, None))(phase, seen.signals, now, config)
+    failed = jnp.full_like(was, -1)
+    phase, decision = decide.give_up(phase, jnp.zeros_like(was), was, failed, seen.signals)
+    unsettled = jnp.zeros(seen.signals.shape, bool)
+    none = jnp.zeros_like(was)
+    return phase, Digest(*seen[:4], unsettled, phase.phase, decision, phase.since, none, failed)
+
+  def _learn(
     self,
     state: LoopState,
+    seen: Watched,
     rows: Row,
     now: jax.Array,
     choices: Choices,
@@ -157,11 +267,7 @@ class Loop:
     config: AdaptConfig,
   ) -> tuple[LoopState, Digest]:
     agent, was = self.agent, state.phase.phase
-    split = jax.vmap(lambda key: jax.random.split(jax.random.fold_in(key, now), 3))(keys)
-    seen, history, detector, past = watch.watch(
-      agent, self.monitor, self.detector, self.spec, state, rows, split[:, :2]
-    )
-
+    draws = _split(keys, now)[:, 2]
     begin = decide.starts(seen.fired, choices.at, now, self.repeat, config)
     if acceptance is None or config.acceptance is not None:
       acceptance = self.spec.acceptance if config.acceptance is None else config.acceptance
@@ -177,9 +283,7 @@ class Loop:
     number = jnp.floor(owed + 1e-6).astype(jnp.int32)
     train, acting = learn.begin(agent, state, keys, begins, choices.fresh, config.fresh_moments)
     counted = train.updates
-    train, replay, failed = learn.learn(
-      agent, train, replay, split[:, 2], number, choices.world_only
-    )
+    train, replay, failed = learn.learn(agent, train, replay, draws, number, choices.world_only)
     taken = train.updates - counted
     phase, decision = decide.give_up(phase, decision, was, failed, seen.signals)
 
@@ -189,10 +293,19 @@ class Loop:
     # a stream that is done watches again, its reference refitted on the latest rows
     over = (decision == decide.STOP) | (decision == decide.END)
     refit = lambda d, p, s: watch.refit(self.detector, d, p, s)
-    detector = jax.lax.cond(jnp.any(over), refit, lambda d, p, s: d, detector, past, over)
+    detector = jax.lax.cond(
+      jnp.any(over), refit, lambda d, p, s: d, state.detector, state.past, over
+    )
     executed = state.executed + taken
-    state = LoopState(
-      train, acting, replay, history, detector, phase, past, owed - number, executed, before
+    state = state._replace(
+      train=train,
+      acting=acting,
+      replay=replay,
+      detector=detector,
+      phase=phase,
+      owed=owed - number,
+      executed=executed,
+      before=before,
     )
     said = (phase.phase, decision, phase.since, executed, failed, *weighed)
     return state, Digest(*seen[:4], settled, *said)
@@ -203,7 +316,7 @@ class Loop:
     train: TrainState,
     acting: Any,
     phase: decide.PhaseState,
-    seen: watch.Watched,
+    seen: Watched,
     begins: jax.Array,
     number: jax.Array,
     taken: jax.Array,

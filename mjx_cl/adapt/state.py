@@ -5,12 +5,18 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import jax
+import numpy as np
 
 from mjx_cl.adapt.act import Before
 from mjx_cl.adapt.decide import PhaseState
+from mjx_cl.adapt.watch import Minds, Sight
 from mjx_cl.dreamer.agent import TrainState
 from mjx_cl.dreamer.replay import Replay
 from mjx_cl.rollout.monitor import History, Residual
+
+# fields of a LoopState whose streams lie along axis 1; of the others along axis 0
+LATER = ("history", "past")
+ROWS = ("residual", "score", "fired")  # fields of a Digest, likewise
 
 
 class LoopState(NamedTuple):
@@ -40,6 +46,29 @@ class LoopState(NamedTuple):
   owed: jax.Array
   executed: jax.Array
   before: Before | None = None
+
+
+  @property
+  def minds(self) -> Minds:
+    """What predicts and judges."""
+    return Minds(self.acting, self.train.slow, self.train.range)
+
+  @property
+  def sight(self) -> Sight:
+    """What watching remembers."""
+    return Sight(self.history, self.detector, self.past)
+
+
+class Frozen(NamedTuple):
+  """What is kept of a robot that has not begun to learn, leading as in LoopState.
+
+  Attributes:
+    sight: what watching remembers.
+    phase: PhaseState.
+  """
+
+  sight: Sight
+  phase: PhaseState
 
 
 class Digest(NamedTuple):
@@ -75,3 +104,20 @@ class Digest(NamedTuple):
   back: jax.Array | None = None
   earned: jax.Array | None = None
   earns: jax.Array | None = None
+
+
+def cut(tree: Any, block: slice, axis: int) -> Any:
+  """Entries `block` along an axis of every leaf."""
+  return jax.tree.map(lambda x: x[(slice(None),) * axis + (block,)], tree)
+
+
+def glue(parts: list, later: tuple[str, ...]) -> Any:
+  """Named tuples put together along axis 1 of the fields `later`, axis 0 of the others, NumPy."""
+
+  def field(name: str) -> Any:
+    values = [getattr(part, name) for part in parts]
+    return jax.tree.map(
+      lambda *x: np.concatenate([np.asarray(y) for y in x], int(name in later)), *values
+    )
+
+  return type(parts[0])(*(field(name) for name in parts[0]._fields))

@@ -10,12 +10,13 @@ import jax
 import jax.numpy as jnp
 
 from mjx_cl.adapt.act import choose
-from mjx_cl.adapt.state import LoopState
 from mjx_cl.detectors.base import Detector
-from mjx_cl.dreamer.agent import Agent, Record, TrainState
+from mjx_cl.dreamer.agent import Agent
 from mjx_cl.rollout.monitor import History, Monitor, Residual
 from mjx_cl.rollout.scan import Row
 from mjx_cl.types import Spec
+
+STARTS = 16  # states of a chunk that the signals of actor and critic are imagined from
 
 
 class Watched(NamedTuple):
@@ -36,15 +37,44 @@ class Watched(NamedTuple):
   posture: jax.Array
 
 
+class Sight(NamedTuple):
+  """What watching remembers from chunk to chunk.
+
+  Attributes:
+    history: of the monitor, leading (n - 1, groups, 1).
+    detector: state of the detector, leading (groups,).
+    past: Residual of the last `refit` rows, leading (refit, groups).
+  """
+
+  history: History
+  detector: Any
+  past: Residual
+
+
+class Minds(NamedTuple):
+  """Which weights predict and judge, leading (groups,).
+
+  Attributes:
+    params: that act.
+    slow: of the slow critic.
+    range: float32 (groups, 2), see TrainState.
+  """
+
+  params: Any
+  slow: Any
+  range: jax.Array
+
+
 def watch(
   agent: Agent,
   monitor: Monitor,
   detector: Detector,
   spec: Spec,
-  state: LoopState,
+  minds: Minds,
+  sight: Sight,
   rows: Row,
   keys: jax.Array,
-) -> tuple[Watched, History, Any, Residual]:
+) -> tuple[Watched, Sight]:
   """Looks at a chunk.
 
   Args:
@@ -52,66 +82,49 @@ def watch(
     monitor: gives residuals.
     detector: gives alarms.
     spec: of the environment.
-    state: before the chunk.
+    minds: weights.
+    sight: before the chunk.
     rows: leading (T, groups, 1).
     keys: (groups, 2), of the monitor and of the signals.
 
   Returns:
-    (Watched, the monitor's history, the detector's state, the latest residuals) after the chunk.
+    (Watched, sight') after the chunk.
   """
-  history, residual = monitor.update(state.acting, state.history, rows, keys[:, 0])
+  history, residual = monitor.update(minds.params, sight.history, rows, keys[:, 0])
   residual = jax.tree.map(lambda x: x[:, :, 0], residual)
-  after, alarms = jax.lax.scan(jax.vmap(detector.update), state.detector, residual)
-  past = jax.tree.map(lambda a, b: jnp.concatenate([a, b])[-a.shape[0] :], state.past, residual)
+  after, alarms = jax.lax.scan(jax.vmap(detector.update), sight.detector, residual)
+  past = jax.tree.map(lambda a, b: jnp.concatenate([a, b])[-a.shape[0] :], sight.past, residual)
 
-  dyn, adv, value = evaluate(agent, state.train, state.history, rows, keys[:, 1])
+  dyn = jnp.mean(jnp.maximum(agent.config.free_nats, residual.surprise), 0)
+  adv, value = evaluate(agent, minds, rows, keys[:, 1])
   reward = jnp.mean(rows.rewards, (0, 2, 3))
   signals = jnp.stack(
     [jnp.nanmean(residual.opr, 0), jnp.nanmean(residual.rpr, 0), reward, dyn, adv, value], -1
   )
   index, _ = spec.posture or (0, -jnp.inf)
   posture = jnp.mean(rows.final_obs[:, :, 0, index], 0)
-  return Watched(residual, alarms.score, alarms.fired, signals, posture), history, after, past
+  seen = Watched(residual, alarms.score, alarms.fired, signals, posture)
+  return seen, Sight(history, after, past)
 
 
 def evaluate(
-  agent: Agent, train: TrainState, before: History, rows: Row, keys: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-  """Dynamics loss, advantage magnitude and value loss (groups,) on the chunk just lived, without
-  gradient.
+  agent: Agent, minds: Minds, rows: Row, keys: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+  """Advantage magnitude and value loss (groups,) of what the robot acts by, without gradient.
 
-  The ring of recent data is the chunk itself with the last record before it as context, so an
-  alarm leaves nothing old in it.
+  Imagined from STARTS states of the chunk, evenly spaced, whose posterior latents acting has found
+  already.
   """
-  # (groups, 1, 1 + T, ...)
-  join = lambda old, new: jnp.concatenate([old[-1:].astype(new.dtype), new])[:, :, 0].swapaxes(
-    0, 1
-  )[:, None]
-  deter, stoch = join(before.deter, rows.deter), join(before.stoch, rows.stoch)
-  action, obs = join(before.action, rows.action), join(before.obs, rows.obs)
-  reward = join(before.reward, rows.reward_in)
-  first = join(before.done, rows.first).at[:, :, 0].set(True)
-  none = jnp.zeros_like(first)
-  batch = Record(
-    obs=obs,
-    action=action,
-    reward=reward,
-    first=first,
-    last=jnp.concatenate([first[:, :, 1:], none[:, :, :1]], 2),
-    terminal=none,
-    deter=deter,
-    stoch=stoch,
-    demo=jnp.zeros_like(action),
-    has_demo=none,
-  )
+  length = rows.reward.shape[0]
+  at = jnp.arange(max(1, length // STARTS) - 1, length, max(1, length // STARTS))
 
   def one(
-    train: TrainState, batch: Record, key: jax.Array
-  ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    metrics = agent.loss(train.params, train.slow, train.range, batch, key)[1][0]
-    return metrics["loss/dyn"], metrics["adv_mag"], metrics["loss/value"]
+    minds: Minds, deter: jax.Array, stoch: jax.Array, key: jax.Array
+  ) -> tuple[jax.Array, jax.Array]:
+    dreamt = agent.judge(*minds, deter, agent.hot(stoch), key)
+    return dreamt.metrics["adv_mag"], dreamt.value
 
-  return jax.vmap(one)(train, batch, keys)
+  return jax.vmap(one, (0, 1, 1, 0))(minds, rows.deter[at, :, 0], rows.stoch[at, :, 0], keys)
 
 
 def refit(detector: Detector, state: Any, past: Residual, over: jax.Array) -> Any:

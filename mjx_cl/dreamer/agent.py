@@ -187,10 +187,7 @@ class Agent(Networks):
     c = self.config
     tail = slice(len(deter) - (c.last_starts or len(deter)), None)
     flat = lambda x: x[tail].reshape((-1,) + x.shape[2:])
-    form = (
-      (stepwise.imagine, stepwise.sums) if self.stepwise else (behaviour.imagine, behaviour.sums)
-    )
-    img = behaviour.losses(self, params, slow, range_, flat(deter), flat(stoch), key, *form)
+    img = self.judge(params, slow, range_, flat(deter), flat(stoch), key)
     reward, terminal, last = seen.reward[tail], seen.terminal[tail], seen.last[tail]
     target = losses.replay_return(
       reward, terminal, last, img.boot.reshape(reward.shape), c.lam, self.discount
@@ -202,6 +199,21 @@ class Agent(Networks):
       nets.two_hot_loss(logits, target, self.bins)
       + nets.two_hot_loss(logits, slow_value, self.bins)
     )
+
+  def judge(
+    self,
+    params: Any,
+    slow: Any,
+    range_: Float[Array, "2"],
+    deter: Float[Array, "rows deter"],
+    stoch: Float[Array, "rows stoch"],
+    key: PRNGKeyArray,
+  ) -> behaviour.Behaviour:
+    """Losses of actor and critic on dreams from rows of states."""
+    form = (
+      (stepwise.imagine, stepwise.sums) if self.stepwise else (behaviour.imagine, behaviour.sums)
+    )
+    return behaviour.losses(self, params, slow, range_, deter, stoch, key, *form)
 
   def _clone_loss(
     self,

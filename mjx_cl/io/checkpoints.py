@@ -120,8 +120,8 @@ class Checkpoints:
       ) from e
 
   def load(self, like: Any) -> tuple[Any, dict[str, Any]]:
-    """Newest checkpoint that can be read, (tree, meta), for a tree like `like`; it is the `latest`
-    from then on.
+    """Newest checkpoint that can be read, (tree, meta), for a tree like `like`, or, where that is
+    a function, like(meta); it is the `latest` from then on.
 
     Where the newest is broken and an earlier one is whole, that is said in a line on stderr, and
     the broken one is set aside: its folder is renamed to NUMBER.broken.
@@ -130,11 +130,16 @@ class Checkpoints:
       FileError: none can be read, or it is of another size or dtype, or reading failed for
         another reason than the file (memory, open files, ...); nothing is set aside then.
     """
-    packed, numbers, first = pack(like), sorted(self._manager.all_steps(), reverse=True), None
+    numbers, first = sorted(self._manager.all_steps(), reverse=True), None
     if not numbers:
       raise FileError(f"no checkpoint in {self.folder}")
     for number in numbers:
       try:
+        own = like
+        if callable(like):
+          only = ocp.args.Composite(meta=ocp.args.JsonRestore())
+          own = like(self._manager.restore(number, args=only)["meta"])
+        packed = pack(own)
         stored = _dtypes(
           ocp.PyTreeCheckpointHandler().metadata(self.folder / str(number) / "tree").tree
         )
@@ -176,7 +181,7 @@ class Checkpoints:
     (leaves, structure), meta = jax.tree.flatten(out["tree"]), out["meta"]
     del out  # the arrays are held once
     free(leaves, jax.tree.leaves(packed))
-    return unpack(jax.tree.unflatten(structure, leaves), like), meta
+    return unpack(jax.tree.unflatten(structure, leaves), own), meta
 
   def _set_aside(self, numbers: list[int]) -> None:
     """Renames the folders of broken checkpoints to NUMBER.broken (.broken-2, ... where that

@@ -230,12 +230,12 @@ class Host:
     force: np.ndarray | None = None,
   ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """`Native.step` on NumPy arrays with any leading axes: (rows, {output: float32})."""
-    begin = time.perf_counter()
     state = np.asarray(state)
     lead, width = state.shape[:-1], state.shape[-1]
     num = math.prod(lead)
     flat = lambda x: np.asarray(x).reshape((num,) + np.shape(x)[len(lead) :])
     with self._lock:
+      begin = time.perf_counter()
       batch, views = self._batch(num, tuple(sorted(fields)), force is not None)
       self._write_fields(batch, views, fields, num)
       views["state"][...] = np.ascontiguousarray(state.reshape(num, width)).view(np.float64)

@@ -14,7 +14,6 @@ from mjx_cl.config import RunConfig
 from mjx_cl.errors import UserError
 from mjx_cl.faults.presets import becomes, changes
 from mjx_cl.io import memory
-from mjx_cl.rollout.order import Lanes
 from mjx_cl.runs.identity import arm_agents
 from mjx_cl.runs.loops import capacity
 from mjx_cl.runs.records import acts
@@ -134,7 +133,7 @@ def estimate(part: Part, rate: float, robots: Robots) -> Estimate:
   batch, starts = c.adapt.batch or trained.batch, c.adapt.last_starts
   shape = (trained.size, len(spec.obs), len(spec.act))
   size = needs.parameters(*shape, trained.bins)[0] / 640_867  # of size1m on a walker
-  streams, lanes = len(c.arms) * c.seeds, len(Lanes(len(c.arms), c.seeds).order)
+  streams = lanes = len(c.arms) * c.seeds
   told = stop_rule.told(c)
   learning = sum(
     max(0, steps - c.adapt.start_windows - trained.length)

@@ -6,7 +6,6 @@ import json
 from typing import Any
 
 from mjx_cl import detectors
-from mjx_cl.adapt.blocks import Blocks
 from mjx_cl.adapt.loop import Loop, Programs
 from mjx_cl.config import CHUNK, RunConfig
 from mjx_cl.dreamer import replay
@@ -24,20 +23,20 @@ def capacity(steps: int, episode: int, repeat: int = 1) -> int:
   return replay.room((chunks + 2) * CHUNK + steps // episode)
 
 
-def loops(
+def make_loop(
   config: RunConfig,
   robots: list[Any],
   trained: agents.Trained,
-  groups: int,
+  learners: int,
   programs: Programs | None,
-) -> Blocks:
-  """The run's Blocks.
+) -> Loop:
+  """The run's Loop.
 
   Args:
     config: of the run.
     robots: what each stream's robot is, and what it becomes where it becomes another.
     trained: the run's agent.
-    groups: number of streams.
+    learners: streams that may learn.
     programs: compiled ones that it may share.
 
   Raises:
@@ -51,7 +50,7 @@ def loops(
   records = lambda steps: capacity(steps, episode, repeat)
   size = (agent.config.size, len(spec.obs), len(spec.act))
   bounded = ("steps", records)
-  needs.check(*size, records(config.steps), groups, bounded, agent.config.bins)
+  needs.check(*size, records(config.steps), max(1, learners), bounded, agent.config.bins)
   same = (
     agent.config,
     agent.obs_size,
@@ -65,7 +64,7 @@ def loops(
     robot,
     json.dumps(settings, sort_keys=True, default=repr),
   )
-  loop = Loop(
+  return Loop(
     agent,
     Monitor(agent, n=15, form=config.form, actions=config.actions, spec=spec),
     detector,
@@ -76,4 +75,3 @@ def loops(
     same=same,
     programs=programs or Programs(),
   )
-  return Blocks(loop, groups)

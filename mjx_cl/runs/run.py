@@ -170,7 +170,7 @@ def finish(runner: Runner, tell: Callable[[str], Any] = lambda text: None) -> di
   figures.figure(out)
   if runner.endless and "posture" in trace:
     tables.write_table(out / "signals.parquet", ledger.signals(trace))
-  value = summary(ledger, rows, trace, runner.seconds, runner.quiet, runner.done_chunks)
+  value = summary(ledger, rows, trace, runner.seconds)
   if runner.snapshots and (taken := runner.snapshots.taken(trace, runner.chunk_steps)):
     scores, value["wall_s_snapshots"] = runner.snapshots.evaluate(taken, targets(runner), tell)
     tables.write_table(out / "snapshots.parquet", scores)
@@ -192,9 +192,8 @@ def write_rows(path: pathlib.Path, rows: list[dict], names: Iterable[str]) -> No
 
 def targets(runner: Runner) -> np.ndarray:
   """Int (groups, F), of each stream's faults."""
-  streams = runner.state.streams
-  last = streams if runner.other is None else streams.after
-  return np.asarray(last.injection.target)[:, 0]
+  last = lambda robots: robots if runner.other is None else robots.after
+  return runner.lives.each(lambda robots: last(robots).injection.target)
 
 
 def ledger_of(runner: Runner) -> Ledger:
@@ -231,30 +230,25 @@ def keep(runner: Runner) -> None:
   seed, control steps of the run, updates taken.
   """
   config, folder = runner.config, runner.out / "agents"
-  for block, loop in zip(runner.loops.blocks, runner.state.loop):
-    for at, g in enumerate(range(block.start, block.stop)):
-      arm, seed = runner.labels[g]
-      updates = int(runner._updates[g])
-      if not updates:
-        continue
-      train = loop.train._replace(params=loop.acting)
-      card = runner.others.get(arm, runner.trained).card | {
-        "adapted": {
-          "env": config.env,
-          "becomes": becomes(config),
-          "fault": config.fault,
-          "arm": arm,
-          "seed": seed,
-          "steps": config.steps,
-          "updates": updates,
-        }
+  for g, (arm, seed) in enumerate(runner.labels):
+    updates = int(runner._updates[g])
+    if not updates:
+      continue
+    card = runner.others.get(arm, runner.trained).card | {
+      "adapted": {
+        "env": config.env,
+        "becomes": becomes(config),
+        "fault": config.fault,
+        "arm": arm,
+        "seed": seed,
+        "steps": config.steps,
+        "updates": updates,
       }
-      card = {k: v for k, v in card.items() if k not in ("eval", "demonstrator_return")}
-      try:
-        agents.save(
-          folder / f"{arm}-{seed}", jax.tree.map(lambda x: np.asarray(x[at]), train), card
-        )
-      except OSError as e:
-        raise FileError(
-          f"cannot write in {folder}: {e.strerror or e}; --resume writes them again"
-        ) from None
+    }
+    card = {k: v for k, v in card.items() if k not in ("eval", "demonstrator_return")}
+    try:
+      agents.save(folder / f"{arm}-{seed}", runner.lives.learnt(g), card)
+    except OSError as e:
+      raise FileError(
+        f"cannot write in {folder}: {e.strerror or e}; --resume writes them again"
+      ) from None

@@ -1,5 +1,6 @@
 """The life of a run: all its streams, chunk by chunk, and its checkpoints."""
 
+import functools
 import itertools
 import pathlib
 import sys
@@ -14,18 +15,19 @@ import numpy as np
 from mjx_cl import envs, faults
 from mjx_cl.adapt import decide as phase_lib
 from mjx_cl.adapt.arms import ARMS, FOREVER, never_stops
-from mjx_cl.adapt.loop import Choices, Digest, LoopState, Programs, choices
+from mjx_cl.adapt.loop import Choices, Digest, Programs, choices
+from mjx_cl.adapt.state import cut
 from mjx_cl.config import CHUNK, RunConfig
 from mjx_cl.dreamer.agent import CAUSES, EXPLODED
 from mjx_cl.errors import FileError
 from mjx_cl.faults.presets import becomes, changes
 from mjx_cl.io import arrays, checkpoints, runtime
 from mjx_cl.keys import OfSeed
-from mjx_cl.rollout.order import Lanes
 from mjx_cl.rollout.scan import Rollout, Row, nest, start
 from mjx_cl.rollout.transfer import Transfer
 from mjx_cl.runs.identity import arm_agents, identity
-from mjx_cl.runs.loops import loops
+from mjx_cl.runs.lives import Lives, Settled
+from mjx_cl.runs.loops import make_loop
 from mjx_cl.runs.records import acts
 from mjx_cl.runs.settings import check
 from mjx_cl.runs.snapshots import Snapshots
@@ -33,17 +35,7 @@ from mjx_cl.runs.trace import at_end, columns
 from mjx_cl.scoring import stop_rule
 from mjx_cl.training import agents
 
-
-class State(NamedTuple):
-  """All arrays of a run.
-
-  Attributes:
-    streams: the robots, a Stream, or a Moving where they become others.
-    loop: everything else, in blocks of streams, see adapt/blocks.py.
-  """
-
-  streams: Any
-  loop: list[LoopState]
+KINDS = ("physics", "acting", "monitor", "updates", "compiling", "other")  # of wall time
 
 
 class Progress(NamedTuple):
@@ -74,24 +66,11 @@ class Progress(NamedTuple):
   note: str = ""
 
 
-def held(state: LoopState) -> dict:
-  """Its fields by name, without those that this run has no use for: a checkpoint of a version that
-  did not know them yet goes on.
-  """
-  return {name: value for name, value in state._asdict().items() if value is not None}
-
-
-def entered(streams: Any) -> np.ndarray:
-  """Int (groups,), control step at which each robot became the other one; FOREVER: not known."""
-  return np.asarray(streams.after.enter)[:, 0]
-
-
 class Runner:
   """Runs one RunConfig into the folder `out`.
 
   Streams are ordered arm by arm, seed by seed. A stream's keys come from its seed alone, so the
-  same seed lives the same life in every arm until an alarm is acted on, bit for bit: see
-  rollout/order.py. Another number of arms or seeds is another program, which rounds otherwise.
+  same seed lives the same life in every arm until an adaptation begins, see lives.py.
   """
 
   def __init__(
@@ -117,7 +96,6 @@ class Runner:
     seeds = range(config.first_seed, config.first_seed + config.seeds)
     self.labels = list(itertools.product(config.arms, seeds))
     self.groups = len(self.labels)
-    self.lanes = Lanes(len(config.arms), config.seeds)
     arms = [ARMS[arm] for arm in config.arms]
     self.endless = any(never_stops(arm) for arm in arms)
     self.breaks = np.asarray([ARMS[arm].breaks for arm, _ in self.labels])
@@ -127,19 +105,22 @@ class Runner:
     keys = jnp.stack([jax.random.key(seed) for _, seed in self.labels])[:, None]
     self.keys = jax.vmap(lambda k: jax.random.fold_in(k, OfSeed.ADAPTATION))(keys[:, 0])
     self.rollout, begin = self._rollout(plan, target)
-    self.loops = loops(config, self.robots, self.trained, self.groups, programs)
+    learners = sum(ARMS[arm].learns for arm, _ in self.labels)
+    self.loop = make_loop(config, self.robots, self.trained, learners, programs)
     trains = [self.others.get(arm, self.trained).train for arm, _ in self.labels]
-    self.state = State(
-      nest(begin, (0, 0), (0, None))(keys, jnp.asarray(self.breaks)),
-      self.loops.init(trains, any(arm.rollback for arm in arms)),
+    self.lives = Lives(
+      self.rollout,
+      self.loop,
+      jax.jit(nest(begin, (0, 0), (0, None)))(keys, jnp.asarray(self.breaks)),
+      trains,
+      [(id(t), bool(b), seed) for t, b, (_, seed) in zip(trains, self.breaks, self.labels)],
+      self.keys,
+      any(arm.rollback for arm in arms),
     )
-    self.acting = self.loops.acting(self.state.loop, self.lanes)
-    self.choices = self._choices(self.state.streams)
+    self.choices = self._choices()
     # what has been lived
     self.done_chunks = 0
-    self.compiled = False  # the first chunk of this process compiles
-    self.seconds = {"physics": 0.0, "acting": 0.0, "digest": 0.0, "other": 0.0}
-    self.quiet: list[float] = []  # digest time of chunks without an update
+    self.seconds = dict.fromkeys(KINDS, 0.0)
     self.parts: list[dict] = []
     self.stream_seconds: np.ndarray = np.zeros(self.groups)
     self._updates: Any = np.zeros(self.groups, int)
@@ -171,37 +152,21 @@ class Runner:
 
   def step(self) -> Progress:
     """Lives one chunk and logs it."""
-    begin = time.perf_counter()
-    physics = self._physics_seconds()
-    streams, rows = self.rollout.chunk(self.acting, self.lanes.spread(self.state.streams), CHUNK)
-    streams, rows = self.lanes.gather(streams), self.lanes.gather_rows(jax.block_until_ready(rows))
-    acted = time.perf_counter()
-    physics = self._physics_seconds() - physics
+    begin, physics, compiled = time.perf_counter(), self._physics_seconds(), self.lives.compiled
     now = (self.done_chunks + 1) * self.chunk_steps
-    if self.other is not None:
-      self.choices = self._choices(streams)  # robots have changed in this chunk
-    accepted = self._acceptance(streams, now)
-    loop, digest = self.loops.digest(
-      self.state.loop, rows, jnp.int32(now), self.choices, self.keys, accepted
-    )
-    digested = time.perf_counter()
-    self.state = State(streams, loop)
-    # weights are what they were in every other stream
-    changed = (digest.updates != self._updates) | (digest.decision > 0)
-    # the only block's own arrays are used up by its next digest
-    if changed.any() or len(loop) == 1:
-      self.acting = self.loops.acting(loop, self.lanes)
+    rows, digest, seconds = self.lives.step(now, functools.partial(self._settle, now))
+    lived = time.perf_counter()
     before = self._phase
     self._log(rows, digest)
-    updates = digest.updates - self._updates
     self._updates = digest.updates
     self._alarms = self._alarms + digest.fired.sum(0)
     self.done_chunks += 1
     self._notice_failures(digest, now)
     if self.snapshots:
-      self.snapshots.take(self.acting, self.lanes.place, before, digest, now, self.chunk_steps)
-    self._account(acted - begin, physics, digested - acted, np.asarray(updates))
-    self.seconds["other"] += time.perf_counter() - digested
+      self.snapshots.take(self.lives.acting, before, digest, now, self.chunk_steps)
+    physics, compiled = self._physics_seconds() - physics, self.lives.compiled - compiled
+    self._account(lived - begin, seconds, physics, compiled)
+    self.seconds["other"] += time.perf_counter() - lived
     arms, seeds = map(list, zip(*self.labels))
     return Progress(
       min(now, self.config.steps),
@@ -215,23 +180,19 @@ class Runner:
       digest.updates,
     )
 
-  def _account(self, acting: float, physics: float, digest: float, updates: np.ndarray) -> None:
-    """Adds a chunk's seconds, those of compiling apart, and shares them among the streams: what
-    learning took among those that learnt.
+  def _account(self, wall: float, seconds: np.ndarray, physics: float, compiled: float) -> None:
+    """Adds a chunk's seconds of wall time, shared among kinds of work and streams as the cores'
+    own `seconds` (groups, kinds) are; a chunk in which something was compiled counts as compiling.
     """
-    learnt = updates.sum()
-    if self.compiled:
-      self.seconds["physics"] += physics
-      self.seconds["acting"] += acting - physics
-      self.seconds["digest"] += digest
-      if not learnt:
-        self.quiet.append(digest)
-    else:
-      self.seconds["other"] += acting + digest
-      self.compiled = True
-    learning = max(0.0, digest - float(np.median(self.quiet))) if self.quiet and learnt else 0.0
-    all_share = (acting + digest - learning) / self.groups
-    self.stream_seconds += all_share + learning * updates / max(1, learnt)
+    share = wall / max(1e-9, seconds.sum())
+    self.stream_seconds += seconds.sum(1) * share
+    if compiled:
+      self.seconds["compiling"] += wall
+      return
+    acting, monitor, updates = seconds.sum(0) * share
+    physics = min(acting, physics * share)
+    for kind, spent in zip(KINDS, (physics, acting - physics, monitor, updates)):
+      self.seconds[kind] += float(spent)
 
   def _notice_failures(self, digest: Digest, now: int) -> None:
     """Says which streams are given up for a loss at fault; they live on without learning. A reward
@@ -262,25 +223,39 @@ class Runner:
     clocks = {id(getattr(p, "host", p)): p for p in map(envs.physics_of, self.robots)}
     return sum(getattr(p, "seconds", 0.0) for p in clocks.values())
 
-  def _acceptance(self, streams: Any, now: int) -> jax.Array | None:
-    """Level (groups,) of the robot that each stream has after `now` control steps; None where
-    robots stay what they are.
-    """
-    if self.other is None:
-      return None
-    levels = [jnp.float32(robot.spec.acceptance) for robot in (self.other, self.env)]
-    return jnp.where(streams.after.enter[:, 0] < now, *levels)
+  def _entered(self) -> np.ndarray:
+    """Int (groups,), control step at which each robot became the other one; FOREVER: not known."""
+    return self.lives.each(lambda robots: robots.after.enter)
 
-  def _choices(self, streams: Any) -> Choices:
-    """The arms, with every true onset of their robots that is known by now; arms that are told one
+  def _level(self, enter: Any, now: int) -> jax.Array:
+    """Acceptance of robots that became the other one in control steps `enter`."""
+    levels = [jnp.float32(robot.spec.acceptance) for robot in (self.robots[-1], self.env)]
+    return jnp.where(jnp.asarray(enter) < now, *levels)
+
+  def _settle(self, now: int, g: int, robot: Callable[[], Any]) -> Settled:
+    """What holds for stream g in the chunk that ends with control step `now`."""
+    own = self.choices[g]
+    if self.other is None:
+      return Settled(own, None)
+    enter = robot().after.enter[0]
+    return Settled(own._replace(at=self._at(g, int(enter[0]))), self._level(enter, now))
+
+  def _onsets(self) -> tuple[int, ...]:
+    return tuple(self.config.onset + c.after for c in self.changes if c.fault != "none")
+
+  def _at(self, g: int, enter: int) -> jax.Array:
+    """Choices.at of stream g, whose robot became the other one in control step `enter`."""
+    c = self.config
+    return choices(self.labels[g : g + 1], c.adapt, c.steps, [(enter, *self._onsets())], self.stops).at
+
+  def _choices(self) -> list[Choices]:
+    """Of each stream, with every true onset that is known from the start; arms that are told one
     begin there even where the fault's severity is 0.
     """
     c = self.config
-    onsets = tuple(c.onset + change.after for change in self.changes if change.fault != "none")
-    known = [onsets] * self.groups
-    if self.other is not None:
-      known = [(step, *onsets) for step in entered(streams).tolist()]
-    return choices(self.labels, c.adapt, c.steps, known, self.stops)
+    known = [(() if self.other is None else (FOREVER,)) + self._onsets()] * self.groups
+    whole = choices(self.labels, c.adapt, c.steps, known, self.stops)
+    return [cut(whole, slice(g, g + 1), 0) for g in range(self.groups)]
 
   def onsets(self) -> list[int | None]:
     """Each stream's onset; where the robot becomes another one: as far as it is known. None: not in
@@ -289,7 +264,7 @@ class Runner:
     """
     steps, onset = self.config.steps, self.config.onset
     if self.other is not None:
-      return [step if step < steps else None for step in entered(self.state.streams).tolist()]
+      return [step if step < steps else None for step in self._entered().tolist()]
     met = onset < steps and any(acts(change) for change in self.changes)
     return [onset if breaks and met else None for breaks in self.breaks]
 
@@ -303,8 +278,10 @@ class Runner:
     if self.endless:  # what the stop rule reads besides the signals
       level: Any = self.config.adapt.acceptance
       if level is None:
-        level = self._acceptance(self.state.streams, (self.done_chunks + 1) * self.chunk_steps)
-      level = np.float32(self.env.spec.acceptance if level is None else level)
+        now = (self.done_chunks + 1) * self.chunk_steps
+        level = self.env.spec.acceptance
+        level = level if self.other is None else self._level(self._entered(), now)
+      level = np.asarray(level, np.float32)
       index = (self.env.spec.posture or (0, 0.0))[0]
       part["posture"] = np.asarray(rows.final_obs)[:, :, 0, index].mean(0)[None]
       part["acceptance"] = np.broadcast_to(level, (1, self.groups)).copy()
@@ -319,18 +296,18 @@ class Runner:
     if self.checkpoints.latest() == number:
       return
     begin = time.perf_counter()
+    tree, bands = self.lives.pack()
     arrays.write(self.work / f"trace-{number:06d}.npz", self.trace())
     self.seconds["other"] += time.perf_counter() - begin
     meta = {
       "seconds": self.seconds,
-      "quiet": self.quiet,
+      "bands": bands,
       "stream_seconds": self.stream_seconds.tolist(),
       "updates": self._updates.tolist(),
       "alarms": self._alarms.tolist(),
       "phase": self._phase.tolist(),
     }
-    state: Any = (self.state.streams, held(self.loops.join(self.state.loop)))
-    self.checkpoints.save(number, State(*state), meta)
+    self.checkpoints.save(number, tree, meta)
     runtime.give_back()
     for old in sorted(self.work.glob("trace-*.npz"))[:-2]:
       old.unlink()
@@ -342,18 +319,14 @@ class Runner:
 
   def resume(self) -> None:
     """Goes on from the newest checkpoint; without one, from the start."""
-    number = self.checkpoints.latest()
-    if number is None:
+    if self.checkpoints.latest() is None:
       return
-    like: Any = (self.state.streams, held(self.loops.shapes(self.state.loop)))
-    # what the run began with need not lie beside what it goes on with
-    del self.state, self.acting
-    (streams, loop), meta = self.checkpoints.load(State(*like))
-    self.state = State(streams, self.loops.split(LoopState(**loop)))
-    self.acting = self.loops.acting(self.state.loop, self.lanes)
+    tree, meta = self.checkpoints.load(lambda meta: self.lives.like(meta.get("bands", [])))
+    self.lives.unpack(tree, meta["bands"])
+    number = self.checkpoints.latest() or 0  # a broken one has been set aside
     self.parts = [arrays.read(self.work / f"trace-{number:06d}.npz")]
     self.done_chunks = number
-    self.seconds, self.quiet = meta["seconds"], meta["quiet"]
+    self.seconds = meta["seconds"]
     self.stream_seconds, self._updates, self._alarms, self._phase = (
       np.asarray(meta[k]) for k in ("stream_seconds", "updates", "alarms", "phase")
     )

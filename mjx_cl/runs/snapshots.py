@@ -128,8 +128,7 @@ class Snapshots:
 
   def take(
     self,
-    acting: Any,
-    place: np.ndarray,
+    acting: Callable[[int], Any],
     before: np.ndarray,
     digest: Digest,
     now: int,
@@ -138,20 +137,15 @@ class Snapshots:
     """Writes the snapshots that are due.
 
     Args:
-      acting: parameters, those of stream g at place[g].
-      place: int (groups,).
+      acting: stream -> what it acts by.
       before: as in `due`.
       digest: of the chunk.
       now: as in `due`.
       length: as in `due`.
     """
-    wanted = self._due(before, digest.decision, digest.since, now, length)
-    if not wanted:
-      return
-    weights: dict[str, Any] = arrays.named({k: acting[k] for k in ACTS})
-    weights = {name: np.asarray(leaf) for name, leaf in weights.items()}
-    for s in wanted:
-      self._write(self._path(s), {name: x[place[s.stream]] for name, x in weights.items()})
+    for s in self._due(before, digest.decision, digest.since, now, length):
+      weights = arrays.named({k: acting(s.stream)[k] for k in ACTS})
+      self._write(self._path(s), {name: np.asarray(leaf) for name, leaf in weights.items()})
 
   def _due(
     self, before: np.ndarray, decision: Any, since: Any, now: int, length: int

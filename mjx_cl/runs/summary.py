@@ -16,8 +16,6 @@ def summary(
   rows: list[dict],
   trace: dict[str, np.ndarray],
   seconds: dict[str, float],
-  quiet: list[float],
-  chunks: int,
 ) -> dict:
   """summary.json: per arm the aggregates; those of arm `detector` also at the top level.
 
@@ -25,23 +23,12 @@ def summary(
     ledger: of the run.
     rows: of runs.parquet.
     trace: of the run.
-    seconds: wall time by kind of work (physics, acting, digest, other).
-    quiet: digest's of each chunk without an update.
-    chunks: of the run.
+    seconds: wall time by kind of work (runner.KINDS).
   """
   config, wall = ledger.config, sum(seconds.values())
   severities = [c.severity if acts(c) else 0.0 for c in ledger.changes]
   arms = by_arm(rows, config, ledger.spec.control_s)
   share, interval = invalid(trace["valid"], ledger.repeat)
-  pause = float(np.median(quiet)) if quiet else 0.0
-  monitor = min(seconds["digest"], pause * max(1, chunks - 1))
-  shares = {
-    "physics": seconds["physics"],
-    "acting": seconds["acting"],
-    "monitor": monitor,
-    "updates": seconds["digest"] - monitor,
-    "other": seconds["other"],
-  }
   return {
     "env": config.env,
     "fault": config.fault,
@@ -56,7 +43,7 @@ def summary(
     "wall_s_arms": {
       arm: float(sum(r["wall_s"] or 0.0 for r in rows if r["arm"] == arm)) for arm in arms["arms"]
     },
-    "wall_share": {k: v / wall for k, v in shares.items()},
+    "wall_share": {k: v / wall for k, v in seconds.items()},
   }
 
 

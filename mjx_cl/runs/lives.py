@@ -1,0 +1,483 @@
+"""Robots side by side: every life is lived once, on whichever core is free.
+
+A stream (arm x seed) that has not begun to learn acts by the weights that its agent ships with, so
+the arms of a seed are one life until one of them begins an adaptation: its stream then leaves with
+a copy of the robot as it stands, and is a learner from that chunk on.
+
+  herd  up to HERD lives that act as one batch under one set of weights
+  band  up to BAND learners that act as one batch, each under its own weights
+
+Watching and learning are programs of one stream. Batches have fixed sizes and are filled up with
+repetitions, so a life's numbers do not depend on which others there are, nor on how many cores
+share the work. On an accelerator all streams are one band from the start.
+"""
+
+from __future__ import annotations
+
+import concurrent.futures
+import dataclasses
+import functools
+import time
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_cl.adapt import decide
+from mjx_cl.adapt.choices import Choices
+from mjx_cl.adapt.loop import Loop, Once
+from mjx_cl.adapt.state import LATER, ROWS, Digest, Frozen, LoopState, cut, glue
+from mjx_cl.adapt.watch import Minds, Sight
+from mjx_cl.config import CHUNK, AdaptConfig
+from mjx_cl.dreamer.agent import TrainState
+from mjx_cl.io.runtime import cores
+from mjx_cl.rollout.scan import Row
+
+HERD, BAND = 8, 4
+MANY = 4  # groups for each core, above which a group is seen to as a whole
+LOGGED = ("rewards", "severity", "severities", "episode", "terminated", "truncated", "final_obs")
+WORK = ("acting", "monitor", "updates")  # kinds of work, in the order in which a stream has them
+
+
+class Settled(NamedTuple):
+  """What holds for one stream in a chunk.
+
+  Attributes:
+    choices: of its arm, leading (1,).
+    acceptance: float32 (1,), of its robot, or None: that of the environment.
+  """
+
+  choices: Choices
+  acceptance: Any
+
+
+@dataclasses.dataclass
+class Herd:
+  """Lives under one set of weights.
+
+  Attributes:
+    lives: their numbers.
+    train: the agent.
+    minds: what it acts and judges by, leading (1,).
+    streams: robots, leading (1, HERD).
+    frozen: of each life.
+  """
+
+  lives: list[int]
+  train: TrainState
+  minds: Minds
+  streams: Any
+  frozen: list[Frozen]
+
+
+@dataclasses.dataclass
+class Band:
+  """Learners.
+
+  Attributes:
+    who: number of the stream in each lane, fewer than lanes where there is room.
+    streams: robots, leading (lanes, 1).
+    loops: LoopStates, of one stream each; on an accelerator one of all.
+    acting: weights, leading (lanes,); None: to be put together.
+  """
+
+  who: list[int]
+  streams: Any
+  loops: list[LoopState]
+  acting: Any = None
+
+
+class Chunk(NamedTuple):
+  """What a chunk brought.
+
+  Attributes:
+    rows: Row leading (T, streams, 1), NumPy, of the fields LOGGED; the others are None.
+    digest: Digest, NumPy.
+    seconds: float (streams, 3), of each kind of WORK, on one core; lives that several streams
+      share are shared out.
+  """
+
+  rows: Row
+  digest: Digest
+  seconds: np.ndarray
+
+
+def departs(
+  fired: np.ndarray,
+  phase: int,
+  choices: Choices,
+  now: int,
+  repeat: int,
+  config: AdaptConfig,
+) -> bool:
+  """Whether a stream begins an adaptation, as decide.starts and decide.update say it.
+
+  Args:
+    fired: bool (T,), alarms of the chunk's rows.
+    phase: of the stream.
+    choices: of its arm, leading (1,).
+    now: control steps done after the chunk.
+    repeat: control steps of a row.
+    config: AdaptConfig.
+  """
+  if phase != decide.NOMINAL or now <= config.warmup:
+    return False
+  opened = now - len(fired) * repeat
+  at = np.asarray(choices.at)
+  due = ((at >= max(opened, config.warmup)) & (at < now)).any()
+  known = opened + (np.arange(len(fired)) + 1) * repeat - 1
+  heard = bool(np.asarray(choices.listens)[0]) and (fired & (known >= config.warmup)).any()
+  return bool(due or heard)
+
+
+class Told(NamedTuple):
+  """What became of a chunk of streams that share a state.
+
+  Attributes:
+    streams: number -> (rows, digest), NumPy, each with one stream.
+    left: number -> (state, robot) of those that have begun to learn.
+    seconds: of watching and of learning.
+  """
+
+  streams: dict[int, tuple[Row, Digest]]
+  left: dict[int, tuple[LoopState, Any]]
+  seconds: tuple[float, float]
+
+
+# (stream, its robot after the chunk with leading (1, 1), on demand) -> Settled
+Settle = Callable[[int, Callable[[], Any]], Settled]
+
+
+class Lives:
+  """The streams of a run.
+
+  Args:
+    rollout: Rollout or Transfer; its `chunk` lives on.
+    loop: of every stream.
+    streams: robots before the first step, leading (streams, 1).
+    trains: the agent of each stream.
+    life: number of each stream's life: equal ones have the same robot, agent and keys.
+    keys: of the streams, for all but their robots.
+    rollback: an arm goes back, see act.Before.
+    together: all streams are one band from the start; None: on an accelerator.
+  """
+
+  def __init__(
+    self,
+    rollout: Any,
+    loop: Loop,
+    streams: Any,
+    trains: Sequence[TrainState],
+    life: Sequence[int],
+    keys: jax.Array,
+    rollback: bool = False,
+    together: bool | None = None,
+  ) -> None:
+    self.rollout, self.loop, self.keys = rollout, loop, keys
+    self.trains, self.rollback, self.streams = list(trains), rollback, len(trains)
+    together = jax.default_backend() != "cpu" if together is None else together
+    # streams of a band, and those that share a LoopState
+    self.band_size, self.width = (self.streams, self.streams) if together else (BAND, 1)
+    self.herds: list[Herd] = []
+    self.bands: list[Band] = []
+    self.place: dict[int, tuple[Band, int]] = {}  # learner -> its band and lane
+    self.sharing: dict[int, list[int]] = {}  # life -> streams that live it still
+    live = lambda *given: rollout.chunk(*given, CHUNK)
+    self._live = {Herd: Once(live), Band: Once(live)}
+    self._programs = (*self._live.values(), *loop.programs)
+    if together:
+      state = loop.init(trains[0], self.streams, rollback)
+      stack = jax.tree.map(lambda *x: jnp.stack(x), *trains)
+      # `before` is written at every start, before it is read
+      state = state._replace(train=stack, acting=jax.tree.map(jnp.copy, stack.params))
+      self._settle_down([Band(list(range(self.streams)), streams, [state])])
+    else:
+      for g, own in enumerate(life):
+        self.sharing.setdefault(own, []).append(g)
+      self._gather(streams)
+    self._robot = jax.tree.map(lambda x: x[:1], streams)
+
+  def _gather(self, streams: Any) -> None:
+    """Herds of all lives."""
+    agents = {id(train): train for train in self.trains}
+    for train in agents.values():
+      own = [life for life, who in self.sharing.items() if self.trains[who[0]] is train]
+      one = jax.tree.map(lambda x: jnp.asarray(x)[None], train)
+      minds = Minds(one.params, one.slow, one.range)
+      for k in range(0, len(own), HERD):
+        lives = own[k : k + HERD]
+        lanes = np.array([self.sharing[lives[i % len(lives)]][0] for i in range(HERD)])
+        robots = jax.tree.map(lambda x: x[lanes].swapaxes(0, 1), streams)
+        frozen = [self.loop.frozen() for _ in lives]
+        self.herds.append(Herd(lives, train, minds, robots, frozen))
+
+  def _settle_down(self, bands: list[Band]) -> None:
+    self.bands = bands
+    self.place = {g: (band, lane) for band in bands for lane, g in enumerate(band.who)}
+    for life, who in self.sharing.items():
+      self.sharing[life] = [g for g in who if g not in self.place]
+
+  @property
+  def compiled(self) -> float:
+    """Seconds that first calls of programs have taken so far, which compile."""
+    return sum(program.seconds for program in self._programs)
+
+  # ---- who is where ------------------------------------------------------------------------------
+
+  def _loop_of(self, g: int) -> tuple[LoopState, int]:
+    """State of learner g, and its place there."""
+    band, lane = self.place[g]
+    return band.loops[lane // self.width], lane % self.width
+
+  def acting(self, g: int) -> Any:
+    """What stream g acts by."""
+    if g not in self.place:
+      return self.trains[g].params
+    loop, at = self._loop_of(g)
+    return jax.tree.map(lambda x: x[at], loop.acting)
+
+  def learnt(self, g: int) -> TrainState:
+    """What learner g has learnt, with the weights that it acts by, NumPy."""
+    loop, at = self._loop_of(g)
+    return jax.tree.map(lambda x: np.asarray(x[at]), loop.train._replace(params=loop.acting))
+
+  def each(self, read: Callable[[Any], jax.Array]) -> np.ndarray:
+    """`read` of the robots, which it gets with two leading axes, as (streams, ...)."""
+    out: dict[int, np.ndarray] = {}
+    for herd in self.herds:
+      values = np.asarray(read(herd.streams))[0]
+      out |= {g: values[k] for k, life in enumerate(herd.lives) for g in self.sharing[life]}
+    for band in self.bands:
+      values = np.asarray(read(band.streams))[:, 0]
+      out |= {g: values[lane] for lane, g in enumerate(band.who)}
+    return np.stack([out[g] for g in range(self.streams)])
+
+  # ---- one chunk ---------------------------------------------------------------------------------
+
+  def step(self, now: int, settle: Settle) -> Chunk:
+    """Lives a chunk; `now`: control steps done after it."""
+    told: dict[int, tuple[Row, Digest]] = {}
+    left: dict[int, tuple[LoopState, Any]] = {}
+    seconds = np.zeros((self.streams, len(WORK)))
+    # learners first: theirs is most of the work
+    groups = [*self.bands, *(h for h in self.herds if any(map(self.sharing.get, h.lives)))]
+    for who, acting, look in self._all(groups, now, settle):
+      told |= look.streams
+      left |= look.left
+      seconds[who] = np.array((acting, *look.seconds)) / len(who)
+    for g in sorted(left):
+      self._join(g, *left[g])
+    rows, digests = zip(*(told[g] for g in range(self.streams)))
+    join = lambda name: np.concatenate([getattr(r, name) for r in rows], 1)
+    logged = (None if x is None else join(name) for name, x in rows[0]._asdict().items())
+    return Chunk(Row(*logged), glue(list(digests), ROWS), seconds)
+
+  def _all(
+    self, groups: list[Herd | Band], now: int, settle: Settle
+  ) -> Iterator[tuple[list[int], float, Told]]:
+    """Of all groups: (streams that share a state, seconds of acting, Told)."""
+
+    def whole(group: Herd | Band) -> list[tuple[list[int], float, Told]]:
+      rows, took = self._act(group)
+      tasks = list(self._tasks(group, rows, now, settle))
+      return [(who, took / len(tasks), task()) for who, task in tasks]
+
+    with concurrent.futures.ThreadPoolExecutor(len(cores())) as pool:
+      if len(groups) > MANY * len(cores()):  # rows of a few groups at a time lie in memory
+        for told in pool.map(whole, groups):
+          yield from told
+        return
+      acted = {pool.submit(self._act, group): group for group in groups}
+      looks = []
+      for future in concurrent.futures.as_completed(acted):
+        rows, took = future.result()
+        tasks = list(self._tasks(acted[future], rows, now, settle))
+        looks += [(who, took / len(tasks), pool.submit(task)) for who, task in tasks]
+      for who, took, look in looks:
+        yield who, took, look.result()
+
+  def _act(self, group: Herd | Band) -> tuple[Row, float]:
+    """Rows of a chunk, and the seconds that it took."""
+    begin = time.perf_counter()
+    if isinstance(group, Herd):
+      params = group.minds.params
+    else:
+      params = group.acting = self._acting(group) if group.acting is None else group.acting
+    group.streams, rows = self._live[type(group)](params, group.streams)
+    return jax.tree.map(np.asarray, rows), time.perf_counter() - begin
+
+  def _acting(self, band: Band) -> Any:
+    """Weights of all lanes of a band; a lane without a learner repeats its first."""
+    parts = [loop.acting for loop in band.loops]
+    parts += parts[:1] * (self.band_size // self.width - len(parts))
+    # copies: the next digest uses the loops' own arrays up
+    return jax.tree.map(lambda *x: jnp.array(np.concatenate(x)), *parts)
+
+  def _tasks(
+    self, group: Herd | Band, rows: Row, now: int, settle: Settle
+  ) -> Iterator[tuple[list[int], Callable[[], Told]]]:
+    """What is to be done with a group's rows, each for streams that share it."""
+    if isinstance(group, Herd):
+      for lane, life in enumerate(group.lives):
+        if who := self.sharing[life]:
+          own = jax.tree.map(lambda x, lane=lane: x[:, :, lane : lane + 1], rows)
+          yield who, functools.partial(self._watch_life, group, lane, who, own, now, settle)
+      return
+    for k in range(len(group.loops)):
+      lanes = slice(k * self.width, (k + 1) * self.width)
+      own = cut(rows, lanes, 1)
+      yield group.who[lanes], functools.partial(self._watch_band, group, k, own, now, settle)
+
+  def _watch_life(
+    self, herd: Herd, lane: int, who: list[int], rows: Row, now: int, settle: Settle
+  ) -> Told:
+    begin = time.perf_counter()
+    step, was, keys = jnp.int32(now), herd.frozen[lane], self.keys[who[0] : who[0] + 1]
+    seen, sight = self.loop.watch(herd.minds, was.sight, rows, step, keys)
+    phase, digest = jax.block_until_ready(self.loop.rest(was.phase, seen, step))
+    herd.frozen[lane] = Frozen(sight, phase)
+    digest = jax.tree.map(np.asarray, digest)
+    slim = _slim(rows)
+    told, left = {g: (slim, digest) for g in who}, {}
+    watched = time.perf_counter()
+    robot = functools.cache(
+      lambda: jax.tree.map(lambda x: x[:, lane : lane + 1], herd.streams)
+    )
+    for g in who:
+      settled = settle(g, robot)
+      at = int(was.phase.phase[0])
+      fired = digest.fired[:, 0]
+      if departs(fired, at, settled.choices, now, self.loop.repeat, self.loop.config):
+        own, phase = jax.tree.map(jnp.copy, (sight, was.phase))  # learning uses its state up
+        state = self.loop.init(herd.train, 1, self.rollback)._replace(phase=phase)
+        state, new = self.loop.learn(
+          state, seen, own, rows, step, settled.choices, keys, settled.acceptance
+        )
+        left[g] = jax.block_until_ready(state), robot()
+        told[g] = slim, jax.tree.map(np.asarray, new)
+    return Told(told, left, (watched - begin, time.perf_counter() - watched))
+
+  def _watch_band(self, band: Band, k: int, rows: Row, now: int, settle: Settle) -> Told:
+    begin = time.perf_counter()
+    step, state, first = jnp.int32(now), band.loops[k], k * self.width
+    who = band.who[first : first + self.width]
+    keys = self.keys[np.array(who)]
+    seen, sight = jax.block_until_ready(self.loop.watch(state.minds, state.sight, rows, step, keys))
+    watched = time.perf_counter()
+    robot = lambda lane: jax.tree.map(lambda x: x[lane : lane + 1], band.streams)
+    settled = [settle(g, functools.partial(robot, first + i)) for i, g in enumerate(who)]
+    all_settled = jax.tree.map(lambda *x: jnp.concatenate(x), *settled)
+    state, digest = self.loop.learn(
+      state, seen, sight, rows, step, all_settled.choices, keys, all_settled.acceptance
+    )
+    band.loops[k] = jax.block_until_ready(state)
+    if (np.asarray(digest.decision) > 0).any() or (np.asarray(digest.updates) > 0).any():
+      band.acting = None
+    digest = jax.tree.map(np.asarray, digest)
+    one = lambda i: Digest(
+      *(cut(v, slice(i, i + 1), int(k in ROWS)) for k, v in digest._asdict().items())
+    )
+    told = {g: (cut(_slim(rows), slice(i, i + 1), 1), one(i)) for i, g in enumerate(who)}
+    return Told(told, {}, (watched - begin, time.perf_counter() - watched))
+
+  def _join(self, g: int, loop: LoopState, robot: Any) -> None:
+    """Stream g is a learner from now on."""
+    band = next((b for b in self.bands if len(b.who) < self.band_size), None)
+    if band is None:
+      spread = lambda x: jnp.concatenate([x] * self.band_size)
+      band = Band([], jax.tree.map(spread, robot), [])
+      self.bands.append(band)
+    at = len(band.who)
+    band.streams = jax.tree.map(lambda x, new: x.at[at].set(new[0]), band.streams, robot)
+    band.who.append(g)
+    band.loops.append(loop)
+    band.acting = None
+    self._settle_down(self.bands)
+
+  # ---- checkpoints -------------------------------------------------------------------------------
+
+  def pack(self) -> tuple[dict, list[list[int]]]:
+    """What a checkpoint holds, NumPy but for the robots, and the streams of each band."""
+    frozen = [life for herd in self.herds for life in herd.frozen]
+    loops = [loop for band in self.bands for loop in band.loops]
+    tree: dict[str, Any] = {"robots": [group.streams for group in (*self.herds, *self.bands)]}
+    if frozen:
+      tree["sight"] = glue([life.sight for life in frozen], LATER)
+      tree["phase"] = glue([life.phase for life in frozen], ())
+    if loops:
+      tree["replays"] = [loop.replay for loop in loops]
+      tree["learners"] = _held(glue([loop._replace(replay=None) for loop in loops], LATER))
+    return tree, [band.who for band in self.bands]
+
+  def like(self, who: list[list[int]]) -> dict:
+    """Shapes of what `pack` gives with bands of the streams `who`."""
+    tree, _ = self.pack()
+    spread = lambda x: jnp.concatenate([x] * self.band_size)
+    tree["robots"] = [herd.streams for herd in self.herds]
+    tree["robots"] += [jax.tree.map(spread, self._robot) for _ in who]
+    if who:
+      begin = functools.partial(self.loop.init, groups=self.width, rollback=self.rollback)
+      state = jax.eval_shape(begin, self.trains[0])
+      number = sum(len(own) for own in who) // self.width
+      tree["replays"] = [state.replay] * number
+      tree["learners"] = _held(
+        LoopState(*(_wider(v, number, name) for name, v in state._replace(replay=None)._asdict().items()))
+      )
+    return tree
+
+  def unpack(self, tree: dict, who: list[list[int]]) -> None:
+    """Goes on from what `pack` gave."""
+    robots = iter(tree["robots"])
+    at = 0
+    for herd in self.herds:
+      herd.streams, own = next(robots), slice(at, at + len(herd.lives))
+      herd.frozen = [
+        jax.tree.map(
+          jnp.asarray, Frozen(_part(Sight(*tree["sight"]), i, 1), cut(tree["phase"], slice(i, i + 1), 0))
+        )
+        for i in range(own.start, own.stop)
+      ]
+      at = own.stop
+    loops = [
+      jax.tree.map(
+        jnp.asarray,
+        _part(LoopState(**tree["learners"], replay=None), k, self.width)._replace(replay=replay),
+      )
+      for k, replay in enumerate(tree.get("replays", []))
+    ]
+    bands = []
+    for own in who:
+      number = len(own) // self.width
+      bands.append(Band(list(own), next(robots), loops[:number]))
+      del loops[:number]
+    self._settle_down(bands)
+
+
+def _held(state: LoopState) -> dict:
+  """Its fields by name, without those that this run has no use for."""
+  return {name: value for name, value in state._asdict().items() if value is not None}
+
+
+def _wider(tree: Any, number: int, name: str) -> Any:
+  """Shapes of `number` states' field `name` side by side."""
+  axis = int(name in LATER)
+  wide = lambda x: jax.ShapeDtypeStruct(
+    x.shape[:axis] + (number * x.shape[axis],) + x.shape[axis + 1 :], x.dtype
+  )
+  return jax.tree.map(wide, tree)
+
+
+def _part(state: Any, k: int, width: int) -> Any:
+  """State k of several side by side, of `width` streams each."""
+  at = slice(k * width, (k + 1) * width)
+  host = lambda tree: jax.tree.map(np.asarray, tree)
+  return type(state)(
+    *(cut(host(value), at, int(name in LATER)) for name, value in state._asdict().items())
+  )
+
+
+def _slim(rows: Row) -> Row:
+  """Of the fields LOGGED; the others are None."""
+  return Row(*(x if name in LOGGED else None for name, x in rows._asdict().items()))
