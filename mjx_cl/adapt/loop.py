@@ -56,22 +56,29 @@ class Programs:
 class Once:
   """A jitted function that threads may call at the same time: the first call, which compiles, is
   made alone.
+
+  Attributes:
+    seconds: that calls have waited for compiling.
   """
 
   def __init__(self, function: Callable[..., Any]) -> None:
-    self.function = function
-    self.seconds = 0.0  # of the first call
+    self.function, self.seconds = function, 0.0
     self._lock, self._warm = threading.Lock(), False
 
   def __call__(self, *args: Any) -> Any:
     """What the function gives."""
     if self._warm:
       return self.function(*args)
+    begin = time.perf_counter()
+    out = self.warm(*args)
+    self.seconds += time.perf_counter() - begin
+    return out
+
+  def warm(self, *args: Any) -> Any:
+    """Likewise; time that goes by counts as nobody's."""
     with self._lock:
-      begin = time.perf_counter()
       out = self.function(*args)
-      if not self._warm:
-        self.seconds, self._warm = time.perf_counter() - begin, True
+      self._warm = True
     return out
 
 

@@ -162,6 +162,7 @@ class Lives:
     keys: of the streams, for all but their robots.
     rollback: an arm goes back, see act.Before.
     together: all streams are one band from the start; None: on an accelerator.
+    learns: something may start an adaptation.
   """
 
   def __init__(
@@ -174,6 +175,7 @@ class Lives:
     keys: jax.Array,
     rollback: bool = False,
     together: bool | None = None,
+    learns: bool = True,
   ) -> None:
     self.rollout, self.loop, self.keys = rollout, loop, keys
     self.trains, self.rollback, self.streams = list(trains), rollback, len(trains)
@@ -184,6 +186,9 @@ class Lives:
     self.bands: list[Band] = []
     self.place: dict[int, tuple[Band, int]] = {}  # learner -> its band and lane
     self.sharing: dict[int, list[int]] = {}  # life -> streams that live it still
+    # what compiles beside the first chunks what the first departure will need
+    self._ahead: concurrent.futures.Future | None = None
+    self._learns = learns and not together
     live = lambda *given: rollout.chunk(*given, CHUNK)
     self._live = {Herd: Once(live), Band: Once(live)}
     self._programs = (*self._live.values(), *loop.programs)
@@ -269,6 +274,8 @@ class Lives:
       seconds[who] = np.array((acting, *look.seconds)) / len(who)
     for g in sorted(left):
       self._join(g, *left[g])
+    if self._ahead is None and self._learns and self.herds:
+      self._compile_ahead(now, settle)
     rows, digests = zip(*(told[g] for g in range(self.streams)))
     join = lambda name: np.concatenate([getattr(r, name) for r in rows], 1)
     logged = (None if x is None else join(name) for name, x in rows[0]._asdict().items())
@@ -395,6 +402,31 @@ class Lives:
     band.loops.append(loop)
     band.acting = None
     self._settle_down(self.bands)
+
+  def _compile_ahead(self, now: int, settle: Settle) -> None:
+    """On a thread: the programs of a learner, on a departure that leads nowhere."""
+    herd, programs = self.herds[0], self.loop.programs
+    who = self.sharing[herd.lives[0]][:1]
+    if not who:
+      return
+    frozen, robots = herd.frozen[0], jax.tree.map(lambda x: x[:, :1], herd.streams)
+
+    def ahead() -> None:
+      settled, keys = settle(who[0], lambda: robots), self.keys[who[0] : who[0] + 1]
+      _, rows = self._live[Herd](herd.minds.params, herd.streams)
+      rows = jax.tree.map(lambda x: np.asarray(x)[:, :, :1], rows)
+      seen, sight = self.loop.watch(herd.minds, frozen.sight, rows, jnp.int32(now), keys)
+      state = self.loop.init(herd.train, 1, self.rollback)._replace(**sight._asdict())
+      programs.learn.warm(
+        state, seen, rows, jnp.int32(now), settled.choices, keys, settled.acceptance, self.loop.config
+      )
+      spread = lambda x: jnp.concatenate([x] * self.band_size)
+      params = jax.tree.map(lambda x: jnp.stack([x] * self.band_size), herd.train.params)
+      self._live[Band].warm(params, jax.tree.map(spread, robots))
+
+    pool = concurrent.futures.ThreadPoolExecutor(1, "ahead")
+    self._ahead = pool.submit(ahead)
+    pool.shutdown(wait=False)
 
   # ---- checkpoints -------------------------------------------------------------------------------
 

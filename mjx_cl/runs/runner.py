@@ -116,6 +116,7 @@ class Runner:
       [(id(t), bool(b), seed) for t, b, (_, seed) in zip(trains, self.breaks, self.labels)],
       self.keys,
       any(arm.rollback for arm in arms),
+      learns=learners > 0,
     )
     self.choices = self._choices()
     # what has been lived
