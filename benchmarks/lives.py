@@ -1,0 +1,260 @@
+"""What a life costs, beside the same work in a checkout of an earlier version, by turns:
+
+  git worktree add ../base 10f2717
+  python benchmarks/lives.py [--base ../base] [--rounds 5] [--whole] [--json] [--figure FILE]
+
+Chunks of 64 control steps of walkers, as `mjx-cl run walker` lives them. Each version has a process
+of its own that lives through everything once before anything is timed; then they take turns, and
+rows are medians. `start` is a new process: from its first import to the end of its first chunk,
+with an empty compile cache and with a filled one. `--whole` runs the README's main job once with
+each version, programs cached, and draws where its time went. Nothing else should run on the
+machine.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import pathlib
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+
+HERE = pathlib.Path(__file__).resolve()
+CHUNK, SEEDS, UPDATES = 64, 10, 4  # UPDATES: of a learner in a chunk
+NEVER = 10**6  # control steps: later than anything here
+MAIN = ("run", "walker", "--seeds", str(SEEDS))
+# name -> (arms, seeds, AdaptConfig's settings, onset)
+SCENES = {
+  "healthy": (("detector", "none"), SEEDS, {"warmup": NEVER}, NEVER - 1),
+  "idle": (("oracle",), SEEDS, {"warmup": 0, "start_windows": NEVER}, CHUNK),
+  "learning": (("oracle",), SEEDS, {"warmup": 0, "start_windows": 1}, CHUNK),
+  **{f"frozen {n}": (("none",), n, {}, NEVER - 1) for n in (40, 160, 640, 2560)},
+}
+GOALS = {"main job": 0.45, "start, empty cache": 0.4, "update": 0.6}
+
+
+# ---- in the process of a version -----------------------------------------------------------------
+
+
+def serve() -> None:
+  """Answers scenes on standard input, one name a line, with the seconds of a chunk."""
+  from mjx_cl.config import AdaptConfig, RunConfig
+
+  try:
+    from mjx_cl.runs.runner import Runner
+  except ImportError:  # before there were rooms
+    from mjx_cl import runtime
+    from mjx_cl.run import Runner
+
+    runtime.setup()
+  else:
+    from mjx_cl.io import runtime
+
+    runtime.setup()
+  runners: dict = {}
+  for line in sys.stdin:
+    name = line.strip()
+    if name not in runners:
+      runners.clear()  # memory
+      arms, seeds, adapt, onset = SCENES[name]
+      config = RunConfig(
+        env="walker",
+        fault="walker/gear-half",
+        seeds=seeds,
+        arms=arms,
+        steps=NEVER // 2 if onset == CHUNK else NEVER,
+        onset=onset,
+        adapt=AdaptConfig(**adapt),
+        detector="rolling_sigma",
+      )
+      runners[name] = Runner(config, tempfile.mkdtemp())
+      for _ in range(6 if onset == CHUNK else 2):
+        runners[name].step()
+    begin = time.perf_counter()
+    runners[name].step()
+    print(json.dumps(time.perf_counter() - begin), flush=True)
+
+
+# ---- in the process that asks --------------------------------------------------------------------
+
+
+class Version:
+  """A checkout and its process."""
+
+  def __init__(self, folder: pathlib.Path) -> None:
+    self.folder = folder
+    self.cache = tempfile.mkdtemp(prefix="mjx_cl_lives_")
+    self.process = self.begin(self.cache)
+
+  def environment(self, cache: str) -> dict[str, str]:
+    return {**os.environ, "PYTHONPATH": str(self.folder), "MJX_CL_CACHE": cache}
+
+  def begin(self, cache: str) -> subprocess.Popen:
+    return subprocess.Popen(
+      [sys.executable, str(HERE), "--serve"],
+      cwd=self.folder,
+      env=self.environment(cache),
+      stdin=subprocess.PIPE,
+      stdout=subprocess.PIPE,
+      stderr=subprocess.DEVNULL,
+      text=True,
+    )
+
+  def chunk(self, scene: str, process: subprocess.Popen | None = None) -> float:
+    """Seconds of one more chunk of a scene."""
+    process = process or self.process
+    process.stdin.write(scene + "\n")
+    process.stdin.flush()
+    return json.loads(process.stdout.readline())
+
+  def start(self, cache: str) -> float:
+    """Seconds of a new process up to the end of its first chunk."""
+    begin = time.perf_counter()
+    process = subprocess.Popen(
+      [
+        sys.executable,
+        "-m",
+        "mjx_cl",
+        *MAIN,
+        "--steps",
+        str(CHUNK),
+        "--onset",
+        "0",
+        "--out",
+        tempfile.mkdtemp() + "/run",
+      ],
+      cwd=self.folder,
+      env=self.environment(cache),
+      stdout=subprocess.PIPE,
+      stderr=subprocess.STDOUT,
+      text=True,
+    )
+    for line in process.stdout:
+      if line.startswith("step "):
+        break
+    took = time.perf_counter() - begin
+    process.communicate()
+    return took
+
+  def whole(self) -> tuple[float, dict]:
+    """Seconds of the main job, and its shares."""
+    out = tempfile.mkdtemp() + "/run"
+    begin = time.perf_counter()
+    subprocess.run(
+      [sys.executable, "-m", "mjx_cl", *MAIN, "--out", out],
+      cwd=self.folder,
+      env=self.environment(self.cache),
+      check=True,
+      capture_output=True,
+    )
+    took = time.perf_counter() - begin
+    return took, json.loads((pathlib.Path(out) / "summary.json").read_text())["wall_share"]
+
+
+def by_turns(versions: list[Version], measure, rounds: int) -> list[float]:
+  """Median of each version."""
+  times = [[measure(v) for v in versions] for _ in range(rounds)]
+  return [statistics.median(column) for column in zip(*times)]
+
+
+def row(name: str, unit: str, values: list[float], factor: float = 1.0) -> dict:
+  base = values[1] * factor if len(values) > 1 else None
+  ratio = values[0] / values[1] if len(values) > 1 else None
+  goal = GOALS.get(name)
+  return {
+    "name": name,
+    "value": round(values[0] * factor, 3),
+    "unit": unit,
+    "base": base and round(base, 3),
+    "ratio": ratio and round(ratio, 3),
+    "goal": goal,
+    "holds": None if goal is None or ratio is None else ratio <= goal,
+  }
+
+
+def price(versions: list[Version], rounds: int) -> list[dict]:
+  """All rows but the main job."""
+  rows = [
+    row("start, empty cache", "s", by_turns(versions, lambda v: v.start(tempfile.mkdtemp()), 1)),
+  ]
+  chunks = {}
+  for scene in SCENES:
+    some = versions if scene not in ("frozen 640", "frozen 2560") else versions[:1]
+    for v in some:
+      v.chunk(scene)  # compiles
+    chunks[scene] = by_turns(some, lambda v, scene=scene: v.chunk(scene), rounds)
+  streams = {name: len(arms) * seeds for name, (arms, seeds, *_) in SCENES.items()}
+  for scene, values in chunks.items():
+    rows.append(row(f"{scene}, a stream", "ms a chunk", values, 1e3 / streams[scene]))
+  cores = len(os.sched_getaffinity(0))
+  update = [(a - b) / (SEEDS * UPDATES) for a, b in zip(chunks["learning"], chunks["idle"])]
+  rows.append(row("update", "core-ms", update, 1e3 * cores))
+  rows.append(row("start, filled cache", "s", by_turns(versions, lambda v: v.start(v.cache), 2)))
+  return rows
+
+
+def draw(shares: list[dict], seconds: list[float], path: pathlib.Path) -> None:
+  """Where the main job's time goes: a bar for each version, newest first."""
+  from mjx_cl.render.figures import plotting
+
+  plt = plotting()
+  figure, axis = plt.subplots(figsize=(7, 1.2 + 0.6 * len(shares)))
+  kinds = list(dict.fromkeys(k for share in shares for k in share))
+  for i, (share, whole) in enumerate(zip(shares, seconds)):
+    left = 0.0
+    for k, kind in enumerate(kinds):
+      width = share.get(kind, 0.0) * whole
+      axis.barh(i, width, left=left, color=f"C{k}", label=kind if not i else None)
+      left += width
+  axis.set_yticks(range(len(shares)), ["now", "before"][: len(shares)])
+  axis.set_xlabel("seconds of the main job, programs cached")
+  axis.legend(
+    ncols=len(kinds),
+    fontsize="x-small",
+    loc="lower center",
+    bbox_to_anchor=(0.5, 1.0),
+    frameon=False,
+  )
+  figure.tight_layout()
+  figure.savefig(path, dpi=150)
+
+
+def main() -> None:
+  parser = argparse.ArgumentParser(
+    description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+  )
+  parser.add_argument("--base", type=pathlib.Path, help="checkout of an earlier version")
+  parser.add_argument("--rounds", type=int, default=5)
+  parser.add_argument("--whole", action="store_true", help="the main job as well")
+  parser.add_argument("--json", action="store_true", help="one JSON value on standard output")
+  parser.add_argument("--figure", type=pathlib.Path, help="draws the main job's shares")
+  parser.add_argument("--serve", action="store_true", help=argparse.SUPPRESS)
+  args = parser.parse_args()
+  if args.serve:
+    return serve()
+  folders = [HERE.parents[1]] + ([args.base.resolve()] if args.base else [])
+  versions = [Version(folder) for folder in folders]
+  rows = price(versions, args.rounds)
+  if args.whole or args.figure:
+    for v in versions:
+      v.process.stdin.close()
+    told = [v.whole() for v in versions]
+    rows.append(row("main job", "s", [seconds for seconds, _ in told]))
+    if args.figure:
+      draw([share for _, share in told], [seconds for seconds, _ in told], args.figure)
+  for r in rows:
+    print(
+      f"{r['name']:28s} {r['value']:>9} {r['unit']:10s} base {r['base'] or '-':>9} "
+      f"ratio {r['ratio'] or '-'}",
+      file=sys.stderr,
+    )
+  if args.json:
+    print(json.dumps(rows))
+
+
+if __name__ == "__main__":
+  main()
