@@ -36,8 +36,8 @@ def update():
 def digest():
   """Likewise, for the first stream of a run."""
   import jax.numpy as jnp
-
   from mjx_cl.adapt.blocks import cut
+
   from mjx_cl.config import CHUNK, RunConfig
   from mjx_cl.runs import run
 

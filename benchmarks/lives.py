@@ -47,8 +47,9 @@ def serve() -> None:
   try:
     from mjx_cl.runs.runner import Runner
   except ImportError:  # before there were rooms
-    from mjx_cl import runtime
     from mjx_cl.run import Runner
+
+    from mjx_cl import runtime
 
     runtime.setup()
   else:
