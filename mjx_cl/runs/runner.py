@@ -246,7 +246,9 @@ class Runner:
   def _at(self, g: int, enter: int) -> jax.Array:
     """Choices.at of stream g, whose robot became the other one in control step `enter`."""
     c = self.config
-    return choices(self.labels[g : g + 1], c.adapt, c.steps, [(enter, *self._onsets())], self.stops).at
+    return choices(
+      self.labels[g : g + 1], c.adapt, c.steps, [(enter, *self._onsets())], self.stops
+    ).at
 
   def _choices(self) -> list[Choices]:
     """Of each stream, with every true onset that is known from the start; arms that are told one
