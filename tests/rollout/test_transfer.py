@@ -431,11 +431,17 @@ def asked(saved, **kw):
 
 @pytest.fixture(scope="module")
 def whole(short, saved, tmp_path_factory):
-  """An uninterrupted run of both arms: (folder, [rows of each chunk], [acceptance handed to each
-  digest]).
+  """An uninterrupted run of both arms: (folder, [rows of each chunk], {(control steps done,
+  stream): acceptance that was handed on}).
   """
-  out, chunks, levels = tmp_path_factory.mktemp("runs") / "whole", [], []
-  log, accept = run.Runner._log, run.Runner._acceptance
+  out, chunks, levels = tmp_path_factory.mktemp("runs") / "whole", [], {}
+  log, settle = run.Runner._log, run.Runner._settle
+
+  def settled(self, now, g, robot):
+    told = settle(self, now, g, robot)
+    levels[now, g] = told.acceptance
+    return told
+
   with pytest.MonkeyPatch.context() as patch:
     patch.setattr(
       run.Runner,
@@ -444,9 +450,7 @@ def whole(short, saved, tmp_path_factory):
         chunks.append(jax.tree.map(np.asarray, rows)) or log(self, rows, digest)
       ),
     )
-    patch.setattr(
-      run.Runner, "_acceptance", lambda self, *a: levels.append(accept(self, *a)) or levels[-1]
-    )
+    patch.setattr(run.Runner, "_settle", settled)
     run.execute(asked(saved), out)
   return out, chunks, levels
 
@@ -580,7 +584,8 @@ def test_the_task_is_accepted_by_the_level_of_the_robot_that_there_is(whole):
   out, _, levels = whole
   trace = by_stream(out)
   at = np.asarray([entered(trace, g) for g in range(4)])
-  for i, level in enumerate(levels):
+  for i in range(-(-STEPS // CHUNK)):
+    level = np.concatenate([levels[(i + 1) * CHUNK, g] for g in range(4)])
     np.testing.assert_array_equal(
       level, np.where(at < (i + 1) * CHUNK, -1e9, 1e9).astype(np.float32)
     )
@@ -594,7 +599,7 @@ def test_the_replay_holds_what_the_stream_lived(whole):
   """
   out, chunks, _ = whole
   trace = by_stream(out)
-  obs = np.concatenate([c.obs for c in chunks])[:, :, 0]
+  obs = np.concatenate([c.final_obs for c in chunks])[:, :, 0]
   for g in (0, 1):
     first = (events_of(out, g, "start") + [(STEPS, "")])[0][0]
     assert obs[:first, g].tobytes() == obs[:first, g + 2].tobytes()
@@ -625,10 +630,7 @@ def test_a_run_killed_before_during_and_after_the_change_ends_in_the_same_files(
       runner.save()
       runner.checkpoints.close()
       what.append(
-        [
-          int(x) < runner.done_chunks * CHUNK
-          for x in np.asarray(runner.state.streams.after.enter)[:, 0]
-        ]
+        [int(x) < runner.done_chunks * CHUNK for x in runner.lives.each(lambda r: r.after.enter)]
       )
   run.finish(runner)
   assert not any(what[0]) and any(what[1]) and all(what[2])
