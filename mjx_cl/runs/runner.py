@@ -244,11 +244,13 @@ class Runner:
     return tuple(self.config.onset + c.after for c in self.changes if c.fault != "none")
 
   def _at(self, g: int, enter: int) -> jax.Array:
-    """Choices.at of stream g, whose robot became the other one in control step `enter`."""
-    c = self.config
-    return choices(
-      self.labels[g : g + 1], c.adapt, c.steps, [(enter, *self._onsets())], self.stops
-    ).at
+    """Choices.at of stream g, as wide as before, whose robot became the other one in control step
+    `enter`.
+    """
+    c, own = self.config, self.labels[g : g + 1]
+    at = choices(own, c.adapt, c.steps, [(enter, *self._onsets())], self.stops).at
+    room = self.choices[g].at.shape[1] - at.shape[1]  # an arm with more starts makes it wider
+    return jnp.pad(at, ((0, 0), (0, room)), constant_values=FOREVER)
 
   def _choices(self) -> list[Choices]:
     """Of each stream, with every true onset that is known from the start; arms that are told one
