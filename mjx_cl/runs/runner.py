@@ -325,7 +325,7 @@ class Runner:
     """Goes on from the newest checkpoint; without one, from the start."""
     if self.checkpoints.latest() is None:
       return
-    tree, meta = self.checkpoints.load(lambda meta: self.lives.like(meta.get("bands", [])))
+    tree, meta = self.checkpoints.load(self._like)
     self.lives.unpack(tree, meta["bands"])
     number = self.checkpoints.latest() or 0  # a broken one has been set aside
     self.parts = [arrays.read(self.work / f"trace-{number:06d}.npz")]
@@ -334,6 +334,12 @@ class Runner:
     self.stream_seconds, self._updates, self._alarms, self._phase = (
       np.asarray(meta[k]) for k in ("stream_seconds", "updates", "alarms", "phase")
     )
+
+  def _like(self, meta: dict) -> dict:
+    """Shapes of a checkpoint's tree."""
+    if "bands" not in meta:
+      raise FileError("it names no bands of learners, as those of an earlier version")
+    return self.lives.like(meta["bands"])
 
   @property
   def done(self) -> bool:
