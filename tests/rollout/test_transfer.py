@@ -13,7 +13,7 @@ import pyarrow.parquet
 import pytest
 
 from mjx_cl import envs, faults
-from mjx_cl.config import CHUNK, PRESETS, AdaptConfig, RunConfig
+from mjx_cl.config import CHUNK, FOREVER, PRESETS, AdaptConfig, RunConfig
 from mjx_cl.dreamer.agent import Agent
 from mjx_cl.envs.car import Car
 from mjx_cl.envs.car_real import CarReal
@@ -591,6 +591,24 @@ def test_the_task_is_accepted_by_the_level_of_the_robot_that_there_is(whole):
     )
   stops = [(g, s) for g in (0, 1) for s, _ in events_of(out, g, "stop")]
   assert stops and all(s >= at[g] for g, s in stops)
+
+
+def test_starts_are_as_wide_for_every_arm_of_a_run(short, saved, tmp_path):
+  """Beside an arm of nine starts, one that is told the change has it, once it has come, in a row
+  of the same shape: streams are put together, and share a program.
+  """
+  adapt = dataclasses.replace(ADAPT, period=40, period_steps=30)
+  runner = run.Runner(asked(saved, arms=("periodic", "oracle"), seeds=1, adapt=adapt), tmp_path)
+  robot = jax.tree.map(lambda x: x[:, :1], runner.lives.herds[0].streams)
+  moved = robot._replace(after=robot.after._replace(enter=jnp.full_like(robot.after.enter, 97)))
+  told = [
+    [runner._settle(128, g, lambda own=own: own).choices.at for own in (robot, moved)]
+    for g in (0, 1)
+  ]
+  assert {at.shape for own in told for at in own} == {runner.choices[0].at.shape} == {(1, 16)}
+  assert list(told[0][1][0][:10]) == [*range(40, 400, 40), FOREVER]
+  assert sorted(told[1][1][0].tolist())[:3] == [97, ONSET + SECOND, FOREVER]
+  assert sorted(told[1][0][0].tolist())[:2] == [ONSET + SECOND, FOREVER]
 
 
 def test_the_replay_holds_what_the_stream_lived(whole):
