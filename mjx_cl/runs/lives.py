@@ -339,6 +339,9 @@ class Lives:
     seen, sight = self.loop.watch(herd.minds, was.sight, rows, step, keys)
     phase, digest = jax.block_until_ready(self.loop.rest(was.phase, seen, step))
     herd.frozen[lane] = Frozen(sight, phase)
+    if self.rollback:  # nothing to weigh yet; streams that learn say it too
+      unknown = np.full(1, np.nan, np.float32)
+      digest = digest._replace(back=np.zeros(1, bool), earned=unknown, earns=unknown)
     digest = jax.tree.map(np.asarray, digest)
     slim = _slim(rows)
     told, left = {g: (slim, digest) for g in who}, {}

@@ -208,6 +208,28 @@ def test_how_the_work_is_shared_changes_nothing(make, monkeypatch, same, changes
   assert bands == again and same(host(one), host(two))
 
 
+def test_a_run_that_may_go_back_says_so_of_every_stream(make):
+  """Streams that have learnt nothing weigh nothing; beside one that has, whose learning is played."""
+  runner = make(("none", "rollback", "oracle"), adapt=dataclasses.replace(ADAPT, warmup=150))
+  loop, one = runner.loop, jnp.ones(1)
+
+  def learn(state, seen, sight, rows, now, *more):
+    phase, digest = loop.rest(state.phase, seen, now)
+    told = digest._replace(back=one > 0, earned=one, earns=2 * one, decision=digest.decision + 1)
+    return state._replace(phase=phase, **sight._asdict()), told
+
+  loop.learn = learn
+  live(runner, 4)
+  trace, learners = runner.trace(), sorted(runner.lives.place)
+  assert 2 in learners and 0 not in learners
+  back = np.zeros((4, 3), bool)
+  for g in learners:
+    back[np.flatnonzero(trace["decision"][:, g])[0] :, g] = True
+  assert trace["back"].tolist() == back.tolist() and back[2:, 2].all()
+  np.testing.assert_array_equal(trace["earned"], np.where(back, 1.0, np.nan))
+  np.testing.assert_array_equal(trace["earns"], np.where(back, 2.0, np.nan))
+
+
 # ---- all streams as one band ---------------------------------------------------------------------
 
 
