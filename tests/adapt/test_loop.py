@@ -723,7 +723,8 @@ def hand_losses(agent, state, rows, keys, starts):
     kl = (q * np.log(q / p)).sum((-2, -1))
     hot = np.eye(agent.size.classes, dtype=np.float32)[own.stoch[starts]].reshape(len(starts), -1)
     form = behaviour.imagine, behaviour.sums
-    img = behaviour.losses(agent, params, slow, range_, own.deter[starts], hot, keys[g], *form)
+    judge = quick.jit(lambda *given: behaviour.losses(agent, *given, *form))
+    img = judge(params, slow, range_, own.deter[starts], hot, keys[g])
     dyn = np.maximum(agent.config.free_nats, kl).mean()
     out.append((dyn, img.metrics["adv_mag"], img.value))
   return np.array(out, np.float64).T

@@ -337,7 +337,7 @@ def test_shapes_are_those_of_what_is_packed(make, learners, rollback):
     robot = jax.tree.map(one, runner.lives.herds[0].streams)
     runner.lives._join(g, runner.loop.init(runner.trained.train, 1, rollback), robot)
   tree, bands = runner.lives.pack()
-  assert bands == [list(range(5, 10))[k : k + 4] for k in range(0, learners, 4)]
+  assert bands == [list(range(5, 5 + learners))[k : k + 4] for k in range(0, learners, 4)]
   shapes = lambda tree: jax.tree.map(lambda x: (x.shape, str(x.dtype)), tree)
   assert shapes(empty.lives.like(bands)) == shapes(tree)
   empty.lives.unpack(tree, bands)
