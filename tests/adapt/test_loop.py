@@ -3,6 +3,7 @@ them on hand-made rows.
 """
 
 import dataclasses
+import functools
 import types
 from typing import NamedTuple
 
@@ -709,6 +710,13 @@ def test_the_detector_is_refitted_after_a_stop(story):
   ]  # nobody else's is
 
 
+@functools.cache
+def judge():
+  """Losses of actor and critic of `small`, all dreams at once."""
+  form = behaviour.imagine, behaviour.sums
+  return quick.jit(lambda *given: behaviour.losses(small(), *given, *form))
+
+
 def hand_losses(agent, state, rows, keys, starts):
   """Dynamics loss, advantage magnitude and value loss (streams,) of what acts: the divergence of
   the two beliefs in NumPy, and the agent's losses, all dreams at once, on rows `starts`.
@@ -722,9 +730,7 @@ def hand_losses(agent, state, rows, keys, starts):
     q, p = (0.99 * x / x.sum(-1, keepdims=True) + 0.01 / x.shape[-1] for x in exp)
     kl = (q * np.log(q / p)).sum((-2, -1))
     hot = np.eye(agent.size.classes, dtype=np.float32)[own.stoch[starts]].reshape(len(starts), -1)
-    form = behaviour.imagine, behaviour.sums
-    judge = quick.jit(lambda *given: behaviour.losses(agent, *given, *form))
-    img = judge(params, slow, range_, own.deter[starts], hot, keys[g])
+    img = judge()(params, slow, range_, own.deter[starts], hot, keys[g])
     dyn = np.maximum(agent.config.free_nats, kl).mean()
     out.append((dyn, img.metrics["adv_mag"], img.value))
   return np.array(out, np.float64).T
