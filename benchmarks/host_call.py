@@ -55,9 +55,10 @@ def chunk():
   runner = run.Runner(
     RunConfig(env="walker", seeds=10, arms=("none",), steps=10_000), tempfile.gettempdir()
   )
-  return lambda: jax.block_until_ready(
-    runner.rollout.chunk(runner.acting, runner.state.streams, CHUNK)[1]
-  )
+  params = jax.tree.map(lambda x: jax.numpy.asarray(x)[None], runner.trained.train.params)
+  robots = [jax.tree.map(lambda x: x[:, :n], h.streams) for h, n in zip(runner.lives.herds, (8, 2))]
+  streams = jax.tree.map(lambda *x: jax.numpy.concatenate(x, 1), *robots)
+  return lambda: jax.block_until_ready(runner.rollout.chunk(params, streams, CHUNK)[1])
 
 
 def measure(make, rounds: int) -> dict[str, float]:

@@ -98,8 +98,9 @@ def drive(runner: Runner, seeds: list[int], grips, drives: int, steps: int):
     (0, 0),
     (0, None),
   )(keys, severity)
+  acting = [runner.lives.acting(g) for g in range(len(seeds))]
   params, rollout = (
-    jax.tree.map(lambda x: jnp.repeat(x, len(grips), 0), runner.acting),
+    jax.tree.map(lambda *x: jnp.repeat(jnp.stack(x), len(grips), 0), *acting),
     Rollout(env, agent, fault),
   )
   reward, crashes = [], []

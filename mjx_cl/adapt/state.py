@@ -47,7 +47,6 @@ class LoopState(NamedTuple):
   executed: jax.Array
   before: Before | None = None
 
-
   @property
   def minds(self) -> Minds:
     """What predicts and judges."""

@@ -107,9 +107,7 @@ def watch(
   return seen, Sight(history, after, past)
 
 
-def evaluate(
-  agent: Agent, minds: Minds, rows: Row, keys: jax.Array
-) -> tuple[jax.Array, jax.Array]:
+def evaluate(agent: Agent, minds: Minds, rows: Row, keys: jax.Array) -> tuple[jax.Array, jax.Array]:
   """Advantage magnitude and value loss (groups,) of what the robot acts by, without gradient.
 
   Imagined from STARTS states of the chunk, evenly spaced, whose posterior latents acting has found

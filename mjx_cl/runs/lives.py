@@ -18,7 +18,7 @@ import concurrent.futures
 import dataclasses
 import functools
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -29,7 +29,7 @@ from mjx_cl.adapt import decide
 from mjx_cl.adapt.choices import Choices
 from mjx_cl.adapt.loop import Loop, Once
 from mjx_cl.adapt.state import LATER, ROWS, Digest, Frozen, LoopState, cut, glue
-from mjx_cl.adapt.watch import Minds, Sight
+from mjx_cl.adapt.watch import Minds
 from mjx_cl.config import CHUNK, AdaptConfig
 from mjx_cl.dreamer.agent import TrainState
 from mjx_cl.io.runtime import cores
@@ -58,14 +58,14 @@ class Herd:
   """Lives under one set of weights.
 
   Attributes:
-    lives: their numbers.
+    lives: their names.
     train: the agent.
     minds: what it acts and judges by, leading (1,).
     streams: robots, leading (1, HERD).
     frozen: of each life.
   """
 
-  lives: list[int]
+  lives: list[Hashable]
   train: TrainState
   minds: Minds
   streams: Any
@@ -158,7 +158,7 @@ class Lives:
     loop: of every stream.
     streams: robots before the first step, leading (streams, 1).
     trains: the agent of each stream.
-    life: number of each stream's life: equal ones have the same robot, agent and keys.
+    life: name of each stream's life: equal ones have the same robot, agent and keys.
     keys: of the streams, for all but their robots.
     rollback: an arm goes back, see act.Before.
     together: all streams are one band from the start; None: on an accelerator.
@@ -171,7 +171,7 @@ class Lives:
     loop: Loop,
     streams: Any,
     trains: Sequence[TrainState],
-    life: Sequence[int],
+    life: Sequence[Hashable],
     keys: jax.Array,
     rollback: bool = False,
     together: bool | None = None,
@@ -185,7 +185,7 @@ class Lives:
     self.herds: list[Herd] = []
     self.bands: list[Band] = []
     self.place: dict[int, tuple[Band, int]] = {}  # learner -> its band and lane
-    self.sharing: dict[int, list[int]] = {}  # life -> streams that live it still
+    self.sharing: dict[Hashable, list[int]] = {}  # life -> streams that live it still
     # what compiles beside the first chunks what the first departure will need
     self._ahead: concurrent.futures.Future | None = None
     self._learns = learns and not together
@@ -267,7 +267,8 @@ class Lives:
     left: dict[int, tuple[LoopState, Any]] = {}
     seconds = np.zeros((self.streams, len(WORK)))
     # learners first: theirs is most of the work
-    groups = [*self.bands, *(h for h in self.herds if any(map(self.sharing.get, h.lives)))]
+    groups: list[Herd | Band] = [*self.bands]
+    groups += [h for h in self.herds if any(map(self.sharing.get, h.lives))]
     for who, acting, look in self._all(groups, now, settle):
       told |= look.streams
       left |= look.left
@@ -278,8 +279,8 @@ class Lives:
       self._compile_ahead(now, settle)
     rows, digests = zip(*(told[g] for g in range(self.streams)))
     join = lambda name: np.concatenate([getattr(r, name) for r in rows], 1)
-    logged = (None if x is None else join(name) for name, x in rows[0]._asdict().items())
-    return Chunk(Row(*logged), glue(list(digests), ROWS), seconds)
+    logged = [None if x is None else join(name) for name, x in rows[0]._asdict().items()]
+    return Chunk(_row(logged), glue(list(digests), ROWS), seconds)
 
   def _all(
     self, groups: list[Herd | Band], now: int, settle: Settle
@@ -345,13 +346,14 @@ class Lives:
     seen, sight = self.loop.watch(herd.minds, was.sight, rows, step, keys)
     phase, digest = jax.block_until_ready(self.loop.rest(was.phase, seen, step))
     herd.frozen[lane] = Frozen(sight, phase)
+    if self.rollback:  # nothing to weigh yet; streams that learn say it too
+      unknown = np.full(1, np.nan, np.float32)
+      digest = digest._replace(back=np.zeros(1, bool), earned=unknown, earns=unknown)
     digest = jax.tree.map(np.asarray, digest)
     slim = _slim(rows)
     told, left = {g: (slim, digest) for g in who}, {}
     watched = time.perf_counter()
-    robot = functools.cache(
-      lambda: jax.tree.map(lambda x: x[:, lane : lane + 1], herd.streams)
-    )
+    robot = functools.cache(lambda: jax.tree.map(lambda x: x[:, lane : lane + 1], herd.streams))
     for g in who:
       settled = settle(g, robot)
       at = int(was.phase.phase[0])
@@ -434,7 +436,8 @@ class Lives:
     """What a checkpoint holds, NumPy but for the robots, and the streams of each band."""
     frozen = [life for herd in self.herds for life in herd.frozen]
     loops = [loop for band in self.bands for loop in band.loops]
-    tree: dict[str, Any] = {"robots": [group.streams for group in (*self.herds, *self.bands)]}
+    robots = [herd.streams for herd in self.herds] + [band.streams for band in self.bands]
+    tree: dict[str, Any] = {"robots": robots}
     if frozen:
       tree["sight"] = glue([life.sight for life in frozen], LATER)
       tree["phase"] = glue([life.phase for life in frozen], ())
@@ -454,9 +457,8 @@ class Lives:
       state = jax.eval_shape(begin, self.trains[0])
       number = sum(len(own) for own in who) // self.width
       tree["replays"] = [state.replay] * number
-      tree["learners"] = _held(
-        LoopState(*(_wider(v, number, name) for name, v in state._replace(replay=None)._asdict().items()))
-      )
+      fields = state._replace(replay=None)._asdict().items()
+      tree["learners"] = _held(LoopState(*(_wider(v, number, name) for name, v in fields)))
     return tree
 
   def unpack(self, tree: dict, who: list[list[int]]) -> None:
@@ -464,14 +466,12 @@ class Lives:
     robots = iter(tree["robots"])
     at = 0
     for herd in self.herds:
-      herd.streams, own = next(robots), slice(at, at + len(herd.lives))
+      herd.streams, first, at = next(robots), at, at + len(herd.lives)
       herd.frozen = [
-        jax.tree.map(
-          jnp.asarray, Frozen(_part(Sight(*tree["sight"]), i, 1), cut(tree["phase"], slice(i, i + 1), 0))
-        )
-        for i in range(own.start, own.stop)
+        Frozen(_part(tree["sight"], i, 1), cut(tree["phase"], slice(i, i + 1), 0))
+        for i in range(first, at)
       ]
-      at = own.stop
+      herd.frozen = jax.tree.map(jnp.asarray, herd.frozen)
     loops = [
       jax.tree.map(
         jnp.asarray,
@@ -480,9 +480,9 @@ class Lives:
       for k, replay in enumerate(tree.get("replays", []))
     ]
     bands = []
-    for own in who:
-      number = len(own) // self.width
-      bands.append(Band(list(own), next(robots), loops[:number]))
+    for members in who:
+      number = len(members) // self.width
+      bands.append(Band(list(members), next(robots), loops[:number]))
       del loops[:number]
     self._settle_down(bands)
 
@@ -512,4 +512,9 @@ def _part(state: Any, k: int, width: int) -> Any:
 
 def _slim(rows: Row) -> Row:
   """Of the fields LOGGED; the others are None."""
-  return Row(*(x if name in LOGGED else None for name, x in rows._asdict().items()))
+  return _row([x if name in LOGGED else None for name, x in rows._asdict().items()])
+
+
+def _row(fields: list[Any]) -> Row:
+  """A Row, of which some fields may be None."""
+  return Row(*fields)

@@ -21,7 +21,6 @@ import time
 from collections.abc import Callable, Iterable
 from typing import Any
 
-import jax
 import numpy as np
 
 from mjx_cl.adapt import decide as phase_lib

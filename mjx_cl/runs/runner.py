@@ -245,9 +245,13 @@ class Runner:
     return tuple(self.config.onset + c.after for c in self.changes if c.fault != "none")
 
   def _at(self, g: int, enter: int) -> jax.Array:
-    """Choices.at of stream g, whose robot became the other one in control step `enter`."""
-    c = self.config
-    return choices(self.labels[g : g + 1], c.adapt, c.steps, [(enter, *self._onsets())], self.stops).at
+    """Choices.at of stream g, as wide as before, whose robot became the other one in control step
+    `enter`.
+    """
+    c, own = self.config, self.labels[g : g + 1]
+    at = choices(own, c.adapt, c.steps, [(enter, *self._onsets())], self.stops).at
+    room = self.choices[g].at.shape[1] - at.shape[1]  # an arm with more starts makes it wider
+    return jnp.pad(at, ((0, 0), (0, room)), constant_values=FOREVER)
 
   def _choices(self) -> list[Choices]:
     """Of each stream, with every true onset that is known from the start; arms that are told one
@@ -322,7 +326,7 @@ class Runner:
     """Goes on from the newest checkpoint; without one, from the start."""
     if self.checkpoints.latest() is None:
       return
-    tree, meta = self.checkpoints.load(lambda meta: self.lives.like(meta.get("bands", [])))
+    tree, meta = self.checkpoints.load(self._like)
     self.lives.unpack(tree, meta["bands"])
     number = self.checkpoints.latest() or 0  # a broken one has been set aside
     self.parts = [arrays.read(self.work / f"trace-{number:06d}.npz")]
@@ -331,6 +335,12 @@ class Runner:
     self.stream_seconds, self._updates, self._alarms, self._phase = (
       np.asarray(meta[k]) for k in ("stream_seconds", "updates", "alarms", "phase")
     )
+
+  def _like(self, meta: dict) -> dict:
+    """Shapes of a checkpoint's tree."""
+    if "bands" not in meta:
+      raise FileError("it names no bands of learners, as those of an earlier version")
+    return self.lives.like(meta["bands"])
 
   @property
   def done(self) -> bool:

@@ -301,7 +301,7 @@ def story():
     EAGER,
     capacity=512,
   )
-  loop._program = quick.jit(loop._digest, donate_argnums=0)
+  loop.programs = quick.programs(loop)
   train = jax.jit(agent.init)(jax.random.key(0))
   # fresh heads say exactly 0, and a signal whose median is 0 has no scale to be settled on; slow
   # critic and moments get values of their own
@@ -494,7 +494,7 @@ def test_scratch_starts_from_fresh_parameters(story, same):
 
 
 def test_one_trace_serves_all_arms(story):
-  assert story.loop._program._cache_size() == 1
+  assert quick.traces(story.loop.programs) == (1, 0, 1)
 
 
 # ---- an abort that goes back ---------------------------------------------------------------------
@@ -513,7 +513,7 @@ def aborted(story):
   loop = Loop(
     story.loop.agent, story.loop.monitor, scripted(), story.loop.spec, EAGER, capacity=512
   )
-  loop._program = quick.jit(loop._digest, donate_argnums=0)
+  loop.programs = quick.programs(loop)
 
   def live(names, due, config, chunks, reward, level):
     loop.config = config  # its numbers are arguments of the program
@@ -544,7 +544,7 @@ def aborted(story):
     return states, digests
 
   yield live
-  assert loop._program._cache_size() == 1
+  assert quick.traces(loop.programs) == (1, 0, 1)
 
 
 UNACCEPTED = dataclasses.replace(EAGER, acceptance=None, budget=9 * STEPS, start_windows=40)

@@ -3,6 +3,7 @@ them on hand-made rows.
 """
 
 import dataclasses
+import functools
 import types
 from typing import NamedTuple
 
@@ -13,7 +14,7 @@ import pytest
 import quick
 
 from mjx_cl.adapt import decide as phase_lib
-from mjx_cl.adapt.blocks import Blocks, cut
+from mjx_cl.adapt import watch
 from mjx_cl.adapt.decide import (
   ABORT_BELOW,
   ABORT_BUDGET,
@@ -28,8 +29,10 @@ from mjx_cl.adapt.decide import (
   settled,
 )
 from mjx_cl.adapt.loop import Loop, choices
+from mjx_cl.adapt.state import LATER, ROWS, cut, glue
 from mjx_cl.config import PRESETS, AdaptConfig
 from mjx_cl.detectors import Alarm, Detector
+from mjx_cl.dreamer import behaviour
 from mjx_cl.dreamer.agent import Agent
 from mjx_cl.errors import UserError
 from mjx_cl.rollout.monitor import Monitor
@@ -397,10 +400,9 @@ class Counting(Agent):
   def open_loop(self, params, deter, stoch, actions, key):
     return jnp.zeros(actions.shape[:2] + (self.obs_size,)), jnp.zeros(actions.shape[:2])
 
-  def loss(self, *args):
-    return 0.0, (
-      {"loss/dyn": jnp.float32(2), "adv_mag": jnp.float32(0.5), "loss/value": jnp.float32(3)},
-    )
+  def judge(self, params, slow, range_, deter, stoch, key):
+    said = {"adv_mag": jnp.float32(0.5)}
+    return behaviour.Behaviour(jnp.float32(0), jnp.float32(3), deter[:, 0], range_, said)
 
   def update(self, state, batch, key):
     jax.debug.callback(lambda: self.calls.append(1))
@@ -443,14 +445,18 @@ class Told(NamedTuple):
   digest: object
 
 
+def small(kind=Agent):
+  """An agent with short windows and dreams."""
+  return kind(dataclasses.replace(PRESETS["tiny"].dreamer, batch=4, length=8, imagine=4), 24, 6)
+
+
 def tell(kind, config=EAGER, used=0, block=1):
   """Lives the script with an agent of class `kind` whose optimiser state is `used` more than fresh:
   (start, [Told of each chunk]).
 
-  block: streams in a block; there are two threads; one, as on a CPU: any number of
-  blocks shares a program.
+  block: streams that share a LoopState; one, as on a CPU: any number of them shares a program.
   """
-  agent = kind(dataclasses.replace(PRESETS["tiny"].dreamer, batch=4, length=8, imagine=4), 24, 6)
+  agent = small(kind)
   loop = Loop(
     agent,
     Monitor(agent, n=4, least=2),
@@ -459,7 +465,7 @@ def tell(kind, config=EAGER, used=0, block=1):
     config,
     capacity=256,
   )
-  loop._program = quick.jit(loop._digest, donate_argnums=0)
+  loop.programs = quick.programs(loop)
   train = jax.jit(agent.init)(jax.random.key(0))
   # fresh heads say exactly 0, and a signal whose median is 0 has no scale to be settled on
   params = jax.tree.map(
@@ -472,24 +478,20 @@ def tell(kind, config=EAGER, used=0, block=1):
   keys, chosen = jax.random.split(jax.random.key(1), 3), choices(ARMS, config, CHUNKS * STEPS)
   copy = lambda tree: jax.tree.map(lambda x: np.array(x), tree)
   begin, told = copy(state), []
-  loops = Blocks(loop, 3, block, threads=2)
-  states = loops.split(state._replace(replay=[cut(state.replay, own, 0) for own in loops.blocks]))
-  whole = lambda joined: joined._replace(
-    replay=jax.tree.map(lambda *x: np.concatenate(x), *joined.replay)
-  )
+  blocks = [slice(g, min(g + block, 3)) for g in range(0, 3, block)]
+  field = lambda name, own: cut(getattr(state, name), own, int(name in LATER))
+  states = [
+    jax.tree.map(jnp.array, type(state)(*(field(name, own) for name in state._fields)))
+    for own in blocks
+  ]
   for c in range(CHUNKS):
-    states, digest = loops.digest(
-      states, hand_rows(c * STEPS), jnp.int32((c + 1) * STEPS), chosen, keys
-    )
-    told.append(Told(whole(copy(loops.join(states))), digest))
-  joined = copy(loops.join(states))
-  jax.tree.map(np.testing.assert_array_equal, copy(loops.acting(states)), joined.acting)
-  jax.tree.map(
-    np.testing.assert_array_equal, copy(loops.join(loops.split(joined))), joined
-  )  # what a checkpoint holds, and back
-  assert jax.tree.map(lambda x: (x.shape, x.dtype), loops.shapes(states)) == jax.tree.map(
-    lambda x: (x.shape, x.dtype), joined
-  )
+    rows, digests = hand_rows(c * STEPS), []
+    for k, own in enumerate(blocks):
+      states[k], digest = loop.digest(
+        states[k], cut(rows, own, 1), jnp.int32((c + 1) * STEPS), cut(chosen, own, 0), keys[own]
+      )
+      digests.append(copy(digest))
+    told.append(Told(glue(copy(states), LATER), glue(digests, ROWS)))
   return begin, told
 
 
@@ -708,17 +710,70 @@ def test_the_detector_is_refitted_after_a_stop(story):
   ]  # nobody else's is
 
 
+@functools.cache
+def judge():
+  """Losses of actor and critic of `small`, all dreams at once."""
+  form = behaviour.imagine, behaviour.sums
+  return quick.jit(lambda *given: behaviour.losses(small(), *given, *form))
+
+
+def hand_losses(agent, state, rows, keys, starts):
+  """Dynamics loss, advantage magnitude and value loss (streams,) of what acts: the divergence of
+  the two beliefs in NumPy, and the agent's losses, all dreams at once, on rows `starts`.
+  """
+  out = []
+  for g in range(len(keys)):
+    own = jax.tree.map(lambda x: x[:, g, 0], rows)
+    params, slow, range_ = (of(x, g) for x in (state.acting, state.train.slow, state.train.range))
+    said = agent.beliefs(params, own.deter, own.obs)
+    exp = [np.exp(x - np.max(x, -1, keepdims=True)) for x in np.asarray(said, np.float64)]
+    q, p = (0.99 * x / x.sum(-1, keepdims=True) + 0.01 / x.shape[-1] for x in exp)
+    kl = (q * np.log(q / p)).sum((-2, -1))
+    hot = np.eye(agent.size.classes, dtype=np.float32)[own.stoch[starts]].reshape(len(starts), -1)
+    img = judge()(params, slow, range_, own.deter[starts], hot, keys[g])
+    dyn = np.maximum(agent.config.free_nats, kl).mean()
+    out.append((dyn, img.metrics["adv_mag"], img.value))
+  return np.array(out, np.float64).T
+
+
 def test_signals_of_a_chunk(story):
-  _, told = story
+  """By the weights, the slow critic and the range that the chunk was lived with."""
+  begin, told = story
+  agent, before = small(), begin
   for c, t in enumerate(told):
-    reward = np.asarray(hand_rows(c * STEPS).reward).mean((0, 2))
+    rows = hand_rows(c * STEPS)
+    reward = np.asarray(rows.reward).mean((0, 2))
     np.testing.assert_allclose(
       t.digest.signals[:, 2], reward, rtol=1e-5, atol=1e-6
     )  # float32 mean of 16
     np.testing.assert_allclose(
       t.digest.signals[:, 0], np.nanmean(t.digest.residual.opr, 0), rtol=1e-5
     )
+    np.testing.assert_allclose(
+      t.digest.signals[:, 1], np.nanmean(t.digest.residual.rpr, 0), rtol=1e-5
+    )
+    if c in (0, 6, 9):  # nominal; one adapts, one starts; one has stopped and starts again
+      own = [jax.random.fold_in(k, (c + 1) * STEPS) for k in jax.random.split(jax.random.key(1), 3)]
+      keys = [jax.random.split(k, 3)[1] for k in own]
+      want = hand_losses(agent, before.state if c else begin, rows, keys, np.arange(STEPS))
+      np.testing.assert_allclose(t.digest.signals[:, 3:].T, want, rtol=2e-4)  # float32 sums
     assert np.isfinite(t.digest.signals).all()
+    before = t
+
+
+@pytest.mark.parametrize("length, starts", [(64, range(3, 64, 4)), (5, range(5))])
+def test_dreams_begin_at_sixteen_states_evenly_spaced(length, starts):
+  """The last of each sixteenth of a chunk; a chunk of fewer: all its states."""
+  agent, keys = small(), jax.random.split(jax.random.key(3), 2)
+  trains = jax.vmap(lambda key: jax.tree.map(lambda x: x + 0.01, agent.init(key)))(keys)
+  many = [hand_rows(k * STEPS) for k in range(4)]
+  rows = jax.tree.map(lambda *x: jnp.concatenate(x)[:length, :2], *many)
+  minds = watch.Minds(trains.params, trains.slow, trains.range)
+  state = types.SimpleNamespace(acting=trains.params, train=trains)
+  got = quick.jit(lambda *given: watch.evaluate(agent, *given))(minds, rows, keys)
+  want = hand_losses(agent, state, rows, keys, np.array(starts))[1:]
+  np.testing.assert_allclose(got, want, rtol=2e-4)  # float32 sums in another order
+  assert len(starts) in (watch.STARTS, length)
 
 
 def test_numbers_of_the_config_are_arguments():

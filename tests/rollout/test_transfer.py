@@ -13,7 +13,7 @@ import pyarrow.parquet
 import pytest
 
 from mjx_cl import envs, faults
-from mjx_cl.config import CHUNK, PRESETS, AdaptConfig, RunConfig
+from mjx_cl.config import CHUNK, FOREVER, PRESETS, AdaptConfig, RunConfig
 from mjx_cl.dreamer.agent import Agent
 from mjx_cl.envs.car import Car
 from mjx_cl.envs.car_real import CarReal
@@ -431,11 +431,17 @@ def asked(saved, **kw):
 
 @pytest.fixture(scope="module")
 def whole(short, saved, tmp_path_factory):
-  """An uninterrupted run of both arms: (folder, [rows of each chunk], [acceptance handed to each
-  digest]).
+  """An uninterrupted run of both arms: (folder, [rows of each chunk], {(control steps done,
+  stream): acceptance that was handed on}).
   """
-  out, chunks, levels = tmp_path_factory.mktemp("runs") / "whole", [], []
-  log, accept = run.Runner._log, run.Runner._acceptance
+  out, chunks, levels = tmp_path_factory.mktemp("runs") / "whole", [], {}
+  log, settle = run.Runner._log, run.Runner._settle
+
+  def settled(self, now, g, robot):
+    told = settle(self, now, g, robot)
+    levels[now, g] = told.acceptance
+    return told
+
   with pytest.MonkeyPatch.context() as patch:
     patch.setattr(
       run.Runner,
@@ -444,9 +450,7 @@ def whole(short, saved, tmp_path_factory):
         chunks.append(jax.tree.map(np.asarray, rows)) or log(self, rows, digest)
       ),
     )
-    patch.setattr(
-      run.Runner, "_acceptance", lambda self, *a: levels.append(accept(self, *a)) or levels[-1]
-    )
+    patch.setattr(run.Runner, "_settle", settled)
     run.execute(asked(saved), out)
   return out, chunks, levels
 
@@ -580,12 +584,31 @@ def test_the_task_is_accepted_by_the_level_of_the_robot_that_there_is(whole):
   out, _, levels = whole
   trace = by_stream(out)
   at = np.asarray([entered(trace, g) for g in range(4)])
-  for i, level in enumerate(levels):
+  for i in range(-(-STEPS // CHUNK)):
+    level = np.concatenate([levels[(i + 1) * CHUNK, g] for g in range(4)])
     np.testing.assert_array_equal(
       level, np.where(at < (i + 1) * CHUNK, -1e9, 1e9).astype(np.float32)
     )
   stops = [(g, s) for g in (0, 1) for s, _ in events_of(out, g, "stop")]
   assert stops and all(s >= at[g] for g, s in stops)
+
+
+def test_starts_are_as_wide_for_every_arm_of_a_run(short, saved, tmp_path):
+  """Beside an arm of nine starts, one that is told the change has it, once it has come, in a row
+  of the same shape: streams are put together, and share a program.
+  """
+  adapt = dataclasses.replace(ADAPT, period=40, period_steps=30)
+  runner = run.Runner(asked(saved, arms=("periodic", "oracle"), seeds=1, adapt=adapt), tmp_path)
+  robot = jax.tree.map(lambda x: x[:, :1], runner.lives.herds[0].streams)
+  moved = robot._replace(after=robot.after._replace(enter=jnp.full_like(robot.after.enter, 97)))
+  told = [
+    [runner._settle(128, g, lambda own=own: own).choices.at for own in (robot, moved)]
+    for g in (0, 1)
+  ]
+  assert {at.shape for own in told for at in own} == {runner.choices[0].at.shape} == {(1, 16)}
+  assert list(told[0][1][0][:10]) == [*range(40, 400, 40), FOREVER]
+  assert sorted(told[1][1][0].tolist())[:3] == [97, ONSET + SECOND, FOREVER]
+  assert sorted(told[1][0][0].tolist())[:2] == [ONSET + SECOND, FOREVER]
 
 
 def test_the_replay_holds_what_the_stream_lived(whole):
@@ -594,7 +617,7 @@ def test_the_replay_holds_what_the_stream_lived(whole):
   """
   out, chunks, _ = whole
   trace = by_stream(out)
-  obs = np.concatenate([c.obs for c in chunks])[:, :, 0]
+  obs = np.concatenate([c.final_obs for c in chunks])[:, :, 0]
   for g in (0, 1):
     first = (events_of(out, g, "start") + [(STEPS, "")])[0][0]
     assert obs[:first, g].tobytes() == obs[:first, g + 2].tobytes()
@@ -625,10 +648,7 @@ def test_a_run_killed_before_during_and_after_the_change_ends_in_the_same_files(
       runner.save()
       runner.checkpoints.close()
       what.append(
-        [
-          int(x) < runner.done_chunks * CHUNK
-          for x in np.asarray(runner.state.streams.after.enter)[:, 0]
-        ]
+        [int(x) < runner.done_chunks * CHUNK for x in runner.lives.each(lambda r: r.after.enter)]
       )
   run.finish(runner)
   assert not any(what[0]) and any(what[1]) and all(what[2])

@@ -406,12 +406,11 @@ def lived(config, folder):
 
   def watched(self):
     progress = step(self)
-    jax.tree.map(
-      np.testing.assert_array_equal, self.acting, self.loops.acting(self.state.loop)
-    )  # what acts is never out of date
-    acted[progress.step - 1] = jax.tree.map(
-      lambda x: np.array(x[3]), {k: self.loops.acting(self.state.loop)[k] for k in snapshots.ACTS}
-    )
+    for band in self.lives.bands:
+      if band.acting is not None:  # what acts is never out of date
+        jax.tree.map(np.testing.assert_array_equal, band.acting, self.lives._acting(band))
+    weights = self.lives.acting(3)
+    acted[progress.step - 1] = jax.tree.map(np.array, {k: weights[k] for k in snapshots.ACTS})
     return progress
 
   def kept(self, wanted, targets, tell):

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pyarrow.parquet
 import pytest
+import quick
 from test_cli import content, mjx, refused  # noqa: F401  fixtures
 from test_transfer import agent, saved  # noqa: F401  fixtures: a tiny agent of the car, whose programs hold no callback and are cached
 
@@ -458,9 +459,11 @@ def test_parts_run_once_go_on_and_merge(mjx, refused, mini, tmp_path, monkeypatc
   assert mjx("bench", mini, "--out", out, "--only", "grip", "--jobs", "1")[0] == 0
   assert lived == [1, 2] + [0, 1, 2]  # the part that was cut off goes on, the other begins
   config = suites.suite(str(mini)).parts[0].config
-  assert (
-    run.Runner(config, tmp_path).loops.loop._program._cache_size() == 1
-  )  # a run that goes on compiles nothing anew
+  assert quick.traces(run.Runner(config, tmp_path).loop.programs) == (
+    1,
+    1,
+    0,
+  )  # a run that goes on compiles nothing anew; arm none learns nothing
   del begun[:], lived[:]
 
   assert mjx("bench", mini, "--out", other, "--shard", "2/3")[0] == 0
@@ -701,7 +704,7 @@ def test_runs_of_one_kind_share_their_program(mini, tmp_path, programs):  # noqa
   """
   (part, _, _) = suites.suite(str(mini)).parts
   program = lambda **change: (
-    run.Runner(dataclasses.replace(part.config, **change), tmp_path).loops.loop._program
+    run.Runner(dataclasses.replace(part.config, **change), tmp_path).loop.programs
   )
   first = program()
   adapt = dataclasses.replace(part.config.adapt, budget=300, ratio=4.0, near=2.0)
@@ -712,7 +715,7 @@ def test_runs_of_one_kind_share_their_program(mini, tmp_path, programs):  # noqa
     {"adapt": dataclasses.replace(part.config.adapt, lr=1e-3)},
   ):
     assert program(**other) is not first
-  unhashable = run.Runner(part.config, tmp_path).loops.loop
+  unhashable = run.Runner(part.config, tmp_path).loop
   own = type(unhashable)(
     unhashable.agent,
     unhashable.monitor,
@@ -722,9 +725,9 @@ def test_runs_of_one_kind_share_their_program(mini, tmp_path, programs):  # noqa
     same=(["a list"],),
     programs=programs,
   )
-  assert own._program is not first  # what has no hash shares nothing
+  assert own.programs is not first  # what has no hash shares nothing
   assert 1 < len(programs.kept) <= programs.most
-  assert run.Runner(part.config, tmp_path, type(programs)()).loops.loop._program is not first
+  assert run.Runner(part.config, tmp_path, type(programs)()).loop.programs is not first
 
 
 @pytest.mark.parametrize(
@@ -746,13 +749,14 @@ def test_a_reward_that_is_no_number_ends_a_run_in_one_line(mini, tmp_path):  # n
   runner.open()
   runner.step()
   runner.save()
-  digest = runner.loops.digest
+  step = runner.lives.step
 
   def broken(*given):
-    state, value = digest(*given)
-    return state, value._replace(signals=np.asarray(value.signals) * [[1.0], [np.nan]])
+    chunk = step(*given)
+    signals = chunk.digest.signals * [[1.0], [np.nan]]
+    return chunk._replace(digest=chunk.digest._replace(signals=signals))
 
-  runner.loops.digest = broken
+  runner.lives.step = broken
   with pytest.raises(
     FileError,
     match=(
@@ -788,11 +792,11 @@ def test_a_stream_whose_loss_fails_is_given_up_alone_and_named(mini, tmp_path, s
     for i in range(chunks):
       if runner is hurt and i == 3:
         assert (runner._updates > 0).all()
-        (block,) = [k for k, b in enumerate(runner.loops.blocks) if b.start == 1]
-        loop = runner.state.loop[block]
+        band, lane = runner.lives.place[1]
+        loop = band.loops[lane]
         data = loop.replay.data
         at = jax.tree.map(np.array, loop.train)
-        runner.state.loop[block] = loop._replace(
+        band.loops[lane] = loop._replace(
           replay=loop.replay._replace(data=data._replace(reward=data.reward * jnp.nan))
         )
         taken = runner._updates.copy()
@@ -809,24 +813,22 @@ def test_a_stream_whose_loss_fails_is_given_up_alone_and_named(mini, tmp_path, s
     and hurt._updates[0] == sound._updates[0] > taken[0]
     and sound._updates[1] > taken[1]
   )
-  assert same(hurt.state.loop[0], sound.state.loop[0])
-  end = hurt.state.loop[block].train
+  state = lambda runner, g: runner.lives.place[g][0].loops[runner.lives.place[g][1]]
+  assert same(state(hurt, 0), state(sound, 0))
+  end = state(hurt, 1).train
   assert same(end.slow, at.slow) and same(
     end.opt, at.opt
   )  # params became what acts, as at every end
   assert all(np.isfinite(x).all() for x in jax.tree.leaves(end.params))
-  loop = sound.state.loop[
-    block
-    # the latents that finetuning was taken on are fresh: put to nought, some are back after a chunk
-    # that updates
-  ]
-  data = loop.replay.data
-  sound.state.loop[block] = loop._replace(
-    replay=loop.replay._replace(data=data._replace(deter=jnp.zeros_like(data.deter)))
-  )
+  # the latents that finetuning was taken on are fresh: put to nought, some are back after a chunk
+  # that updates
+  band, lane = sound.lives.place[1]
+  replay = band.loops[lane].replay
+  nought = replay.data._replace(deter=jnp.zeros_like(replay.data.deter))
+  band.loops[lane] = band.loops[lane]._replace(replay=replay._replace(data=nought))
   sound.step()
   fresh, new = (
-    np.asarray(sound.state.loop[block].replay.data.deter).any(-1).reshape(-1),
+    np.asarray(state(sound, 1).replay.data.deter).any(-1).reshape(-1),
     CHUNK + 4,
   )  # records of one chunk, ends of episodes among them
   assert new < fresh.sum() < fresh.size
