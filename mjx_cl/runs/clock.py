@@ -1,0 +1,122 @@
+"""How long a run goes on: what its chunks took so far, and the finetunings that are expected."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from mjx_cl.adapt.arms import ARMS, FOREVER
+from mjx_cl.config import CHUNK, RunConfig
+from mjx_cl.runs import outlook, work
+from mjx_cl.runs.lives import BAND, Lives
+from mjx_cl.runs.outlook import Standing
+from mjx_cl.runs.work import Learner, Load, Speed
+
+# seconds that the programs of lives and those of learners compile on the machine of work.RATE
+COMPILE_S, COMPILE_LEARNER_S = 15.0, 35.0
+PRIOR_S = 0.5  # core seconds for which the expected speed counts beside what was measured
+FADES = 0.995  # what a chunk before the newest counts, beside that
+
+
+class Clock:
+  """Seconds left of a run.
+
+    seconds of a kind of work  =  measured / modelled  x  expected, see work.Speed
+
+  A kind that has not been measured goes by the mean of the others.
+
+  Args:
+    config: of the run.
+    labels: (arm, seed) of each stream.
+    together: herds of its lives, see work.herds.
+    own: how streams learn.
+    core: what a core is expected to take.
+    cores: that share the work.
+    repeat: control steps of a decision.
+    stops: seed -> control steps after which an arm that is told ends.
+  """
+
+  def __init__(
+    self,
+    config: RunConfig,
+    labels: Sequence[tuple[str, int]],
+    together: list[list[list[int]]],
+    own: Learner,
+    core: Speed,
+    cores: int,
+    repeat: int = 1,
+    stops: dict[int, int] | None = None,
+  ) -> None:
+    self.config, self.labels, self.together, self.own = config, labels, together, own
+    self.core, self.cores, self.chunk, self.stops = core, cores, CHUNK * repeat, stops or {}
+    self.measured, self.modelled = np.zeros(4), np.zeros(4)  # core seconds by kind
+    self.lived, self.foretold = 0.0, 0.0  # seconds of wall time
+
+  def speed(self) -> Speed:
+    """Core seconds of each kind, as far as they have been measured."""
+    mean = (self.measured.sum() + 1e-9) / (self.modelled.sum() + 1e-9)
+    each = (self.measured + PRIOR_S * mean) / (self.modelled + PRIOR_S)
+    return Speed(*(each * np.array(self.core)))
+
+  def see(self, done: Load, seconds: np.ndarray, wall: float) -> None:
+    """Takes in a chunk in which nothing was compiled; seconds: core seconds by kind, (4,)."""
+    self.measured = self.measured * FADES + seconds
+    self.modelled = self.modelled * FADES + (done.kinds() * np.array(self.core)).sum(0)
+    self.lived = self.lived * FADES + wall
+    self.foretold = self.foretold * FADES + float(work.wall(done, self.speed(), self.cores).sum())
+
+  def expected(self, now: int, stands: Sequence[Standing]) -> Load:
+    """What is expected of the chunks from control step `now` on."""
+    c = self.config
+    most = lambda arm, seed: self.stops[seed] if ARMS[arm].end.told else FOREVER
+    spells = [
+      outlook.expected(c, arm, seed, now, own, most(arm, seed))
+      for (arm, seed), own in zip(self.labels, stands)
+    ]
+    at = np.arange(now, c.steps, self.chunk)
+    begun = [own.since >= 0 for own in stands]
+    return work.load(spells, begun, self.together, self.own, at, self.chunk)
+
+  def left(self, now: int, stands: Sequence[Standing], compiled: float = 0.0) -> float | None:
+    """Seconds from control step `now` to the end; None: nothing is known yet.
+
+    Args:
+      now: control steps done.
+      stands: how each stream stands.
+      compiled: seconds that the programs of lives took to compile.
+    """
+    if not self.foretold:
+      return None
+    todo = self.expected(now, stands)
+    rest = float(work.wall(todo, self.speed(), self.cores).sum()) * self.lived / self.foretold
+    if any(own.since >= 0 for own in stands) or not len(todo.bands):
+      return rest
+    return rest + COMPILE_LEARNER_S * compiled / COMPILE_S * min(1.0, float(todo.bands.max()))
+
+
+def counted(lives: Lives) -> Load:
+  """What acts and is watched in the next chunk; its updates are not known yet."""
+  alive = {life for life, who in lives.sharing.items() if who}
+  herds = sum(any(life in alive for life in herd.lives) for herd in lives.herds)
+  one = lambda x: np.array([float(x)])
+  bands = len(lives.bands) * lives.band_size / BAND
+  return Load(one(herds), one(bands), one(len(alive) + len(lives.place)), one(0), one(0))
+
+
+def sorted_out(seconds: np.ndarray, learner: np.ndarray, updates: np.ndarray) -> np.ndarray:
+  """Core seconds of a chunk by kind (4,), of `seconds` (streams, 3) of acting, watching, learning.
+
+  Args:
+    seconds: of lives.Chunk.
+    learner: bool (streams,), at the chunk's begin.
+    updates: int (streams,), that it took.
+  """
+  learns = learner & (updates > 0)
+  acting, watching, learning = seconds.T
+  return np.array(
+    [
+      acting[~learner].sum(),
+      acting[learner].sum(),
+      watching.sum() + learning[~learns].sum(),
+      learning[learns].sum(),
+    ]
+  )
