@@ -24,12 +24,15 @@ class Run(RunConfig):
 
   Attributes:
     out: Result folder.
+    quick: A whole loop in about two minutes, for a first look: other defaults of fault, seeds,
+      onset, steps and stop rule, for walker, quadruped and car.
     json: One JSON value on standard output, nothing else there.
     resume: Go on with a run that was cut off.
     overwrite: Replace an earlier run in --out.
   """
 
   out: str = "runs/latest"
+  quick: bool = False
   json: bool = False
   resume: bool = False
   overwrite: bool = False

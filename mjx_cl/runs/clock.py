@@ -1,15 +1,20 @@
 """How long a run goes on: what its chunks took so far, and the finetunings that are expected."""
 
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
 
 from mjx_cl.adapt.arms import ARMS, FOREVER
-from mjx_cl.config import CHUNK, RunConfig
+from mjx_cl.config import CHUNK, DreamerConfig, RunConfig
+from mjx_cl.faults.presets import becomes
+from mjx_cl.io import runtime
 from mjx_cl.runs import outlook, work
 from mjx_cl.runs.lives import BAND, Lives
 from mjx_cl.runs.outlook import Standing
 from mjx_cl.runs.work import Learner, Load, Speed
+from mjx_cl.training import needs
+from mjx_cl.types import Spec
 
 # seconds that the programs of lives and those of learners compile on the machine of work.RATE
 COMPILE_S, COMPILE_LEARNER_S = 15.0, 35.0
@@ -91,6 +96,34 @@ class Clock:
     if any(own.since >= 0 for own in stands) or not len(todo.bands):
       return rest
     return rest + COMPILE_LEARNER_S * compiled / COMPILE_S * min(1.0, float(todo.bands.max()))
+
+
+def clock_of(
+  config: RunConfig,
+  spec: Spec,
+  trained: DreamerConfig,
+  repeat: int = 1,
+  stops: dict[int, int] | None = None,
+) -> Clock:
+  """The Clock of a run on this process's cores.
+
+  Args:
+    config: of the run.
+    spec: of its robot.
+    trained: of its agent.
+    repeat: control steps of a decision.
+    stops: see Clock.
+  """
+  seeds = range(config.first_seed, config.first_seed + config.seeds)
+  labels = list(itertools.product(config.arms, seeds))
+  lives = [(ARMS[arm].agent, (ARMS[arm].breaks, seed)) for arm, seed in labels]
+  shape = (trained.size, len(spec.obs), len(spec.act))
+  size = needs.parameters(*shape, trained.bins)[0] / 640_867  # of size1m on a walker
+  robots = filter(None, (config.env, becomes(config)))
+  physics = max(work.PHYSICS_S.get(robot, 0.1e-3) for robot in robots)
+  core = work.speed(config.adapt, trained, size, physics, repeat)
+  own = work.learner(config.adapt, trained, repeat)
+  return Clock(config, labels, work.herds(lives), own, core, len(runtime.cores()), repeat, stops)
 
 
 def counted(lives: Lives) -> Load:

@@ -9,17 +9,16 @@ import jax
 import jax.numpy as jnp
 
 from mjx_cl import detectors, envs, faults
-from mjx_cl.adapt.arms import ARMS, FOREVER
-from mjx_cl.config import RunConfig
 from mjx_cl.errors import UserError
 from mjx_cl.faults.presets import becomes, changes
-from mjx_cl.io import memory
+from mjx_cl.runs import room, work
+from mjx_cl.runs.clock import COMPILE_LEARNER_S, COMPILE_S, clock_of
 from mjx_cl.runs.identity import arm_agents
-from mjx_cl.runs.loops import capacity
-from mjx_cl.runs.records import acts
+from mjx_cl.runs.outlook import Standing
 from mjx_cl.runs.suite import Part
 from mjx_cl.scoring import stop_rule
-from mjx_cl.training import agents, needs
+from mjx_cl.training import agents
+
 
 class Estimate(NamedTuple):
   """What a part will take.
@@ -74,10 +73,8 @@ def estimate(part: Part, rate: float, robots: Robots) -> Estimate:
   """
   c = part.config
   env, trained = robots.make(c.env, "auto"), robots.learner(c.env, c.agent)
-  physics = max(work.PHYSICS_S.get(name, 0.1e-3) for name in filter(None, (c.env, becomes(c))))
-  clock = clock_of(c, env.spec, trained, physics, len(runtime.cores()))
-  nobody = [Standing()] * len(clock.labels)
-  chunks = clock.expected(0, nobody)
+  clock = clock_of(c, env.spec, trained, stops=stop_rule.told(c))
+  chunks = clock.expected(0, [Standing()] * len(clock.labels))
   # RATE is that of two cores, `rate` that of all
   slower = work.RATE / 2 / (rate / clock.cores)
   compiling = COMPILE_S + COMPILE_LEARNER_S * min(1.0, float(chunks.bands.max()))
@@ -86,7 +83,7 @@ def estimate(part: Part, rate: float, robots: Robots) -> Estimate:
     len(clock.labels) * c.steps,
     float(chunks.updates.sum()),
     compiling + slower * float(work.wall(chunks, clock.core, clock.cores).sum()),
-    room.of(c, env.spec, trained),
+    room.of(c, env.spec, trained).total,
   )
 
 

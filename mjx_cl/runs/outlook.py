@@ -119,6 +119,9 @@ class Standing(NamedTuple):
   since: int = -1
 
 
+NEW = Standing()
+
+
 def length(config: RunConfig, arm: str, age: int, most: int = FOREVER) -> float:
   """Control steps that a finetuning which has lasted `age` is expected to last in all."""
   mean, end = limit(config, arm, most)
@@ -130,7 +133,11 @@ def length(config: RunConfig, arm: str, age: int, most: int = FOREVER) -> float:
 
 
 def expected(
-  config: RunConfig, arm: str, seed: int, now: int = 0, stands: Standing = Standing(),
+  config: RunConfig,
+  arm: str,
+  seed: int,
+  now: int = 0,
+  stands: Standing = NEW,
   most: int = FOREVER,
 ) -> list[Spell]:
   """Finetunings of a stream that are under way in control step `now` or expected later."""

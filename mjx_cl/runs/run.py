@@ -21,7 +21,6 @@ import time
 from collections.abc import Callable, Iterable
 from typing import Any
 
-import jax
 import numpy as np
 
 from mjx_cl.adapt import decide as phase_lib
@@ -99,6 +98,7 @@ def execute(
     f"{len(config.arms) * config.seeds} streams of {config.steps:,} control steps; what is not "
     "compiled yet is compiled first, a minute or two"
   )
+  tell(str(runner.room))
   last = live(runner, progress, save_every_s)
   return finish(runner, lambda text: last and progress(last._replace(note=text)))
 

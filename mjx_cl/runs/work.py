@@ -99,9 +99,7 @@ def learner(adapt: AdaptConfig, trained: Any, repeat: int = 1) -> Learner:
   return Learner((adapt.start_windows + trained.length) * repeat, adapt.ratio / replayed / repeat)
 
 
-def speed(
-  adapt: AdaptConfig, trained: Any, size: float, physics: float, repeat: int = 1
-) -> Speed:
+def speed(adapt: AdaptConfig, trained: Any, size: float, physics: float, repeat: int = 1) -> Speed:
   """Speed of a core of the machine of RATE.
 
   Args:
@@ -130,7 +128,8 @@ def herds(lives: Sequence[tuple[Hashable, Hashable]]) -> list[list[list[int]]]:
   for g, (agent, life) in enumerate(lives):
     of.setdefault(agent, {}).setdefault(life, []).append(g)
   return [
-    own[k : k + HERD] for own in map(list, map(dict.values, of.values()))
+    own[k : k + HERD]
+    for own in map(list, map(dict.values, of.values()))
     for k in range(0, len(own), HERD)
   ]
 

@@ -77,9 +77,7 @@ def lived(clock, spans):
         out.append(Standing())
       else:
         (start, steps, _), end = past[-1]
-        out.append(
-          Standing(decide.ADAPTING if start + steps > now else phase.get(end, 0), start)
-        )
+        out.append(Standing(decide.ADAPTING if start + steps > now else phase.get(end, 0), start))
     return out
 
   return at, work.load(own, [False] * len(own), clock.together, clock.own, at, clock.chunk), stands
