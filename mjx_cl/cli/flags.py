@@ -389,7 +389,8 @@ class List:
 
 @dataclass(frozen=True)
 class Doctor:
-  """Versions, devices, physics backend, free memory and a two-second speed check.
+  """Versions, devices, physics backend, free memory, whether compiled programs are found again, and
+  a two-second speed check.
 
   Example: mjx-cl doctor --json
   """
