@@ -45,7 +45,7 @@ class Room(NamedTuple):
     return memory.resident(self.lives + self.weights + self.replays) + self.trace
 
   def __str__(self) -> str:
-    gib = lambda size: f"{size / 2**30:.1f} GiB"
+    gib = lambda size: f"{size / 2**30:.1f} GiB" if size >= 2**29 else f"{size / 2**20:.0f} MiB"
     grows = (
       f"; of that {gib(self.replays)} for the replays of {self.learners} learners and "
       f"{gib(self.trace)} for the trace grow with the steps"
