@@ -104,7 +104,7 @@ def quickly(command: Run, argv: list[str]) -> Run:
   own comes without target and severity of quick's.
   """
   kind = Annotated[Run, tyro.conf.PositionalRequiredArgs]
-  defaults = quick.quick(command.env)
+  defaults = quick.defaults(command.env)
   for left_out in ((), quick.FAULT):
     own = {name: value for name, value in defaults.items() if name not in left_out}
     asked: Run = read(kind, argv, args=argv, default=Run(env=tyro.MISSING, **own))

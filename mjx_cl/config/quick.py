@@ -23,13 +23,13 @@ QUICK: dict[str, dict[str, Any]] = {
 FAULT = ("target", "severity")  # of the preset's own fault alone
 
 
-def quick(env: str) -> dict[str, Any]:
+def defaults(env: str) -> dict[str, Any]:
   """What RunConfig's defaults are with --quick.
 
   Raises:
     UserError: for a robot without.
   """
-  return choose("--quick robot", env, QUICK)
+  return choose("robot of --quick", env, QUICK)
 
 
 def check(config: RunConfig, listens: bool) -> None:

@@ -22,12 +22,14 @@ from mjx_cl.faults.presets import becomes, changes
 from mjx_cl.runs.records import acts
 from mjx_cl.runs.work import Spell
 
-# of the published runs (results/*/runs.parquet, events.parquet), by robot at the start; tests check
-# them against these files
-PROMPT = {"walker": 0.60, "quadruped": 0.56, "car": 0.80}
-LATENCY = {"walker": 270, "quadruped": 270, "car": 45}  # control steps
-LATE = {"walker": 7.4e-6, "quadruped": 17e-6, "car": 21e-6}  # per control step
-ANY = (0.65, 200, 14e-6)  # PROMPT, LATENCY and LATE of any other robot
+# PROMPT, LATENCY [control steps] and LATE [per control step] of the published runs (results/*/
+# runs.parquet, events.parquet), by robot at the start; tests check them against these files
+NOTICES = {
+  "walker": (0.60, 270, 7.4e-6),
+  "quadruped": (0.56, 270, 17e-6),
+  "car": (0.80, 45, 21e-6),
+}
+ANY = (0.65, 200, 14e-6)  # of any other robot
 # control steps that a finetuning with a stop rule lasts, of the robot that it goes on with: mean,
 # and the middle of each tenth
 ADAPTS = {"walker": 7_900, "quadruped": 9_200, "car": 8_100, "car_real": 15_000}
@@ -148,9 +150,7 @@ def expected(
     free = stands.since + int(steps)
   if stands.phase == decide.ABORTED or not own.learns:
     return out
-  prompt, latency, late = (
-    table.get(config.env, other) for table, other in zip((PROMPT, LATENCY, LATE), ANY)
-  )
+  prompt, latency, late = NOTICES.get(config.env, ANY)
   mean = length(config, arm, -1, most)
 
   def add(start: float, chance: float) -> None:

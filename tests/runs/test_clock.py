@@ -143,13 +143,14 @@ def starts_of(published, env):
   return noticed, others, watched
 
 
-@pytest.mark.parametrize("env", outlook.PROMPT)
+@pytest.mark.parametrize("env", outlook.NOTICES)
 def test_what_is_expected_of_a_stream_is_what_the_published_ones_did(published, env):
   noticed, others, watched = starts_of(published, env)
+  prompt, latency, late = outlook.NOTICES[env]
   delays = [x for x in noticed if x is not None]
-  assert len(delays) / len(noticed) == pytest.approx(outlook.PROMPT[env], abs=0.03)
-  assert np.mean(delays) == pytest.approx(outlook.LATENCY[env], rel=0.1)
-  assert others / watched == pytest.approx(outlook.LATE[env], rel=0.1)
+  assert len(delays) / len(noticed) == pytest.approx(prompt, abs=0.03)
+  assert np.mean(delays) == pytest.approx(latency, rel=0.1)
+  assert others / watched == pytest.approx(late, rel=0.1)
 
 
 def test_lengths_are_the_tenths_of_the_published_ones(published):
