@@ -18,7 +18,6 @@ from mjx_cl.types import Spec
 
 # seconds that the programs of lives and those of learners compile on the machine of work.RATE
 COMPILE_S, COMPILE_LEARNER_S = 15.0, 35.0
-PRIOR_S = 0.5  # core seconds for which the expected speed counts beside what was measured
 FADES = 0.995  # what a chunk before the newest counts, beside that
 
 
@@ -58,8 +57,9 @@ class Clock:
 
   def speed(self) -> Speed:
     """Core seconds of each kind, as far as they have been measured."""
-    mean = (self.measured.sum() + 1e-9) / (self.modelled.sum() + 1e-9)
-    each = (self.measured + PRIOR_S * mean) / (self.modelled + PRIOR_S)
+    mean = self.measured.sum() / max(1e-9, self.modelled.sum())
+    known = self.modelled > 0
+    each = np.where(known, self.measured / np.where(known, self.modelled, 1.0), mean)
     return Speed(*(each * np.array(self.core)))
 
   def see(self, done: Load, seconds: np.ndarray, wall: float) -> None:
