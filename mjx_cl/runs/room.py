@@ -3,9 +3,10 @@
   lives     sight (monitor's history, detector, residuals of `refit` steps) and a chunk of rows
   weights   of learners: parameters, moments, slow critic, what acts, and that once more in its band
   replays   of learners
+  scratch   of updates, for each core that has one, and of the compiler before the first
   trace     what is logged, and its table while it is written
 
-Lives and weights are flat in the steps of the run; a replay is not, nor is the trace.
+Lives, weights and scratch are flat in the steps of the run; a replay is not, nor is the trace.
 """
 
 from typing import NamedTuple
@@ -21,13 +22,17 @@ from mjx_cl.types import Spec
 LIFE = 200_000  # bytes of a life besides: detector, history, robot
 TRACE = 400  # bytes of a stream and control step, most of them while the table is written
 
+# bytes of an update of 4 x 64 steps of size1m. With two learners on two cores processes peaked at
+# 2.1 (car) and 2.3 GiB (quadruped), compiling included, where this says 2.5
+SCRATCH = 0.35 * 2**30
+
 
 class Room(NamedTuple):
   """Bytes.
 
   Attributes:
     lives: of robots that have not begun to learn.
-    weights: of learners.
+    weights: of learners, and scratch.
     replays: of learners.
     trace: of all streams.
     learners: streams that may learn.
@@ -77,10 +82,12 @@ def of(config: RunConfig, spec: Spec, trained: DreamerConfig, repeat: int = 1) -
   residual = 4 * (2 * len(spec.obs) + 8)
   copies = 2 + any(arm.rollback for arm in arms)
   at_once = min(learners, len(runtime.cores()))
+  size = params / 4 / 640_867 * (config.adapt.batch or trained.batch) * trained.length / (4 * 64)
+  scratch = int(at_once * SCRATCH * size / memory.GROWTH)
   more = config.parts * 8 + config.residuals * len(spec.obs)  # columns of four bytes
   return Room(
     lives * (config.adapt.refit * residual + LIFE) + rows,
-    learners * (one.weights + copies * params) + (at_once + len(agents)) * one.weights,
+    learners * (one.weights + copies * params) + (at_once + len(agents)) * one.weights + scratch,
     learners * one.replay,
     len(config.arms) * config.seeds * config.steps * (TRACE + 12 * more),
     learners,
