@@ -22,6 +22,7 @@ from typing import Annotated, Any, Union
 import tyro
 
 from mjx_cl import __version__
+from mjx_cl.adapt.arms import ARMS
 from mjx_cl.cli.flags import (
   Bench,
   Certify,
@@ -39,7 +40,7 @@ from mjx_cl.cli.flags import (
   Train,
 )
 from mjx_cl.cli.output import apart, say
-from mjx_cl.config import FaultConfig
+from mjx_cl.config import FaultConfig, quick
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.io.interrupt import Interruptible, Lasting, later
 
@@ -86,23 +87,39 @@ DO = {kind: done_by(kind, module) for kind, module in COMMANDS.items()}
 
 
 def parse(argv: list[str] | None) -> Any:
-  """Arguments -> command. tyro's framed report of a mistake becomes one line. `--version` alone
-  prints it and ends; no argument is a mistake that the help answers.
+  """Arguments -> command. `--version` alone prints it and ends; no argument is a mistake that the
+  help answers.
   """
   argv = sys.argv[1:] if argv is None else argv
   if argv == ["--version"]:
     print(f"mjx-cl {__version__}")
     raise SystemExit(0)
+  about = "Robots that notice a fault, adapt to it and know when they are done."
+  command = read(Command, argv, prog="mjx-cl", args=argv or ["--help"], description=about)
+  return quickly(command, argv[1:]) if isinstance(command, Run) and command.quick else command
+
+
+def quickly(command: Run, argv: list[str]) -> Run:
+  """`run --quick` with the flags `argv`: they override quick's defaults, and a fault of the user's
+  own comes without target and severity of quick's.
+  """
+  kind = Annotated[Run, tyro.conf.PositionalRequiredArgs]
+  defaults = quick.defaults(command.env)
+  for left_out in ((), quick.FAULT):
+    own = {name: value for name, value in defaults.items() if name not in left_out}
+    asked: Run = read(kind, argv, args=argv, default=Run(env=tyro.MISSING, **own))
+    if asked.fault == defaults.get("fault", Run.fault):
+      break
+  quick.check(asked, any(ARMS[arm].learns for arm in asked.arms if arm in ARMS))
+  return asked
+
+
+def read(kind: Any, argv: list[str], **how: Any) -> Any:
+  """What tyro makes of arguments; its framed report of a mistake becomes one line."""
   report = io.StringIO()
   try:
     with contextlib.redirect_stderr(report):
-      return tyro.cli(  # type: ignore[call-overload]
-        Command,
-        prog="mjx-cl",
-        args=argv or ["--help"],
-        description="Robots that notice a fault, adapt to it and know when they are done.",
-        config=(tyro.conf.FlagCreatePairsOff,),
-      )
+      return tyro.cli(kind, config=(tyro.conf.FlagCreatePairsOff,), **how)
   except SystemExit as e:
     if not argv:
       raise SystemExit(UserError.exit_code) from None

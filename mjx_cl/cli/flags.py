@@ -24,12 +24,15 @@ class Run(RunConfig):
 
   Attributes:
     out: Result folder.
+    quick: A whole loop in about two minutes, for a first look: other defaults of fault, seeds,
+      onset, steps and stop rule, for walker, quadruped and car.
     json: One JSON value on standard output, nothing else there.
     resume: Go on with a run that was cut off.
     overwrite: Replace an earlier run in --out.
   """
 
   out: str = "runs/latest"
+  quick: bool = False
   json: bool = False
   resume: bool = False
   overwrite: bool = False
@@ -386,7 +389,8 @@ class List:
 
 @dataclass(frozen=True)
 class Doctor:
-  """Versions, devices, physics backend, free memory and a two-second speed check.
+  """Versions, devices, physics backend, free memory, whether compiled programs are found again, and
+  a two-second speed check.
 
   Example: mjx-cl doctor --json
   """

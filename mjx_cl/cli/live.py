@@ -51,14 +51,11 @@ class RunDisplay(Display):
     console = Console(stderr=True)
     super().__init__(console, Live(console=console, refresh_per_second=2, transient=True))
     self.begin = time.monotonic()
-    self.first: tuple[float, int] | None = None
 
   def __call__(self, p: Progress) -> None:
     """Shows how far a run is, every few seconds."""
     now = time.monotonic()
-    self.first = self.first or (now, p.step)
-    rate = (p.step - self.first[1]) / max(1e-9, now - self.first[0])
-    left = clock((p.steps - p.step) / rate) if rate > 0 else "?"
+    left = "?" if p.left is None else clock(p.left)
     head = p.note or f"step {p.step:,}/{p.steps:,}  {clock(now - self.begin)} gone, {left} left"
     if self.shown:
       rewards = (f"{x:.2f}" for x in p.reward)

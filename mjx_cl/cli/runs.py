@@ -9,7 +9,7 @@ from mjx_cl.cli.flags import Bench, Run
 from mjx_cl.cli.live import RunDisplay
 from mjx_cl.cli.output import clock, emit, say
 from mjx_cl.cli.tables import show_summary
-from mjx_cl.config import RunConfig
+from mjx_cl.config import RunConfig, quick
 from mjx_cl.errors import UserError, require
 from mjx_cl.io import folders, memory
 from mjx_cl.runs import bench, costs, run, workers
@@ -19,6 +19,8 @@ from mjx_cl.runs.suite import Part, Suite, finished, pick, standing, suite
 def do_run(args: Run) -> None:
   """Lives the loop and prints its table."""
   config = RunConfig(**{f.name: getattr(args, f.name) for f in dataclasses.fields(RunConfig)})
+  if args.quick:
+    say(f"note: {quick.said(config)}")
   with RunDisplay() as display:
     summary = run.execute(config, args.out, args.resume, args.overwrite, display, tell=say)
   if args.keep and not pathlib.Path(args.out, "agents").is_dir():

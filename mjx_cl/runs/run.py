@@ -98,6 +98,7 @@ def execute(
     f"{len(config.arms) * config.seeds} streams of {config.steps:,} control steps; what is not "
     "compiled yet is compiled first, a minute or two"
   )
+  tell(str(runner.room))
   last = live(runner, progress, save_every_s)
   return finish(runner, lambda text: last and progress(last._replace(note=text)))
 

@@ -25,9 +25,12 @@ from mjx_cl.io import arrays, checkpoints, runtime
 from mjx_cl.keys import OfSeed
 from mjx_cl.rollout.scan import Rollout, Row, nest, start
 from mjx_cl.rollout.transfer import Transfer
+from mjx_cl.runs import room
+from mjx_cl.runs.clock import clock_of, counted, sorted_out
 from mjx_cl.runs.identity import arm_agents, identity
 from mjx_cl.runs.lives import Lives, Settled
 from mjx_cl.runs.loops import make_loop
+from mjx_cl.runs.outlook import Standing
 from mjx_cl.runs.records import acts
 from mjx_cl.runs.settings import check
 from mjx_cl.runs.snapshots import Snapshots
@@ -52,6 +55,7 @@ class Progress(NamedTuple):
     alarms: int (groups,), so far.
     updates: int (groups,), so far.
     note: what else is under way.
+    left: seconds to the end, None: not known yet.
   """
 
   step: int
@@ -64,6 +68,7 @@ class Progress(NamedTuple):
   alarms: np.ndarray
   updates: np.ndarray | jax.Array
   note: str = ""
+  left: float | None = None
 
 
 class Runner:
@@ -119,6 +124,9 @@ class Runner:
       learns=learners > 0,
     )
     self.choices = self._choices()
+    learner = (self.env.spec, self.trained.agent.config, self.repeat)
+    self.clock = clock_of(config, *learner, self.stops)
+    self.room = room.of(config, *learner)
     # what has been lived
     self.done_chunks = 0
     self.seconds = dict.fromkeys(KINDS, 0.0)
@@ -154,10 +162,11 @@ class Runner:
   def step(self) -> Progress:
     """Lives one chunk and logs it."""
     begin, physics, compiled = time.perf_counter(), self._physics_seconds(), self.lives.compiled
+    done, learner = counted(self.lives), np.isin(range(self.groups), list(self.lives.place))
     now = (self.done_chunks + 1) * self.chunk_steps
     rows, digest, seconds = self.lives.step(now, functools.partial(self._settle, now))
     lived = time.perf_counter()
-    before = self._phase
+    before, updates = self._phase, digest.updates - self._updates
     self._log(rows, digest)
     self._updates = digest.updates
     self._alarms = self._alarms + digest.fired.sum(0)
@@ -168,6 +177,11 @@ class Runner:
     physics, compiled = self._physics_seconds() - physics, self.lives.compiled - compiled
     self._account(lived - begin, seconds, physics, compiled)
     self.seconds["other"] += time.perf_counter() - lived
+    if not compiled:
+      one = lambda x: np.array([float(x)])
+      done = done._replace(updates=one(updates.sum()), longest=one(updates.max()))
+      each = sorted_out(seconds, learner, updates)
+      self.clock.see(done, each, time.perf_counter() - begin)
     arms, seeds = map(list, zip(*self.labels))
     return Progress(
       min(now, self.config.steps),
@@ -179,7 +193,16 @@ class Runner:
       digest.signals[:, phase_lib.SIGNALS.index("reward")],
       self._alarms,
       digest.updates,
+      left=self.clock.left(now, self._stands(digest), self.lives.compiled),
     )
+
+  def _stands(self, digest: Digest) -> list[Standing]:
+    """How each stream stands after a chunk."""
+    begun = [g in self.lives.place and int(digest.since[g]) > 0 for g in range(self.groups)]
+    return [
+      Standing(int(phase), int(since) if yes else -1)
+      for phase, since, yes in zip(digest.phase, digest.since, begun)
+    ]
 
   def _account(self, wall: float, seconds: np.ndarray, physics: float, compiled: float) -> None:
     """Adds a chunk's seconds of wall time, shared among kinds of work and streams as the cores'

@@ -135,7 +135,13 @@ def test_run_takes_every_setting_of_a_run():
   )
   assert given.env == "car" and given.settings == {"a": 1, "b": "x"} and given.arms == ("none",)
   assert given.target is None and given.adapt.ratio == 2.0
-  flags = {f.name for f in dataclasses.fields(app.Run)} - {"out", "json", "resume", "overwrite"}
+  flags = {f.name for f in dataclasses.fields(app.Run)} - {
+    "out",
+    "quick",
+    "json",
+    "resume",
+    "overwrite",
+  }
   assert flags == {f.name for f in dataclasses.fields(RunConfig)}
 
 

@@ -29,7 +29,7 @@ from mjx_cl.envs.walker import Walker
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.io import tables
 from mjx_cl.render import figures
-from mjx_cl.runs import run, workers
+from mjx_cl.runs import run, runner, workers
 from mjx_cl.runs.run import ledger_of
 from mjx_cl.runs.runner import KINDS
 from mjx_cl.scoring import events, intervals
@@ -971,3 +971,28 @@ def test_eval_sums_the_rewards_of_one_episode_each(saved, short_walker, monkeypa
     result["return_ci"][0] <= result["return_iqm"] <= result["return_ci"][1]
     and result["terminations"] == 0
   )
+
+
+# ---- time left -----------------------------------------------------------------------------------
+
+
+def test_time_left_is_known_from_the_first_chunk_without_compiling(saved, tmp_path, monkeypatch):
+  """It counts the chunks that are left at the speed of those that were lived, and ends at 0."""
+  monkeypatch.setitem(envs.ENVS, "walker", Easy)
+  now = [0.0]
+  monkeypatch.setattr(runner.time, "perf_counter", lambda: now[0])
+  seen = []
+  config = RunConfig("walker", agent=str(saved), seeds=1, arms=("none",), steps=640, onset=600)
+  lives = runner.Runner(config, tmp_path / "run")
+
+  def step(end, settle, own=lives.lives.step):
+    out = own(end, settle)
+    now[0] += 3.0
+    return out._replace(seconds=np.array([[2.0, 4.0, 0.0]]))
+
+  monkeypatch.setattr(lives.lives, "step", step)
+  while not lives.done:
+    seen.append(lives.step().left)
+  first = next(k for k, left in enumerate(seen) if left is not None)
+  assert first <= 1 and seen[-1] == 0.0
+  assert seen[first:] == pytest.approx([3.0 * (9 - k) for k in range(first, 10)], rel=0.05)

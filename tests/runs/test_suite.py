@@ -19,9 +19,10 @@ from test_transfer import agent, saved  # noqa: F401  fixtures: a tiny agent of 
 from mjx_cl.adapt.arms import ARMS, NEVER
 from mjx_cl.config import CHUNK, AdaptConfig, RunConfig
 from mjx_cl.errors import FileError, UserError
+from mjx_cl.faults.presets import becomes
 from mjx_cl.io import folders, memory, tables
 from mjx_cl.render import figures
-from mjx_cl.runs import bench, costs, loops, merge, run, scores, settings
+from mjx_cl.runs import bench, clock, costs, loops, merge, outlook, run, scores, settings
 from mjx_cl.runs import suite as suites
 from mjx_cl.scoring import stop_rule
 
@@ -310,12 +311,13 @@ def test_updates_of_the_plan():
       arms=(arm,),
       stops="told" if ARMS[arm].end.told else None,
     )
-    steps = sum(costs.finetunings(own, arm))
+    steps = sum(outlook.finetunings(own, arm))
     assert 0 <= steps <= 19_000 and (steps == 0) == (
       ARMS[arm].trigger is NEVER or not ARMS[arm].breaks
     )
+  compiling = clock.COMPILE_S + clock.COMPILE_LEARNER_S
   slow, quick = (
-    costs.estimate(suites.Part("a", c), rate, costs.Robots()).seconds - costs.COMPILE_S
+    costs.estimate(suites.Part("a", c), rate, costs.Robots()).seconds - compiling
     for rate in (1e11, 2e11)
   )
   assert slow == pytest.approx(2 * quick)
@@ -332,20 +334,20 @@ def test_finetunings_of_the_plan():
     steps=28_000,
     arms=("detector", "oracle", "oracle-budget", "no-fault"),
   )
-  walker = costs.ADAPTS["walker"]
-  assert [costs.finetunings(twice, arm) for arm in twice.arms] == [
+  walker = outlook.ADAPTS["walker"]
+  assert [outlook.finetunings(twice, arm) for arm in twice.arms] == [
     [walker, walker, 3000],
     [walker, 3000],
     [19_000, 3000],
     [],
   ]  # broken, repaired, broken at 5,000, 15,000, 25,000
-  assert costs.finetunings(twice, "oracle-budget", most=700) == [700, 700]
-  assert costs.finetunings(RunConfig("walker", fault="any/all-easy"), "detector") == [
+  assert outlook.finetunings(twice, "oracle-budget", most=700) == [700, 700]
+  assert outlook.finetunings(RunConfig("walker", fault="any/all-easy"), "detector") == [
     walker
   ]  # six faults at once
-  assert costs.finetunings(
+  assert outlook.finetunings(
     RunConfig("walker", severity=0.0), "detector"
-  ) == [] and costs.finetunings(RunConfig("walker", onset=200), "detector") == [walker]
+  ) == [] and outlook.finetunings(RunConfig("walker", onset=200), "detector") == [walker]
   car = RunConfig(
     "car",
     fault="car/transfer-then-socks",
@@ -353,7 +355,7 @@ def test_finetunings_of_the_plan():
     steps=64_000,
     adapt=AdaptConfig(budget=40_000),
   )
-  assert costs.finetunings(car, "detector") == [costs.ADAPTS["car_real"], 12_000]
+  assert outlook.finetunings(car, "detector") == [outlook.ADAPTS["car_real"], 12_000]
 
 
 PLANNED = [
@@ -397,7 +399,7 @@ def test_lengths_of_finetunings_are_those_of_the_published_suites():
   ):
     for part in published(suite).parts:
       if (RESULTS / suite / part.name / "events.parquet").exists():
-        own = lengths.setdefault(costs.becomes(part.config) or part.config.env, [])
+        own = lengths.setdefault(becomes(part.config) or part.config.env, [])
         own += [
           (part.config.steps if s["stop"] is None else s["stop"] + 1) - s["since"]
           for s in stop_rule.spans(tables.read_rows(RESULTS / suite / part.name / "events.parquet"))
@@ -405,7 +407,7 @@ def test_lengths_of_finetunings_are_those_of_the_published_suites():
         ]
   assert {
     robot: pytest.approx(np.mean(own), rel=0.1) for robot, own in lengths.items()
-  } == costs.ADAPTS
+  } == outlook.ADAPTS
 
 
 def published(folder):
