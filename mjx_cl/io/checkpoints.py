@@ -135,10 +135,7 @@ class Checkpoints:
       raise FileError(f"no checkpoint in {self.folder}")
     for number in numbers:
       try:
-        own = like
-        if callable(like):
-          only = ocp.args.Composite(meta=ocp.args.JsonRestore())
-          own = like(self._manager.restore(number, args=only)["meta"])
+        own = like(self._meta(number)) if callable(like) else like
         packed = pack(own)
         stored = _dtypes(
           ocp.PyTreeCheckpointHandler().metadata(self.folder / str(number) / "tree").tree
@@ -182,6 +179,11 @@ class Checkpoints:
     del out  # the arrays are held once
     free(leaves, jax.tree.leaves(packed))
     return unpack(jax.tree.unflatten(structure, leaves), own), meta
+
+  def _meta(self, number: int) -> dict[str, Any]:
+    """The JSON dict of one."""
+    only = ocp.args.Composite(meta=ocp.args.JsonRestore())
+    return self._manager.restore(number, args=only)["meta"]
 
   def _set_aside(self, numbers: list[int]) -> None:
     """Renames the folders of broken checkpoints to NUMBER.broken (.broken-2, ... where that

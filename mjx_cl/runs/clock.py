@@ -10,7 +10,8 @@ from mjx_cl.config import CHUNK, DreamerConfig, RunConfig
 from mjx_cl.faults.presets import becomes
 from mjx_cl.io import runtime
 from mjx_cl.runs import outlook, work
-from mjx_cl.runs.lives import BAND, Lives
+from mjx_cl.runs.groups import BAND
+from mjx_cl.runs.lives import Lives
 from mjx_cl.runs.outlook import Standing
 from mjx_cl.runs.work import Learner, Load, Speed
 from mjx_cl.training import needs

@@ -15,139 +15,37 @@ share the work. On an accelerator all streams are one band from the start.
 from __future__ import annotations
 
 import concurrent.futures
-import dataclasses
 import functools
 import time
 from collections.abc import Callable, Hashable, Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_cl.adapt import decide
-from mjx_cl.adapt.choices import Choices
 from mjx_cl.adapt.loop import Loop, Once
-from mjx_cl.adapt.state import LATER, ROWS, Digest, Frozen, LoopState, cut, glue
+from mjx_cl.adapt.state import ROWS, Digest, Frozen, LoopState, cut, glue
 from mjx_cl.adapt.watch import Minds
-from mjx_cl.config import CHUNK, AdaptConfig
+from mjx_cl.config import CHUNK
 from mjx_cl.dreamer.agent import TrainState
 from mjx_cl.io.runtime import cores
 from mjx_cl.rollout.scan import Row
+from mjx_cl.runs.groups import (
+  BAND,
+  HERD,
+  WORK,
+  Band,
+  Chunk,
+  Herd,
+  Settle,
+  Told,
+  departs,
+  row_of,
+  slim,
+)
 
-HERD, BAND = 8, 4
 MANY = 4  # groups for each core, above which a group is seen to as a whole
-LOGGED = ("rewards", "severity", "severities", "episode", "terminated", "truncated", "final_obs")
-WORK = ("acting", "monitor", "updates")  # kinds of work, in the order in which a stream has them
-
-
-class Settled(NamedTuple):
-  """What holds for one stream in a chunk.
-
-  Attributes:
-    choices: of its arm, leading (1,).
-    acceptance: float32 (1,), of its robot, or None: that of the environment.
-  """
-
-  choices: Choices
-  acceptance: Any
-
-
-@dataclasses.dataclass
-class Herd:
-  """Lives under one set of weights.
-
-  Attributes:
-    lives: their names.
-    train: the agent.
-    minds: what it acts and judges by, leading (1,).
-    streams: robots, leading (1, HERD).
-    frozen: of each life.
-  """
-
-  lives: list[Hashable]
-  train: TrainState
-  minds: Minds
-  streams: Any
-  frozen: list[Frozen]
-
-
-@dataclasses.dataclass
-class Band:
-  """Learners.
-
-  Attributes:
-    who: number of the stream in each lane, fewer than lanes where there is room.
-    streams: robots, leading (lanes, 1).
-    loops: LoopStates, of one stream each; on an accelerator one of all.
-    acting: weights, leading (lanes,); None: to be put together.
-  """
-
-  who: list[int]
-  streams: Any
-  loops: list[LoopState]
-  acting: Any = None
-
-
-class Chunk(NamedTuple):
-  """What a chunk brought.
-
-  Attributes:
-    rows: Row leading (T, streams, 1), NumPy, of the fields LOGGED; the others are None.
-    digest: Digest, NumPy.
-    seconds: float (streams, 3), of each kind of WORK, on one core; lives that several streams
-      share are shared out.
-  """
-
-  rows: Row
-  digest: Digest
-  seconds: np.ndarray
-
-
-def departs(
-  fired: np.ndarray,
-  phase: int,
-  choices: Choices,
-  now: int,
-  repeat: int,
-  config: AdaptConfig,
-) -> bool:
-  """Whether a stream begins an adaptation, as decide.starts and decide.update say it.
-
-  Args:
-    fired: bool (T,), alarms of the chunk's rows.
-    phase: of the stream.
-    choices: of its arm, leading (1,).
-    now: control steps done after the chunk.
-    repeat: control steps of a row.
-    config: AdaptConfig.
-  """
-  if phase != decide.NOMINAL or now <= config.warmup:
-    return False
-  opened = now - len(fired) * repeat
-  at = np.asarray(choices.at)
-  due = ((at >= max(opened, config.warmup)) & (at < now)).any()
-  known = opened + (np.arange(len(fired)) + 1) * repeat - 1
-  heard = bool(np.asarray(choices.listens)[0]) and (fired & (known >= config.warmup)).any()
-  return bool(due or heard)
-
-
-class Told(NamedTuple):
-  """What became of a chunk of streams that share a state.
-
-  Attributes:
-    streams: number -> (rows, digest), NumPy, each with one stream.
-    left: number -> (state, robot) of those that have begun to learn.
-    seconds: of watching and of learning.
-  """
-
-  streams: dict[int, tuple[Row, Digest]]
-  left: dict[int, tuple[LoopState, Any]]
-  seconds: tuple[float, float]
-
-
-# (stream, its robot after the chunk with leading (1, 1), on demand) -> Settled
-Settle = Callable[[int, Callable[[], Any]], Settled]
 
 
 class Lives:
@@ -162,7 +60,7 @@ class Lives:
     keys: of the streams, for all but their robots.
     rollback: an arm goes back, see act.Before.
     together: all streams are one band from the start; None: on an accelerator.
-    learns: something may start an adaptation.
+    ahead: what a first departure needs is compiled beside the first chunks.
   """
 
   def __init__(
@@ -175,7 +73,7 @@ class Lives:
     keys: jax.Array,
     rollback: bool = False,
     together: bool | None = None,
-    learns: bool = True,
+    ahead: bool = False,
   ) -> None:
     self.rollout, self.loop, self.keys = rollout, loop, keys
     self.trains, self.rollback, self.streams = list(trains), rollback, len(trains)
@@ -188,7 +86,7 @@ class Lives:
     self.sharing: dict[Hashable, list[int]] = {}  # life -> streams that live it still
     # what compiles beside the first chunks what the first departure will need
     self._ahead: concurrent.futures.Future | None = None
-    self._learns = learns and not together
+    self._due_ahead = ahead and not together
     live = lambda *given: rollout.chunk(*given, CHUNK)
     self._live = {Herd: Once(live), Band: Once(live)}
     self._programs = (*self._live.values(), *loop.programs)
@@ -197,12 +95,12 @@ class Lives:
       stack = jax.tree.map(lambda *x: jnp.stack(x), *trains)
       # `before` is written at every start, before it is read
       state = state._replace(train=stack, acting=jax.tree.map(jnp.copy, stack.params))
-      self._settle_down([Band(list(range(self.streams)), streams, [state])])
+      self.settle_down([Band(list(range(self.streams)), streams, [state])])
     else:
       for g, own in enumerate(life):
         self.sharing.setdefault(own, []).append(g)
       self._gather(streams)
-    self._robot = jax.tree.map(lambda x: x[:1], streams)
+    self.robot = jax.tree.map(lambda x: x[:1], streams)
 
   def _gather(self, streams: Any) -> None:
     """Herds of all lives."""
@@ -218,7 +116,8 @@ class Lives:
         frozen = [self.loop.frozen() for _ in lives]
         self.herds.append(Herd(lives, train, minds, robots, frozen))
 
-  def _settle_down(self, bands: list[Band]) -> None:
+  def settle_down(self, bands: list[Band]) -> None:
+    """Takes `bands` as those of all learners."""
     self.bands = bands
     self.place = {g: (band, lane) for band in bands for lane, g in enumerate(band.who)}
     for life, who in self.sharing.items():
@@ -275,12 +174,12 @@ class Lives:
       seconds[who] = np.array((acting, *look.seconds)) / len(who)
     for g in sorted(left):
       self._join(g, *left[g])
-    if self._ahead is None and self._learns and self.herds:
+    if self._ahead is None and self._due_ahead and self.herds:
       self._compile_ahead(now, settle)
     rows, digests = zip(*(told[g] for g in range(self.streams)))
     join = lambda name: np.concatenate([getattr(r, name) for r in rows], 1)
     logged = [None if x is None else join(name) for name, x in rows[0]._asdict().items()]
-    return Chunk(_row(logged), glue(list(digests), ROWS), seconds)
+    return Chunk(row_of(logged), glue(list(digests), ROWS), seconds)
 
   def _all(
     self, groups: list[Herd | Band], now: int, settle: Settle
@@ -350,8 +249,8 @@ class Lives:
       unknown = np.full(1, np.nan, np.float32)
       digest = digest._replace(back=np.zeros(1, bool), earned=unknown, earns=unknown)
     digest = jax.tree.map(np.asarray, digest)
-    slim = _slim(rows)
-    told, left = {g: (slim, digest) for g in who}, {}
+    few = slim(rows)
+    told, left = {g: (few, digest) for g in who}, {}
     watched = time.perf_counter()
     robot = functools.cache(lambda: jax.tree.map(lambda x: x[:, lane : lane + 1], herd.streams))
     for g in who:
@@ -365,7 +264,7 @@ class Lives:
           state, seen, own, rows, step, settled.choices, keys, settled.acceptance
         )
         left[g] = jax.block_until_ready(state), robot()
-        told[g] = slim, jax.tree.map(np.asarray, new)
+        told[g] = few, jax.tree.map(np.asarray, new)
     return Told(told, left, (watched - begin, time.perf_counter() - watched))
 
   def _watch_band(self, band: Band, k: int, rows: Row, now: int, settle: Settle) -> Told:
@@ -388,7 +287,7 @@ class Lives:
     one = lambda i: Digest(
       *(cut(v, slice(i, i + 1), int(k in ROWS)) for k, v in digest._asdict().items())
     )
-    told = {g: (cut(_slim(rows), slice(i, i + 1), 1), one(i)) for i, g in enumerate(who)}
+    told = {g: (cut(slim(rows), slice(i, i + 1), 1), one(i)) for i, g in enumerate(who)}
     return Told(told, {}, (watched - begin, time.perf_counter() - watched))
 
   def _join(self, g: int, loop: LoopState, robot: Any) -> None:
@@ -403,7 +302,7 @@ class Lives:
     band.who.append(g)
     band.loops.append(loop)
     band.acting = None
-    self._settle_down(self.bands)
+    self.settle_down(self.bands)
 
   def _compile_ahead(self, now: int, settle: Settle) -> None:
     """On a thread: the programs of a learner, on a departure that leads nowhere."""
@@ -420,7 +319,14 @@ class Lives:
       seen, sight = self.loop.watch(herd.minds, frozen.sight, rows, jnp.int32(now), keys)
       state = self.loop.init(herd.train, 1, self.rollback)._replace(**sight._asdict())
       programs.learn.warm(
-        state, seen, rows, jnp.int32(now), settled.choices, keys, settled.acceptance, self.loop.config
+        state,
+        seen,
+        rows,
+        jnp.int32(now),
+        settled.choices,
+        keys,
+        settled.acceptance,
+        self.loop.config,
       )
       spread = lambda x: jnp.concatenate([x] * self.band_size)
       params = jax.tree.map(lambda x: jnp.stack([x] * self.band_size), herd.train.params)
@@ -429,92 +335,3 @@ class Lives:
     pool = concurrent.futures.ThreadPoolExecutor(1, "ahead")
     self._ahead = pool.submit(ahead)
     pool.shutdown(wait=False)
-
-  # ---- checkpoints -------------------------------------------------------------------------------
-
-  def pack(self) -> tuple[dict, list[list[int]]]:
-    """What a checkpoint holds, NumPy but for the robots, and the streams of each band."""
-    frozen = [life for herd in self.herds for life in herd.frozen]
-    loops = [loop for band in self.bands for loop in band.loops]
-    robots = [herd.streams for herd in self.herds] + [band.streams for band in self.bands]
-    tree: dict[str, Any] = {"robots": robots}
-    if frozen:
-      tree["sight"] = glue([life.sight for life in frozen], LATER)
-      tree["phase"] = glue([life.phase for life in frozen], ())
-    if loops:
-      tree["replays"] = [loop.replay for loop in loops]
-      tree["learners"] = _held(glue([loop._replace(replay=None) for loop in loops], LATER))
-    return tree, [band.who for band in self.bands]
-
-  def like(self, who: list[list[int]]) -> dict:
-    """Shapes of what `pack` gives with bands of the streams `who`."""
-    tree, _ = self.pack()
-    spread = lambda x: jnp.concatenate([x] * self.band_size)
-    tree["robots"] = [herd.streams for herd in self.herds]
-    tree["robots"] += [jax.tree.map(spread, self._robot) for _ in who]
-    if who:
-      begin = functools.partial(self.loop.init, groups=self.width, rollback=self.rollback)
-      state = jax.eval_shape(begin, self.trains[0])
-      number = sum(len(own) for own in who) // self.width
-      tree["replays"] = [state.replay] * number
-      fields = state._replace(replay=None)._asdict().items()
-      tree["learners"] = _held(LoopState(*(_wider(v, number, name) for name, v in fields)))
-    return tree
-
-  def unpack(self, tree: dict, who: list[list[int]]) -> None:
-    """Goes on from what `pack` gave."""
-    robots = iter(tree["robots"])
-    at = 0
-    for herd in self.herds:
-      herd.streams, first, at = next(robots), at, at + len(herd.lives)
-      herd.frozen = [
-        Frozen(_part(tree["sight"], i, 1), cut(tree["phase"], slice(i, i + 1), 0))
-        for i in range(first, at)
-      ]
-      herd.frozen = jax.tree.map(jnp.asarray, herd.frozen)
-    loops = [
-      jax.tree.map(
-        jnp.asarray,
-        _part(LoopState(**tree["learners"], replay=None), k, self.width)._replace(replay=replay),
-      )
-      for k, replay in enumerate(tree.get("replays", []))
-    ]
-    bands = []
-    for members in who:
-      number = len(members) // self.width
-      bands.append(Band(list(members), next(robots), loops[:number]))
-      del loops[:number]
-    self._settle_down(bands)
-
-
-def _held(state: LoopState) -> dict:
-  """Its fields by name, without those that this run has no use for."""
-  return {name: value for name, value in state._asdict().items() if value is not None}
-
-
-def _wider(tree: Any, number: int, name: str) -> Any:
-  """Shapes of `number` states' field `name` side by side."""
-  axis = int(name in LATER)
-  wide = lambda x: jax.ShapeDtypeStruct(
-    x.shape[:axis] + (number * x.shape[axis],) + x.shape[axis + 1 :], x.dtype
-  )
-  return jax.tree.map(wide, tree)
-
-
-def _part(state: Any, k: int, width: int) -> Any:
-  """State k of several side by side, of `width` streams each."""
-  at = slice(k * width, (k + 1) * width)
-  host = lambda tree: jax.tree.map(np.asarray, tree)
-  return type(state)(
-    *(cut(host(value), at, int(name in LATER)) for name, value in state._asdict().items())
-  )
-
-
-def _slim(rows: Row) -> Row:
-  """Of the fields LOGGED; the others are None."""
-  return _row([x if name in LOGGED else None for name, x in rows._asdict().items()])
-
-
-def _row(fields: list[Any]) -> Row:
-  """A Row, of which some fields may be None."""
-  return Row(*fields)

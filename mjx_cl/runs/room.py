@@ -14,7 +14,8 @@ from typing import NamedTuple
 from mjx_cl.adapt.arms import ARMS
 from mjx_cl.config import CHUNK, DreamerConfig, RunConfig
 from mjx_cl.io import memory, runtime
-from mjx_cl.runs.lives import HERD, MANY
+from mjx_cl.runs.groups import HERD
+from mjx_cl.runs.lives import MANY
 from mjx_cl.runs.loops import capacity
 from mjx_cl.training import needs
 from mjx_cl.types import Spec

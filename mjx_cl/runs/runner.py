@@ -25,10 +25,11 @@ from mjx_cl.io import arrays, checkpoints, runtime
 from mjx_cl.keys import OfSeed
 from mjx_cl.rollout.scan import Rollout, Row, nest, start
 from mjx_cl.rollout.transfer import Transfer
-from mjx_cl.runs import room
+from mjx_cl.runs import packing, room
 from mjx_cl.runs.clock import clock_of, counted, sorted_out
+from mjx_cl.runs.groups import Settled
 from mjx_cl.runs.identity import arm_agents, identity
-from mjx_cl.runs.lives import Lives, Settled
+from mjx_cl.runs.lives import Lives
 from mjx_cl.runs.loops import make_loop
 from mjx_cl.runs.outlook import Standing
 from mjx_cl.runs.records import acts
@@ -38,6 +39,7 @@ from mjx_cl.runs.trace import at_end, columns
 from mjx_cl.scoring import stop_rule
 from mjx_cl.training import agents
 
+SOON = 16  # chunks: of a shorter run nothing is compiled before it is needed
 KINDS = ("physics", "acting", "monitor", "updates", "compiling", "other")  # of wall time
 
 
@@ -106,23 +108,7 @@ class Runner:
     self.breaks = np.asarray([ARMS[arm].breaks for arm, _ in self.labels])
     self.chunk_steps = CHUNK * self.repeat
     self.chunks = -(-config.steps // self.chunk_steps)
-    # what moves them
-    keys = jnp.stack([jax.random.key(seed) for _, seed in self.labels])[:, None]
-    self.keys = jax.vmap(lambda k: jax.random.fold_in(k, OfSeed.ADAPTATION))(keys[:, 0])
-    self.rollout, begin = self._rollout(plan, target)
-    learners = sum(ARMS[arm].learns for arm, _ in self.labels)
-    self.loop = make_loop(config, self.robots, self.trained, learners, programs)
-    trains = [self.others.get(arm, self.trained).train for arm, _ in self.labels]
-    self.lives = Lives(
-      self.rollout,
-      self.loop,
-      jax.jit(nest(begin, (0, 0), (0, None)))(keys, jnp.asarray(self.breaks)),
-      trains,
-      [(id(t), bool(b), seed) for t, b, (_, seed) in zip(trains, self.breaks, self.labels)],
-      self.keys,
-      any(arm.rollback for arm in arms),
-      learns=learners > 0,
-    )
+    self._begin(plan, target, programs)
     self.choices = self._choices()
     learner = (self.env.spec, self.trained.agent.config, self.repeat)
     self.clock = clock_of(config, *learner, self.stops)
@@ -139,6 +125,25 @@ class Runner:
     if config.snapshots:
       what = (self.robots[-1], self.trained, self.faults, self.changes, self.labels)
       self.snapshots = Snapshots(config, *what, self.work / "snapshots")
+
+  def _begin(self, plan: faults.Plan, target: Any, programs: Programs | None) -> None:
+    """What moves the streams, and the streams before their first step."""
+    keys = jnp.stack([jax.random.key(seed) for _, seed in self.labels])[:, None]
+    self.keys = jax.vmap(lambda k: jax.random.fold_in(k, OfSeed.ADAPTATION))(keys[:, 0])
+    self.rollout, begin = self._rollout(plan, target)
+    learners = sum(ARMS[arm].learns for arm, _ in self.labels)
+    self.loop = make_loop(self.config, self.robots, self.trained, learners, programs)
+    trains = [self.others.get(arm, self.trained).train for arm, _ in self.labels]
+    self.lives = Lives(
+      self.rollout,
+      self.loop,
+      nest(begin, (0, 0), (0, None))(keys, jnp.asarray(self.breaks)),
+      trains,
+      [(id(t), bool(b), seed) for t, b, (_, seed) in zip(trains, self.breaks, self.labels)],
+      self.keys,
+      any(ARMS[arm].rollback for arm in self.config.arms),
+      ahead=learners > 0 and self.chunks > SOON,
+    )
 
   def _rollout(self, plan: faults.Plan, target: Any) -> tuple[Any, Callable[..., Any]]:
     """The rollout, and what begins a stream of it, given its key and whether its robot breaks."""
@@ -324,7 +329,7 @@ class Runner:
     if self.checkpoints.latest() == number:
       return
     begin = time.perf_counter()
-    tree, bands = self.lives.pack()
+    tree, bands = packing.pack(self.lives)
     arrays.write(self.work / f"trace-{number:06d}.npz", self.trace())
     self.seconds["other"] += time.perf_counter() - begin
     meta = {
@@ -350,7 +355,7 @@ class Runner:
     if self.checkpoints.latest() is None:
       return
     tree, meta = self.checkpoints.load(self._like)
-    self.lives.unpack(tree, meta["bands"])
+    packing.unpack(self.lives, tree, meta["bands"])
     number = self.checkpoints.latest() or 0  # a broken one has been set aside
     self.parts = [arrays.read(self.work / f"trace-{number:06d}.npz")]
     self.done_chunks = number
@@ -363,7 +368,7 @@ class Runner:
     """Shapes of a checkpoint's tree."""
     if "bands" not in meta:
       raise FileError("it names no bands of learners, as those of an earlier version")
-    return self.lives.like(meta["bands"])
+    return packing.like(self.lives, meta["bands"])
 
   @property
   def done(self) -> bool:

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mjx_cl.config import CHUNK, AdaptConfig
-from mjx_cl.runs.lives import BAND, HERD
+from mjx_cl.runs.groups import BAND, HERD
 
 # core seconds of size1m, where RATE FLOP/s are two quiet cores' dense float32 products: per stream
 # and control step, physics apart

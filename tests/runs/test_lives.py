@@ -16,7 +16,7 @@ from mjx_cl.config import CHUNK, FOREVER, AdaptConfig, RunConfig
 from mjx_cl.errors import FileError
 from mjx_cl.io.checkpoints import Checkpoints
 from mjx_cl.rollout.scan import Rollout
-from mjx_cl.runs import lives, run
+from mjx_cl.runs import groups, lives, packing, run
 from mjx_cl.runs import runner as runner_lib
 from mjx_cl.training import agents
 
@@ -204,7 +204,7 @@ def test_how_the_work_is_shared_changes_nothing(make, monkeypatch, same, changes
     monkeypatch.setattr(lives, "MANY", changes["many"])
   other = live(make(**asked), 5)
   assert len(plain.lives.place) == 4 and same(plain.trace(), other.trace())
-  (one, bands), (two, again) = plain.lives.pack(), other.lives.pack()
+  (one, bands), (two, again) = packing.pack(plain.lives), packing.pack(other.lives)
   assert bands == again and same(host(one), host(two))
 
 
@@ -258,7 +258,9 @@ def test_all_streams_as_one_band_decide_alike(make, monkeypatch, same, tmp_path)
   again.open()
   again.resume()
   live(again, 2)
-  assert same(again.trace(), two) and same(host(again.lives.pack()[0]), host(other.lives.pack()[0]))
+  assert same(again.trace(), two) and same(
+    host(packing.pack(again.lives)[0]), host(packing.pack(other.lives)[0])
+  )
   again.checkpoints.close()
 
 
@@ -302,7 +304,7 @@ def test_a_stream_departs_where_the_phase_machine_starts(repeat):
       None,
     )
     want = bool(starts(fired, jnp.int32(phase), chosen, jnp.int32(now), own))
-    assert lives.departs(fired, phase, chosen, now, repeat, own) == want, (now, fired, at, own)
+    assert groups.departs(fired, phase, chosen, now, repeat, own) == want, (now, fired, at, own)
     seen.append(want)
   assert 0.1 < np.mean(seen) < 0.9
 
@@ -320,11 +322,11 @@ def test_a_run_that_was_cut_off_ends_as_the_whole_one(make, whole, same, learner
   again.open()
   again.resume()
   assert len(again.lives.place) == learners and again.done_chunks < CHUNKS
-  assert len(again.lives.bands) == -(-learners // lives.BAND)
+  assert len(again.lives.bands) == -(-learners // groups.BAND)
   live(again, CHUNKS - again.done_chunks)
   again.checkpoints.close()
   assert same(again.trace(), runner.trace())
-  (tree, bands), (want, whose) = again.lives.pack(), runner.lives.pack()
+  (tree, bands), (want, whose) = packing.pack(again.lives), packing.pack(runner.lives)
   assert bands == whose and same(host(tree), host(want))
 
 
@@ -336,12 +338,14 @@ def test_shapes_are_those_of_what_is_packed(make, learners, rollback):
   for g in range(5, 5 + learners):
     robot = jax.tree.map(one, runner.lives.herds[0].streams)
     runner.lives._join(g, runner.loop.init(runner.trained.train, 1, rollback), robot)
-  tree, bands = runner.lives.pack()
+  tree, bands = packing.pack(runner.lives)
   assert bands == [list(range(5, 5 + learners))[k : k + 4] for k in range(0, learners, 4)]
   shapes = lambda tree: jax.tree.map(lambda x: (x.shape, str(x.dtype)), tree)
-  assert shapes(empty.lives.like(bands)) == shapes(tree)
-  empty.lives.unpack(tree, bands)
-  assert shapes(empty.lives.pack()[0]) == shapes(tree) and empty.lives.pack()[1] == bands
+  assert shapes(packing.like(empty.lives, bands)) == shapes(tree)
+  packing.unpack(empty.lives, tree, bands)
+  assert (
+    shapes(packing.pack(empty.lives)[0]) == shapes(tree) and packing.pack(empty.lives)[1] == bands
+  )
   assert sorted(empty.lives.place) == list(range(5, 5 + learners))
 
 
@@ -353,7 +357,7 @@ def test_a_checkpoint_of_an_earlier_version_is_refused_in_a_line(make, tmp_path,
   runner.save()
   runner.checkpoints.close()
   old = Checkpoints(tmp_path / "out" / "work" / "checkpoints")
-  kept, meta = runner.lives.pack()[0], {"seconds": runner.seconds}
+  kept, meta = packing.pack(runner.lives)[0], {"seconds": runner.seconds}
   old.save(2, kept if tree == "the same" else {"loop": np.zeros(3)}, meta)
   old.close()
   shutil.rmtree(old.folder / "1")
