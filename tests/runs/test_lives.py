@@ -251,7 +251,7 @@ def test_all_streams_as_one_band_decide_alike(make, monkeypatch, same, tmp_path)
   one, two = plain.trace(), other.trace()
   for name in ("phase", "updates", "episode", "valid"):
     assert same(one[name], two[name]), name
-  start = 2 * CHUNK  # before anything has been learnt
+  start = CHUNK  # after twice as many a walker on the floor makes 0.2 % of a last bit
   for name in ("reward", "opr", "rpr"):
     np.testing.assert_allclose(one[name][:start], two[name][:start], rtol=1e-3, atol=1e-3)
   other.checkpoints.close()
