@@ -13,11 +13,23 @@ import threading
 os.environ.setdefault(
   "MJX_CL_CACHE", str(pathlib.Path(tempfile.gettempdir()) / "mjx_cl_tests_cache")
 )  # shared by all runs and processes; XLA keys what it holds by the flags below
-# LLVM leaves programs as they are, which shortens compiling. Flags of one's own come later and win;
-# processes that tests start inherit it.
-os.environ["XLA_FLAGS"] = (
-  f"--xla_backend_optimization_level=0 {os.environ.get('XLA_FLAGS', '')}".rstrip()
+# Most of the tests' time is compiling. LLVM leaves programs as they are, kernels come from the older
+# emitters, which need no MLIR, and what only makes a program smaller is left out: half of a learner's
+# compile time. Flags of one's own come later and win; processes that tests start inherit them.
+QUICK = {
+  "xla_backend_optimization_level": 0,
+  "xla_cpu_parallel_codegen_split_count": 1,
+  "xla_cpu_use_fusion_emitters": False,
+  "xla_disable_hlo_passes": "simplification,post_scatter_expansion_simplification",
+}
+os.environ["XLA_FLAGS"] = " ".join(
+  [f"--{name}={str(value).lower()}" for name, value in QUICK.items()]
+  + os.environ.get("XLA_FLAGS", "").split()
 )
+
+# Tracing makes hundreds of thousands of objects, few of them garbage: at Python's own thresholds
+# the collector, and JAX's part of it, takes half of a trace's time.
+gc.set_threshold(50_000, 20, 50)
 
 from mjx_cl.io import runtime  # noqa: E402
 
@@ -94,13 +106,19 @@ def walker():
 @pytest.fixture(scope="session")
 def pair(walker):
   """Native and MJX backend of the walker (10 substeps), as {name: (init, step)} for ROBOTS robots;
-  one program each. LLVM optimises them, as it does outside the tests: MJX then rounds as it does
-  for a user, and takes a tenth of the time.
+  one program each. XLA and LLVM optimise them, as they do outside the tests: MJX then rounds as it
+  does for a user, and takes a tenth of the time.
   """
   from mjx_cl import physics
 
   backends = {name: physics.make(name, walker, substeps=10) for name in ("native", "mjx")}
-  jit = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 3})
+  default = {
+    "xla_backend_optimization_level": 3,
+    "xla_cpu_parallel_codegen_split_count": 32,
+    "xla_cpu_use_fusion_emitters": True,
+    "xla_disable_hlo_passes": "",
+  }
+  jit = functools.partial(jax.jit, compiler_options=default)
   return {name: (jit(jax.vmap(b.init)), jit(jax.vmap(b.step))) for name, b in backends.items()}
 
 

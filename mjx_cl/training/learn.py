@@ -54,21 +54,32 @@ class Updater:
     train, replay, metrics, address, latents = self.sampled(train, replay, key, weights)
     return train, replay_lib.refresh(replay, address, latents), metrics
 
+  def shapes(self, train: TrainState, replay: Replay, key: jax.Array, weights: Weights) -> Metrics:
+    """Of the metrics of an update, each the shape also of its mean. A trace of the update."""
+    return jax.eval_shape(self.refreshed, train, replay, key, weights)[2]
+
   def one_seed(
-    self, train: TrainState, replay: Replay, key: jax.Array, weights: Weights, updates: int
+    self,
+    train: TrainState,
+    replay: Replay,
+    key: jax.Array,
+    weights: Weights,
+    updates: int,
+    shapes: Metrics | None = None,
   ) -> Learnt:
-    """`updates` updates of one seed, see `make_learn`."""
+    """`updates` updates of one seed, see `make_learn`; `shapes`: of its metrics, where known."""
     keys = jax.random.split(key, updates)
+    if shapes is None:
+      shapes = self.shapes(train, replay, key, weights)
 
     def body(state: tuple[Any, ...]) -> tuple[Any, ...]:
       i, train, replay, sums, _ = state
       train, replay, metrics = self.refreshed(train, replay, keys[i], weights)
       return i + 1, train, replay, jax.tree.map(jnp.add, sums, metrics), culprit(metrics)
 
-    zero = _nought(jax.eval_shape(self.refreshed, train, replay, key, weights)[2])
     more = lambda state: (state[0] < updates) & (state[-1] < 0)
     i, train, replay, sums, bad = jax.lax.while_loop(
-      more, body, (jnp.int32(0), train, replay, zero, jnp.int32(-1))
+      more, body, (jnp.int32(0), train, replay, _nought(shapes), jnp.int32(-1))
     )
     return train, replay, jax.tree.map(lambda x: x / i, sums), bad
 
@@ -82,8 +93,8 @@ class Updater:
     updates: int,
   ) -> Learnt:
     """Seeds one after another."""
-    run = lambda train, replay, key: self.one_seed(train, replay, key, weights, updates)
-    shapes = jax.eval_shape(run, *jax.tree.map(lambda x: x[0], (train, replay, keys)))[2]
+    shapes = self.shapes(*jax.tree.map(lambda x: x[0], (train, replay, keys)), weights)
+    run = lambda train, replay, key: self.one_seed(train, replay, key, weights, updates, shapes)
     rest = lambda train, replay, key: (train, replay, _nought(shapes), jnp.int32(-1))
     return jax.lax.map(
       lambda x: jax.lax.cond(x[3], run, rest, *x[:3]), (train, replay, keys, active)

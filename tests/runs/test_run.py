@@ -121,12 +121,19 @@ def saved(tiny, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def whole(saved, tmp_path_factory):
-  """An uninterrupted run: (folder, standard output, standard error)."""
+  """An uninterrupted run in this process: (folder, standard output, standard error)."""
   out = tmp_path_factory.mktemp("runs") / "whole"
-  process = spawn(ARGS + ["--agent", str(saved), "--out", str(out)])
-  stdout, stderr = process.communicate(timeout=1200)
-  assert process.returncode == 0, stderr
-  return out, stdout, stderr
+  before = signal.getsignal(signal.SIGTERM)
+  with (
+    pytest.MonkeyPatch.context() as patch,
+    contextlib.redirect_stdout(io.StringIO()) as stdout,
+    contextlib.redirect_stderr(io.StringIO()) as stderr,
+  ):
+    patch.setitem(envs.ENVS, "walker", Easy)
+    code = app.main(ARGS + ["--agent", str(saved), "--out", str(out)])
+  signal.signal(signal.SIGTERM, before)
+  assert code == 0, stderr.getvalue()
+  return out, stdout.getvalue(), stderr.getvalue()
 
 
 def table(folder, name):
@@ -481,6 +488,9 @@ def test_a_preset_of_several_faults_ends_in_all_files(saved, tmp_path):
     arms=("none",),
     agent=str(saved),
     physics="native",
+    # as below: one program of the loop
+    detector="periodic",
+    settings={"threshold": math.log(30)},
   )
   summary = run.execute(config, tmp_path / "out")
   assert summary["fault"] == "any/all-easy" and summary["severity"] == pytest.approx(1 / 3)

@@ -13,16 +13,17 @@ import pytest
 from mjx_cl.config import PRESETS, TrainConfig, replace
 from mjx_cl.dreamer.agent import CAUSES, Weights, culprit
 from mjx_cl.errors import FileError, UserError
-from mjx_cl.io import runtime
+from mjx_cl.io import checkpoints, runtime
 from mjx_cl.training import trainer as train
 
 DREAMER = replace(PRESETS["tiny"].dreamer, batch=4, length=8, imagine=4)
 CONFIG = TrainConfig(envs=4, updates=10_000, ratio=0.25, capacity=256)  # 2 updates a chunk
-SEEDS = 3
+SEEDS = 4  # on two devices two each
 _shared = {}
 
 
 def make_trainer(env, out):
+  """A Trainer of SEEDS seeds; those of one robot share their programs."""
   trainer = train.Trainer(env, DREAMER, CONFIG, out, seeds=SEEDS)
   trainer.collect, trainer.learn, trainer._add = _shared.setdefault(
     id(env), (trainer.collect, trainer.learn, trainer._add)
@@ -83,15 +84,15 @@ def test_by_vmap_is_by_map(short_walker, tmp_path):
   trainer = make_trainer(short_walker, tmp_path)
   for _ in range(2):
     trainer.step()
-  state, active = poisoned(trainer.state, 1, 1e8), np.array([True, True, False])
+  state, active = poisoned(trainer.state, 1, 1e8), np.array([True, True, False, False])
   copy = lambda: jax.tree.map(jnp.copy, (state.train, state.replay))
   assert runtime.seeds_by() == "map"  # on a CPU
   by_map = trainer.learn["pure"](*copy(), jax.random.key(5), Weights(), active, 2)
   by_vmap = train.make_learn(trainer.plain, DREAMER.batch, DREAMER.length, how="vmap")(
     *copy(), jax.random.key(5), Weights(), active, 2
   )
-  assert list(by_map[3]) == list(by_vmap[3]) == [-1, CAUSES.index("loss/rew"), -1]
-  assert [int(x) - int(y) for x, y in zip(by_vmap[0].updates, state.train.updates)] == [2, 0, 0]
+  assert list(by_map[3]) == list(by_vmap[3]) == [-1, CAUSES.index("loss/rew"), -1, -1]
+  assert [int(x) - int(y) for x, y in zip(by_vmap[0].updates, state.train.updates)] == [2, 0, 0, 0]
   moved = lambda out: np.abs(
     np.asarray(jax.tree.leaves(out[0].params)[0])
     - np.asarray(jax.tree.leaves(state.train.params)[0])
@@ -157,7 +158,7 @@ def test_a_seed_that_fails_stops_alone_and_is_named(
   )
   said = capfd.readouterr().err
   assert said.count("numeric failure of seed 1") == 1
-  for g in (0, 2):
+  for g in (0, 2, 3):
     assert same(seed(hurt.state.train, g), seed(sound.state.train, g)) and same(
       seed(hurt.state.replay, g), seed(sound.state.replay, g)
     )
@@ -194,72 +195,84 @@ def test_when_every_seed_fails_the_training_ends(short_walker, tmp_path, monkeyp
   assert "\n" not in str(e.value)
 
 
-DEVICES = """
+def live(env, out):
+  """A training through a checkpoint to a seed that fails: its trainer, and {leaf: weights and
+  moments} where the checkpoint was written. Going on from there gives the bits of never having
+  stopped, and a seed whose loss explodes leaves the others' bits alone.
+  """
+  whole = make_trainer(env, out)
+  while whole.updates < 4:
+    whole.step()
+  whole.save()
+  again = make_trainer(env, out)
+  again.resume()
+  named = lambda tree: {
+    jax.tree_util.keystr(path): np.asarray(x) for path, x in jax.tree.leaves_with_path(tree)
+  }
+  saved = named(again.state.train)
+  at = again.updates
+  for _ in range(2):
+    whole.step()
+    again.step()
+  assert again.updates > at  # what was read meets what is spread over devices
+  one, other = (named(checkpoints.pack(trainer.state)) for trainer in (whole, again))
+  assert list(one) == list(other)
+  assert all(one[name].tobytes() == other[name].tobytes() for name in one)
+  again.state = again._place(poisoned(again.state, 1, 1e8))
+  of = lambda trainer, g: [np.asarray(x[g]) for x in jax.tree.leaves(trainer.state.train)]
+  frozen = of(again, 1)
+  whole.step()
+  row = again.step()
+  assert list(again.failed) == [1] and row["failed_seeds"] == 1
+  assert again.failed[1].startswith("loss/rew is not finite, or above 1e+06")
+  assert all(map(np.array_equal, frozen, of(again, 1)))
+  for g in (0, 2, 3):
+    assert all(map(np.array_equal, of(whole, g), of(again, g)))
+  return whole, saved
+
+
+TWO = """
 import sys
 from mjx_cl.io import runtime; runtime.setup()
 import jax, numpy as np
-assert len(jax.devices()) == {devices}
+assert len(jax.devices()) == 2
 sys.path.insert(0, {tests!r})
 import test_seeds
 from mjx_cl import envs
-from mjx_cl.io import checkpoints as checkpoint
-from mjx_cl.training import trainer as train
 env = envs.make("walker", "native")
 env.spec = env.spec._replace(episode_steps=12)
-trainer = train.Trainer(env, test_seeds.DREAMER, test_seeds.CONFIG, {out!r}, seeds=2)
-assert (trainer.mesh is not None) == ({devices} > 1)
-while trainer.updates < 4:
-  trainer.step()
-if trainer.mesh is not None:
-  leaf = jax.tree.leaves(trainer.state.train.params)[0]
-  assert len(leaf.sharding.device_set) == 2 and leaf.addressable_shards[0].data.shape[0] == 1
-trainer.save()
-second = train.Trainer(env, test_seeds.DREAMER, test_seeds.CONFIG, {out!r}, seeds=2)
-second.resume()
-leaves = [np.asarray(x) for x in jax.tree.leaves(second.state.train)]
-np.savez({out!r} + "/state.npz", *leaves)
-bits = lambda t: [(jax.tree_util.keystr(p), np.asarray(x).tobytes()) for p, x in jax.tree.leaves_with_path(checkpoint.pack(t.state))]
-at = second.updates
-for _ in range(2):
-  trainer.step()
-  second.step()
-assert second.updates > at  # what was read meets what is spread over devices
-assert bits(second) == bits(trainer)  # N updates, save, load, M updates are N + M in one go
-second.state = second._place(test_seeds.poisoned(second.state, 1, 1e8))
-frozen = [np.asarray(x[1]) for x in jax.tree.leaves(second.state.train)]
-trainer.step()
-row = second.step()
-one = lambda t, g: [np.asarray(x[g]) for x in jax.tree.leaves(t.state.train)]
-assert list(second.failed) == [1] and second.failed[1].startswith("loss/rew is not finite, or above 1e+06") and row["failed_seeds"] == 1
-assert all(map(np.array_equal, frozen, one(second, 1))) and all(map(np.array_equal, one(trainer, 0), one(second, 0)))
+trainer, saved = test_seeds.live(env, {out!r})
+leaf = jax.tree.leaves(trainer.state.train.params)[0]
+assert trainer.mesh is not None and len(leaf.sharding.device_set) == 2
+assert leaf.addressable_shards[0].data.shape[0] == test_seeds.SEEDS // 2
+np.savez({out!r} + "/saved.npz", *saved.values())
 """
 
 
-def test_two_devices_equal_one(tmp_path):
-  """The same training on one and on two host devices, through a checkpoint; the programs differ, so
-  bits may.
-
-  On either: going on from the checkpoint gives the bits of never having stopped, and a seed whose
-  loss explodes leaves the other's bits alone.
+def test_two_devices_equal_one(short_walker, tmp_path, monkeypatch):
+  """The same training on one device, here, and on two of a process of its own; the programs differ,
+  so bits may.
   """
-  out = {}
-  for devices in (1, 2):
-    folder = tmp_path / str(devices)
-    # compiles sooner, see quick.py
-    flags = f"--xla_force_host_platform_device_count={devices} --xla_backend_optimization_level=0"
-    code = DEVICES.format(
-      devices=devices, tests=str(pathlib.Path(__file__).parent), out=str(folder)
-    )
-    done = subprocess.run(
-      [sys.executable, "-c", code],
-      env=os.environ | {"XLA_FLAGS": flags},
-      capture_output=True,
-      text=True,
-    )
-    assert done.returncode == 0, done.stderr[-2000:]
-    with np.load(folder / "state.npz") as z:
-      out[devices] = [z[k] for k in z.files]
-  for a, b in zip(out[1], out[2]):
-    np.testing.assert_allclose(
-      a, b, rtol=1e-3, atol=1e-5 * max(1.0, float(np.abs(a).max()))
-    )  # 4 updates in float32, two programs
+  monkeypatch.chdir(tmp_path)  # MuJoCo logs actions that are not finite into the working folder
+  trainer, one = live(short_walker, tmp_path / "one")
+  assert trainer.mesh is None
+  out = tmp_path / "two"
+  done = subprocess.run(
+    [
+      sys.executable,
+      "-c",
+      TWO.format(tests=str(pathlib.Path(__file__).parent), out=str(out)),
+    ],
+    env=os.environ
+    | {"XLA_FLAGS": f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count=2"},
+    capture_output=True,
+    text=True,
+  )
+  assert done.returncode == 0, done.stderr[-2000:]
+  with np.load(out / "saved.npz") as two:
+    assert len(two.files) == len(one)
+    for (name, a), key in zip(one.items(), two.files):
+      # 4 updates in float32, two programs
+      np.testing.assert_allclose(
+        a, two[key], rtol=1e-3, atol=1e-5 * max(1.0, float(np.abs(a).max())), err_msg=name
+      )
