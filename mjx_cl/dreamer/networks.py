@@ -13,7 +13,7 @@ from jaxtyping import Float, Int, PRNGKeyArray
 
 from mjx_cl.config import DreamerConfig
 from mjx_cl.config.sizes import SIZES
-from mjx_cl.dreamer import heads, nets, rssm
+from mjx_cl.dreamer import heads, nets, posterior, rssm
 from mjx_cl.dreamer.state import Carry, Latent, Record
 from mjx_cl.errors import UserError
 from mjx_cl.types import Array
@@ -148,31 +148,19 @@ class Networks:
     posterior logits (T, B, stoch, classes).
     """
     length, rows = batch.obs.shape[1] - 1, batch.obs.shape[0]
-    params = self.prepare(params)
-    tokens = self._encode(params, later(batch.obs))
-    uniform = nets.in_a_row(jax.random.uniform, key, (length, rows, self.size.stoch))
     # on a CPU the product of a single row takes twice the time of that of two
     wide = lambda x, axis: jnp.repeat(x, 2, axis) if rows == 1 else x
-
-    def step(
-      state: tuple[Array, Array], x: tuple[Array, Array, Array, Array]
-    ) -> tuple[tuple[Array, Array], tuple[Array, Array, Array]]:
-      deter, stoch = state
-      action, first, tokens, uniform = x
-      keep = 1.0 - first[:, None]
-      deter = self._core(params, deter * keep, stoch * keep, action * keep)
-      logits = self._apply(params, "dyn", deter, tokens, method="posterior")
-      stoch = rssm.sample(logits, uniform).reshape(deter.shape[0], -1)
-      return (deter, stoch), (deter[:rows], stoch[:rows], logits[:rows])
-
-    start = (wide(batch.deter[:, 0].astype(jnp.float32), 0), wide(self.hot(batch.stoch[:, 0]), 0))
+    dyn = params["dyn"].get("params", params["dyn"])
     xs = (
       batch.action[:, :-1].swapaxes(0, 1),
       later(batch.first).astype(jnp.float32),
-      tokens,
-      uniform,
+      self._encode(params, later(batch.obs)),
+      nets.in_a_row(jax.random.uniform, key, (length, rows, self.size.stoch)),
     )
-    return jax.lax.scan(step, start, jax.tree.map(lambda x: wide(x, 1), xs))[1]
+    start = batch.deter[:, 0].astype(jnp.float32), self.hot(batch.stoch[:, 0])
+    met = posterior.inputs(self.dyn, dyn, *(wide(x, 1) for x in xs))
+    out = posterior.posteriors(self.dyn, dyn, tuple(wide(x, 0) for x in start), met)
+    return tuple(x[:, :rows] for x in out)
 
   def imagine(
     self,

@@ -113,6 +113,10 @@ class RSSM(nn.Module):
     """(N, D) -> (blocks, N, D / blocks), the layout in which the block-diagonal products run."""
     return deter.reshape(deter.shape[0], self.size.blocks, -1).transpose(1, 0, 2)
 
+  def acted(self, action: Float[Array, "*lead act"]) -> Float[Array, "*lead hidden"]:
+    """What the core makes of the action."""
+    return self.in_action(clip_action(action))
+
   def core(
     self,
     deter: Float[Array, "rows deter"],
@@ -134,9 +138,7 @@ class RSSM(nn.Module):
     A scan that carries both spares the cut, and keeps XLA from fusing the gates' tanh and sigmoid
     into the transposition that follows, where they are not vectorised.
     """
-    shared = jnp.concatenate(
-      [self.in_deter(deter), self.in_stoch(stoch), self.in_action(clip_action(action))], -1
-    )
+    shared = jnp.concatenate([self.in_deter(deter), self.in_stoch(stoch), self.acted(action)], -1)
     h = nn.silu(self.core_norm(self.core_hidden(chunks, shared)))
     r, c, u = jnp.split(self.core_gates(h), 3, -1)
     update = jax.nn.sigmoid(u - 1.0)
