@@ -14,13 +14,22 @@ os.environ.setdefault(
   "MJX_CL_CACHE", str(pathlib.Path(tempfile.gettempdir()) / "mjx_cl_tests_cache")
 )  # shared by all runs and processes; XLA keys what it holds by the flags below
 # Most of the tests' time is compiling. LLVM leaves programs as they are, kernels come from the older
-# emitters, which need no MLIR, and what only makes a program smaller is left out: half of a learner's
-# compile time. Flags of one's own come later and win; processes that tests start inherit them.
+# emitters, which need no MLIR, and passes are left out that cost more than they save: half of a
+# learner's compile time. Flags of one's own come later and win; processes that tests start inherit
+# them.
 QUICK = {
   "xla_backend_optimization_level": 0,
   "xla_cpu_parallel_codegen_split_count": 1,
   "xla_cpu_use_fusion_emitters": False,
-  "xla_disable_hlo_passes": "simplification,post_scatter_expansion_simplification",
+  "xla_disable_hlo_passes": ",".join(
+    (
+      "gather_expander",
+      "simplify-while-loops",
+      "tree_reduction_rewriter",
+      "while-loop-constant-sinking",
+      "while-loop-invariant-code-motion",
+    )
+  ),
 }
 os.environ["XLA_FLAGS"] = " ".join(
   [f"--{name}={str(value).lower()}" for name, value in QUICK.items()]
