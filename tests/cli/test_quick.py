@@ -25,7 +25,7 @@ def test_quick_is_other_defaults(robot):
   config = settings.check(RunConfig(**{k: getattr(run, k) for k in vars(RunConfig(robot))}))
   least = max(run.adapt.least, run.adapt.patience * CHUNK)
   assert run.adapt.warmup < run.onset and run.onset + 700 + least < config.steps
-  assert 100 <= run.first_seed and run.first_seed + run.seeds <= 110  # tuning seeds
+  assert run.first_seed >= 100 and run.first_seed + run.seeds <= 110  # tuning seeds
 
 
 def test_flags_override_quick():
