@@ -38,7 +38,12 @@ class Clock:
     cores: that share the work.
     repeat: control steps of a decision.
     stops: seed -> control steps after which an arm that is told ends.
+
+  Attributes:
+    joined: all streams are learners from the start, as on an accelerator.
   """
+
+  joined = False
 
   def __init__(
     self,
@@ -79,7 +84,7 @@ class Clock:
       for (arm, seed), own in zip(self.labels, stands)
     ]
     at = np.arange(now, c.steps, self.chunk)
-    begun = [own.since >= 0 for own in stands]
+    begun = [self.joined or own.since >= 0 for own in stands]
     return work.load(spells, begun, self.together, self.own, at, self.chunk)
 
   def left(self, now: int, stands: Sequence[Standing], compiled: float = 0.0) -> float | None:
@@ -94,7 +99,7 @@ class Clock:
       return None
     todo = self.expected(now, stands)
     rest = float(work.wall(todo, self.speed(), self.cores).sum()) * self.lived / self.foretold
-    if any(own.since >= 0 for own in stands) or not len(todo.bands):
+    if self.joined or any(own.since >= 0 for own in stands) or not len(todo.bands):
       return rest
     return rest + COMPILE_LEARNER_S * compiled / COMPILE_S * min(1.0, float(todo.bands.max()))
 

@@ -112,6 +112,7 @@ class Runner:
     self.choices = self._choices()
     learner = (self.env.spec, self.trained.agent.config, self.repeat)
     self.clock = clock_of(config, *learner, self.stops)
+    self.clock.joined = not self.lives.herds
     self.room = room.of(config, *learner)
     # what has been lived
     self.done_chunks = 0
