@@ -159,8 +159,9 @@ class Networks:
     )
     start = batch.deter[:, 0].astype(jnp.float32), self.hot(batch.stoch[:, 0])
     met = posterior.inputs(self.dyn, dyn, *(wide(x, 1) for x in xs))
-    out = posterior.posteriors(self.dyn, dyn, tuple(wide(x, 0) for x in start), met)
-    return tuple(x[:, :rows] for x in out)
+    begin = wide(start[0], 0), wide(start[1], 0)
+    deter, stoch, logits = posterior.posteriors(self.dyn, dyn, begin, met)
+    return deter[:, :rows], stoch[:, :rows], logits[:, :rows]
 
   def imagine(
     self,

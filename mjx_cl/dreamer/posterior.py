@@ -21,9 +21,13 @@ from mjx_cl.dreamer import nets
 from mjx_cl.dreamer.rssm import RSSM, dense_part, hoist, join, sample
 from mjx_cl.types import Array
 
-IN_DETER, IN_STOCH = ("in_deter", "linear"), ("in_stoch", "linear")
-CORE, GATES = ("core_hidden",), ("core_gates",)
-HIDDEN, OUT = ("post_hidden", "linear"), ("post_out",)
+Path = tuple[str, ...]  # of a layer in the RSSM
+IN_DETER: Path = ("in_deter", "linear")
+IN_STOCH: Path = ("in_stoch", "linear")
+CORE: Path = ("core_hidden",)
+GATES: Path = ("core_gates",)
+HIDDEN: Path = ("post_hidden", "linear")
+OUT: Path = ("post_out",)
 PRODUCTS = (IN_DETER, IN_STOCH, CORE, GATES, HIDDEN, OUT)  # the layers in the loop, in their order
 SHARED = 1  # which input of CORE is no deter
 
@@ -61,25 +65,25 @@ def inputs(
 ) -> Inputs:
   """`Inputs` of all steps at once."""
   keep = 1.0 - first[..., None]
-  acted = rssm.apply({"params": params}, action * keep, method="acted")
+  acted: Any = rssm.apply({"params": params}, action * keep, method="acted")
   kernel = params["post_hidden"]["linear"]["kernel"][-tokens.shape[-1] :]
   return Inputs(keep, acted, nets.product(tokens, kernel), uniform)
 
 
 def step(
-  rssm: RSSM, variables: Any, state: State, x: Inputs, layers: dict[tuple[str, ...], Any]
+  rssm: RSSM, variables: Any, state: State, x: Inputs, layers: dict[Path, Any]
 ) -> tuple[Array, Array, Array]:
   """Deter, stoch and logits one step on; `layers` take the place of products."""
   deter, stoch = (part * x.keep for part in state)
   with nets.instead({("in_action",): lambda *_: x.acted} | layers):
-    deter = rssm.apply(variables, deter, stoch, x.acted, method="core")
-    logits = rssm.apply(variables, deter, x.seen, method="posterior")
-  return deter, sample(logits, x.uniform).reshape(stoch.shape), logits
+    new: Any = rssm.apply(variables, deter, stoch, x.acted, method="core")
+    logits: Any = rssm.apply(variables, new, x.seen, method="posterior")
+  return new, sample(logits, x.uniform).reshape(stoch.shape), logits
 
 
 def steps(
   rssm: RSSM, params: Any, start: State, xs: Inputs
-) -> tuple[States, dict[tuple[str, ...], tuple[tuple[Array, ...], Array]]]:
+) -> tuple[States, dict[Path, tuple[tuple[Array, ...], Array]]]:
   """States and logits, and of each product its inputs and its output, all with leading T."""
   variables, hidden = hoist(params), params["post_hidden"]["linear"]
   kernel = hidden["kernel"][: start[0].shape[-1]]
@@ -87,7 +91,7 @@ def steps(
   def one(state: State, x: Inputs) -> tuple[State, tuple[Any, Any]]:
     kept = {}
 
-    def layer(path: tuple[str, ...], method: Any, *given: Array) -> Array:
+    def layer(path: Path, method: Any, *given: Array) -> Array:
       y = given[0] @ kernel + hidden["bias"] + x.seen if path == HIDDEN else method(*given)
       kept[path] = given, y
       return y
@@ -123,7 +127,7 @@ def known(back: Any, y: Array, *xs: Array) -> Array:
 known.defvjp(lambda back, y, *xs: (y, None), lambda back, _, g: (g, *back(g)))
 
 
-def ways_back(rssm: RSSM, params: Any, deter: int) -> dict[tuple[str, ...], Any]:
+def ways_back(rssm: RSSM, params: Any, deter: int) -> dict[Path, Any]:
   """Of each product, what turns its output's cotangent into those of its inputs. Kernels are
   transposed here, outside of the loop.
   """
@@ -184,8 +188,8 @@ def gradients(
   params: Any,
   was: tuple[Array, Array],
   deter: Float[Array, "steps rows deter"],
-  met: dict[tuple[str, ...], Array],
-  changes: dict[tuple[str, ...], Array],
+  met: dict[Path, Array],
+  changes: dict[Path, Array],
 ) -> dict[str, Any]:
   """Of the products' kernels and biases, from all steps: what each met, what its output is to be
   changed by.
