@@ -17,7 +17,8 @@ ADAPT = AdaptConfig(least=1536, patience=16, start_windows=256)
 SHARED: dict[str, Any] = {"seeds": 2, "onset": 2000, "steps": 4800, "adapt": ADAPT}
 QUICK: dict[str, dict[str, Any]] = {
   "walker": SHARED | {"target": "right_hip", "severity": 0.5, "first_seed": 105},
-  "quadruped": SHARED | {"fault": "payload", "severity": 1.0, "first_seed": 105},
+  "quadruped": SHARED
+  | {"fault": "bias", "target": "joint_vel", "severity": 0.5, "first_seed": 105},
   "car": SHARED | {"fault": "friction", "target": "rear", "severity": 0.25, "first_seed": 105},
 }
 FAULT = ("target", "severity")  # of the preset's own fault alone

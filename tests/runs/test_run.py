@@ -776,6 +776,8 @@ class Stub:
 
   signals, notes = 0, []
 
+  room = "memory"
+
   def __init__(self, config, out, programs=None):
     self.chunk = 0
 
