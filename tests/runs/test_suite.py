@@ -785,7 +785,7 @@ def test_a_stream_whose_loss_fails_is_given_up_alone_and_named(mini, tmp_path, s
     part.config,
     steps=448,
     arms=("always",),
-    adapt=dataclasses.replace(part.config.adapt, start_windows=1, ratio=64.0),
+    adapt=dataclasses.replace(part.config.adapt, start_windows=1, ratio=4.0),
   )
   sound, hurt = (run.Runner(config, tmp_path / name) for name in ("sound", "hurt"))
   chunks = config.steps // CHUNK
