@@ -93,7 +93,8 @@ class Updater:
     updates: int,
   ) -> Learnt:
     """Seeds one after another."""
-    shapes = self.shapes(*jax.tree.map(lambda x: x[0], (train, replay, keys)), weights)
+    first: Any = jax.tree.map(lambda x: x[0], (train, replay, keys))
+    shapes = self.shapes(*first, weights=weights)
     run = lambda train, replay, key: self.one_seed(train, replay, key, weights, updates, shapes)
     rest = lambda train, replay, key: (train, replay, _nought(shapes), jnp.int32(-1))
     return jax.lax.map(
