@@ -93,8 +93,8 @@ class Updater:
     updates: int,
   ) -> Learnt:
     """Seeds one after another."""
-    first: Any = jax.tree.map(lambda x: x[0], (train, replay, keys))
-    shapes = self.shapes(*first, weights=weights)
+    one: tuple[Any, Any, Any] = jax.tree.map(lambda x: x[0], (train, replay, keys))
+    shapes = self.shapes(*one, weights)
     run = lambda train, replay, key: self.one_seed(train, replay, key, weights, updates, shapes)
     rest = lambda train, replay, key: (train, replay, _nought(shapes), jnp.int32(-1))
     return jax.lax.map(
