@@ -36,10 +36,6 @@ os.environ["XLA_FLAGS"] = " ".join(
   + os.environ.get("XLA_FLAGS", "").split()
 )
 
-# Tracing makes hundreds of thousands of objects, few of them garbage: at Python's own thresholds
-# the collector, and JAX's part of it, takes half of a trace's time.
-gc.set_threshold(50_000, 20, 50)
-
 from mjx_cl.io import runtime  # noqa: E402
 
 runtime.setup()

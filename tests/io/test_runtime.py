@@ -2,6 +2,7 @@
 many physics callbacks.
 """
 
+import gc
 import os
 import pathlib
 import subprocess
@@ -243,3 +244,14 @@ def load_geared(model, gear):
   model = model.__copy__()
   model.actuator_gear[:] = gear
   return model
+
+
+def test_the_collector_runs_seldom_unless_its_user_has_set_it():
+  held = gc.get_threshold()
+  try:
+    gc.set_threshold(700, 10, 10)
+    assert runtime.collect_seldom() and gc.get_threshold()[0] > 700
+    gc.set_threshold(123, 4, 5)
+    assert not runtime.collect_seldom() and gc.get_threshold() == (123, 4, 5)
+  finally:
+    gc.set_threshold(*held)
