@@ -214,11 +214,12 @@ class Runner:
     """Adds a chunk's seconds of wall time, shared among kinds of work and streams as the cores'
     own `seconds` (groups, kinds) are; a chunk in which something was compiled counts as compiling.
     """
+    if compiled:  # which nobody in particular has caused
+      self.seconds["compiling"] += wall
+      self.stream_seconds += wall / len(seconds)
+      return
     share = wall / max(1e-9, seconds.sum())
     self.stream_seconds += seconds.sum(1) * share
-    if compiled:
-      self.seconds["compiling"] += wall
-      return
     acting, monitor, updates = seconds.sum(0) * share
     physics = min(acting, physics * share)
     for kind, spent in zip(KINDS, (physics, acting - physics, monitor, updates)):
