@@ -337,7 +337,8 @@ def test_socks_at_the_healthy_grip_are_none_and_less_grip_costs(monkeypatch):
   params = quick.jit(jax.vmap(lambda k: agent.init(k).params))(
     jax.random.split(jax.random.key(0), 2)
   )
-  runner = types.SimpleNamespace(trained=types.SimpleNamespace(agent=agent), acting=params)
+  acting = types.SimpleNamespace(acting=lambda g: jax.tree.map(lambda x: x[g], params))
+  runner = types.SimpleNamespace(trained=types.SimpleNamespace(agent=agent), lives=acting)
   seen = []
 
   class Watched(Rollout):
@@ -380,14 +381,14 @@ def test_socks_at_the_healthy_grip_are_none_and_less_grip_costs(monkeypatch):
   assert (reward[:, 1:] != reward[:, :1]).all()
 
 
-@pytest.mark.parametrize("given", [[], ["nosuch"], ["update", "digest"]])
+@pytest.mark.parametrize("given", [[], ["nosuch"], ["update", "learn"]])
 def test_compile_time_names_its_programs(given):
   done = subprocess.run(
     [sys.executable, FOLDER / "compile_time.py", *given], capture_output=True, text=True
   )
   assert (
     done.returncode == 1
-    and done.stderr == "usage: python benchmarks/compile_time.py update|digest\n"
+    and done.stderr == "usage: python benchmarks/compile_time.py update|watch|learn\n"
   )
 
 
