@@ -74,7 +74,7 @@ def serve() -> None:
         detector="rolling_sigma",
       )
       runners[name] = Runner(config, tempfile.mkdtemp())
-      for _ in range(6 if onset == CHUNK else 2):
+      for _ in range(6 if onset == CHUNK else 1):
         runners[name].step()
     begin = time.perf_counter()
     runners[name].step()
@@ -189,7 +189,7 @@ def price(versions: list[Version], rounds: int) -> list[dict]:
     some = versions[:1] if large else versions
     for v in some:
       v.chunk(scene)  # compiles
-    chunks[scene] = by_turns(some, lambda v, scene=scene: v.chunk(scene), 2 if large else rounds)
+    chunks[scene] = by_turns(some, lambda v, scene=scene: v.chunk(scene), 1 if large else rounds)
   streams = {name: len(arms) * seeds for name, (arms, seeds, *_) in SCENES.items()}
   for scene, values in chunks.items():
     rows.append(row(f"{scene}, a stream", "ms a chunk", values, 1e3 / streams[scene]))

@@ -14,7 +14,7 @@ from mjx_cl.errors import choose, require
 
 # the rule needs 24 chunks to settle instead of 94, updates begin after 321 steps instead of 1,088
 ADAPT = AdaptConfig(least=1536, patience=16, start_windows=256)
-SHARED: dict[str, Any] = {"seeds": 2, "onset": 2000, "steps": 4800, "adapt": ADAPT}
+SHARED: dict[str, Any] = {"seeds": 2, "onset": 2000, "steps": 6400, "adapt": ADAPT}
 QUICK: dict[str, dict[str, Any]] = {
   "walker": SHARED | {"target": "right_hip", "severity": 0.5, "first_seed": 105},
   "quadruped": SHARED

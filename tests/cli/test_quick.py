@@ -78,7 +78,7 @@ def test_it_says_what_it_is_not_and_runs_what_was_asked(monkeypatch, tmp_path, c
   assert app.main(argv) == 0
   out, err = capsys.readouterr()
   assert json.loads(out) == {"wall_s": 1.0} and got[0].onset == 2000 and got[0].seeds == 2
-  assert err.count("\n") == 1 and "first look, no result: 2 robots for 4,800 steps" in err
+  assert err.count("\n") == 1 and "first look, no result: 2 robots for 6,400 steps" in err
 
 
 def test_help_says_it_in_a_line(capsys):
