@@ -48,7 +48,7 @@ def test_flags_override_quick():
   [
     (("car_real",), "unknown robot of --quick 'car_real'; choose from: car, quadruped, walker"),
     (("walker", "--steps", "2500"), "no finetuning may end before step 3,536"),
-    (("walker", "--onset", "4000"), "no finetuning may end before step 5,536"),
+    (("walker", "--onset", "5000"), "no finetuning may end before step 6,536"),
     (("walker", "--adapt.least", "6000"), "no finetuning may end before step 8,000"),
     (("walker", "--seeds", "10"), "--quick is for up to 8 streams; got 10 seeds in 2 arms"),
     (("walker", "--snapshots", "500"), "--quick and --snapshots exclude each other"),
