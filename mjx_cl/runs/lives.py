@@ -75,7 +75,7 @@ class Lives:
     together: bool | None = None,
     ahead: bool = False,
   ) -> None:
-    self.rollout, self.loop, self.keys = rollout, loop, keys
+    self.loop, self.keys = loop, keys
     self.trains, self.rollback, self.streams = list(trains), rollback, len(trains)
     together = jax.default_backend() != "cpu" if together is None else together
     # streams of a band, and those that share a LoopState
@@ -270,6 +270,7 @@ class Lives:
   def _watch_band(self, band: Band, k: int, rows: Row, now: int, settle: Settle) -> Told:
     begin = time.perf_counter()
     step, state, first = jnp.int32(now), band.loops[k], k * self.width
+    taken = np.array(state.executed)  # learning uses the state up
     who = band.who[first : first + self.width]
     keys = self.keys[np.array(who)]
     seen, sight = jax.block_until_ready(self.loop.watch(state.minds, state.sight, rows, step, keys))
@@ -281,11 +282,11 @@ class Lives:
       state, seen, sight, rows, step, all_settled.choices, keys, all_settled.acceptance
     )
     band.loops[k] = jax.block_until_ready(state)
-    if (np.asarray(digest.decision) > 0).any() or (np.asarray(digest.updates) > 0).any():
-      band.acting = None
     digest = jax.tree.map(np.asarray, digest)
+    if (digest.decision > 0).any() or (digest.updates != taken).any():
+      band.acting = None  # in every other chunk weights are what they were
     one = lambda i: Digest(
-      *(cut(v, slice(i, i + 1), int(k in ROWS)) for k, v in digest._asdict().items())
+      *(cut(v, slice(i, i + 1), int(name in ROWS)) for name, v in digest._asdict().items())
     )
     told = {g: (cut(slim(rows), slice(i, i + 1), 1), one(i)) for i, g in enumerate(who)}
     return Told(told, {}, (watched - begin, time.perf_counter() - watched))

@@ -209,7 +209,7 @@ def test_how_the_work_is_shared_changes_nothing(make, monkeypatch, same, changes
 
 
 def test_a_run_that_may_go_back_says_so_of_every_stream(make):
-  """Streams that have learnt nothing weigh nothing; beside one that has, whose learning is played."""
+  """Streams that have learnt nothing weigh nothing, beside one whose learning is played."""
   runner = make(("none", "rollback", "oracle"), adapt=dataclasses.replace(ADAPT, warmup=150))
   loop, one = runner.loop, jnp.ones(1)
 
