@@ -1,7 +1,10 @@
-"""One part of a suite in a process of its own: `python -m mjx_cl.cli.worker OUT PART CORES`."""
+"""Parts of a suite in a process of its own, see runs/workers.py: `python -m mjx_cl.cli.worker OUT
+CORES`, names of parts on standard input.
+"""
 
 import os
 import pathlib
+import queue
 import signal
 import sys
 import threading
@@ -10,43 +13,67 @@ from mjx_cl.cli import app
 from mjx_cl.io import runtime, tables
 
 
+class Parts:
+  """Names of parts as they come in; once the parent closes standard input this process ends, its
+  state saved.
+  """
+
+  def __init__(self) -> None:
+    self.given, self.done = 0, 0
+    self.names: queue.SimpleQueue[str] = queue.SimpleQueue()
+    threading.Thread(target=self._listen, daemon=True).start()
+
+  def _listen(self) -> None:
+    rest = b""
+    # not sys.stdin, whose lock would still be held as the interpreter ends
+    while more := os.read(0, 4096):
+      *lines, rest = (rest + more).split(b"\n")
+      for line in lines:
+        self.given += 1
+        self.names.put(line.decode())
+    if self.given == self.done:
+      self.names.put("")
+      return
+    # where the parent died, nobody reads what is said, and saying it would be an error before the
+    # state is saved
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
 def main(arguments: list[str]) -> int:
-  """Runs PART of OUT/suite.json on the cores (numbers, separated by commas).
+  """Runs parts of OUT/suite.json on the cores (numbers, separated by commas).
 
   Returns:
     Exit status 0, 1 (files), 2 (settings) or 130 (stopped, saved).
   """
-  out, name, own = arguments
+  out, own = arguments
   if own and hasattr(os, "sched_setaffinity"):
     os.sched_setaffinity(0, {int(core) for core in own.split(",")})  # before JAX counts its threads
-  threading.Thread(target=_orphan, daemon=True).start()
+  parts, folder = Parts(), pathlib.Path(out)
 
   def do() -> None:
     runtime.setup()
     # JAX has not started before
     from mjx_cl.cli.live import RunDisplay
     from mjx_cl.runs import run, suite
+    from mjx_cl.runs.healthy import Healthy
 
-    folder = pathlib.Path(out)
-    values = tables.read_json(folder / "suite.json")["parts"][name]
-    with RunDisplay() as shown:
-      run.execute(
-        suite.config(name, values),
-        folder / name,
-        resume=(folder / name / "config.json").exists(),
-        progress=shown,
-      )
+    programs, healthy = run.Programs(), Healthy()
+    while name := parts.names.get():
+      values = tables.read_json(folder / "suite.json")["parts"][name]
+      with RunDisplay() as shown:
+        run.execute(
+          suite.config(name, values),
+          folder / name,
+          resume=(folder / name / "config.json").exists(),
+          progress=shown,
+          programs=programs,
+          healthy=healthy,
+        )
+      parts.done += 1
+      print(f"finished {name}", flush=True)
 
   return app.attempt(do)
-
-
-def _orphan() -> None:
-  """Ends this process, its state saved, once the parent closes its standard input."""
-  os.read(0, 1)  # not sys.stdin, whose lock would still be held as the interpreter ends
-  # where the parent died, nobody reads what is said, and saying it would be an error before the
-  # state is saved
-  os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
-  os.kill(os.getpid(), signal.SIGTERM)
 
 
 if __name__ == "__main__":

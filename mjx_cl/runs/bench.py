@@ -22,6 +22,7 @@ from mjx_cl.io import tables
 from mjx_cl.runs import merge, run, workers
 from mjx_cl.runs.costs import Estimate
 from mjx_cl.runs.doubts import notes as notes_of
+from mjx_cl.runs.healthy import Healthy
 from mjx_cl.runs.scores import collect, draw
 from mjx_cl.runs.suite import (
   Part,
@@ -151,7 +152,8 @@ def _together(
       left = f"; at most about {round(rest / 60) or 1} min left"
     tell(f"{name} finished, {len(over)} of {len(names)}{left}")
 
-  workers.together(worker, out, names, min(jobs, len(names)), end, tell)
+  robots = {part.name: part.config.env for part in plan.parts}
+  workers.together(worker, out, names, min(jobs, len(names)), end, tell, robots.get)
   return known
 
 
@@ -198,7 +200,7 @@ def execute(
   if jobs > 1 and len(todo) > 1:
     names.sort(key=lambda name: -guess([name]))
     return collect(out, plan, _together(plan, out, names, guess, tell, jobs, worker))
-  spent, programs = 0.0, run.Programs()
+  spent, programs, healthy = 0.0, run.Programs(), Healthy()
   known: dict[str, dict] = {}
   for i, part in enumerate(todo):
     if estimates:
@@ -214,6 +216,7 @@ def execute(
         progress=progress,
         save_every_s=save_every_s,
         programs=programs,
+        healthy=healthy,
       )
     spent += time.monotonic() - begin
     collect(out, plan, known)

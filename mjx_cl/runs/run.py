@@ -32,6 +32,7 @@ from mjx_cl.io import folders, tables
 from mjx_cl.io.interrupt import Interruptible
 from mjx_cl.render import figures
 from mjx_cl.runs.doubts import notes
+from mjx_cl.runs.healthy import Healthy
 from mjx_cl.runs.identity import check_same, identity
 from mjx_cl.runs.records import Ledger
 from mjx_cl.runs.runner import Progress, Runner
@@ -51,6 +52,7 @@ def execute(
   save_every_s: float = 60.0,
   tell: Callable[[str], Any] = lambda text: None,
   programs: Programs | None = None,
+  healthy: Healthy | None = None,
 ) -> dict:
   """Runs a config into a folder.
 
@@ -63,6 +65,7 @@ def execute(
     save_every_s: a kill at any moment loses at most so many seconds of work.
     tell: called with each line for the user.
     programs: compiled ones of this process that it may share.
+    healthy: lives before the onset, likewise.
 
   Returns:
     summary.json's value.
@@ -77,7 +80,7 @@ def execute(
     return tables.read_json(out / "summary.json")
   try:
     # refuses wrong names and broken agents before anything of an earlier run is removed
-    runner = Runner(config, out, programs)
+    runner = Runner(config, out, programs, healthy)
   except UserError:
     if fresh and not any(out.iterdir()):
       out.rmdir()
@@ -92,6 +95,7 @@ def execute(
       clear(out)
     runner.open()
     tables.write_json(out / "config.json", values)
+    runner.fork()
   for text in notes(config):
     tell(f"note: {text}")
   tell(

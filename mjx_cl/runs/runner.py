@@ -28,6 +28,7 @@ from mjx_cl.rollout.transfer import Transfer
 from mjx_cl.runs import packing, room
 from mjx_cl.runs.clock import clock_of, counted, sorted_out
 from mjx_cl.runs.groups import Settled
+from mjx_cl.runs.healthy import Healthy, fork, key_of, last, take
 from mjx_cl.runs.identity import arm_agents, identity
 from mjx_cl.runs.lives import Lives
 from mjx_cl.runs.loops import make_loop
@@ -81,7 +82,11 @@ class Runner:
   """
 
   def __init__(
-    self, config: RunConfig, out: pathlib.Path | str, programs: Programs | None = None
+    self,
+    config: RunConfig,
+    out: pathlib.Path | str,
+    programs: Programs | None = None,
+    healthy: Healthy | None = None,
   ) -> None:
     self.config = config = check(config)
     self.out = pathlib.Path(out)
@@ -114,6 +119,10 @@ class Runner:
     self.clock = clock_of(config, *learner, self.stops)
     self.clock.joined = not self.lives.herds
     self.room = room.of(config, *learner)
+    self.healthy = healthy
+    cards = [self.trained.card, *(other.card for other in self.others.values())]
+    owned = {leaf.removeprefix("mj.") for fault in self.faults for leaf in fault.owns}
+    self.shares = key_of(config, cards, owned) if healthy and self.lives.herds else ""
     # what has been lived
     self.done_chunks = 0
     self.seconds = dict.fromkeys(KINDS, 0.0)
@@ -163,6 +172,14 @@ class Runner:
     """Makes the working folder; before that nothing in `out` is touched."""
     self.checkpoints = checkpoints.Checkpoints(self.work / "checkpoints")
 
+  def fork(self) -> None:
+    """Goes on from what a run of another fault has lived before the onset, where there is one."""
+    past = self.healthy.kept.get(self.shares) if self.healthy else None
+    if past is None or not fork(self.lives, past):
+      return
+    self.done_chunks, self.parts = past.chunks, list(past.parts)
+    self._alarms, self._phase = past.alarms, past.phase
+
   # ---- one chunk ---------------------------------------------------------------------------------
 
   def step(self) -> Progress:
@@ -178,6 +195,9 @@ class Runner:
     self._alarms = self._alarms + digest.fired.sum(0)
     self.done_chunks += 1
     self._notice_failures(digest, now)
+    if self.healthy and self.shares and self.done_chunks <= last(self.config, self.chunk_steps):
+      past = take(self.lives, self.done_chunks, self.parts, self._alarms, self._phase)
+      self.healthy.keep(self.shares, past)
     if self.snapshots:
       self.snapshots.take(self.lives.acting, before, digest, now, self.chunk_steps)
     physics, compiled = self._physics_seconds() - physics, self.lives.compiled - compiled

@@ -1,9 +1,11 @@
-"""Parts of a suite side by side, each in a process of its own on a share of the cores.
+"""Parts of a suite side by side, in a process for each share of the cores.
 
-One run does not keep several cores busy all the time: its programs are compiled on one core, and
-acting is one program for all streams. The parent starts `python -m MODULE OUT PART CORES` for each
-part; OUT/suite.json says what the part is. A worker saves and ends when its standard input closes,
-so that none outlives its parent.
+One run does not keep several cores busy all the time: its programs are compiled on one core, and a
+few lives act as one batch. The parent starts `python -m MODULE OUT CORES`, writes the name of a
+part on its standard input, and reads `finished NAME` on its standard output before it writes the
+next; OUT/suite.json says what a part is. What is compiled, and what robots live before their onset,
+serves the later parts of a process. A worker saves and ends when its standard input closes, so that
+none outlives its parent.
 """
 
 import contextlib
@@ -13,7 +15,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from typing import Any
 
 import jax
@@ -51,11 +53,12 @@ def number(asked: int | None, needs: list[int], space: int) -> int:
 
 
 class Worker:
-  """A running part.
+  """A process that runs parts, one after the other.
 
   Attributes:
-    name: of the part.
     share: its place among the shares of the cores.
+    name: of the part that it runs, "": none.
+    kind: of the part that it has run last, see `together`.
     last: line that it said last.
   """
 
@@ -63,23 +66,24 @@ class Worker:
     self,
     module: str,
     out: pathlib.Path,
-    name: str,
     share: int,
     own: list[int],
     tell: Callable[[str], None],
   ) -> None:
-    self.name, self.share, self.last = name, share, ""
-    command = [sys.executable, "-m", module, str(out), name, ",".join(map(str, own))]
+    self.share, self.name, self.last = share, "", ""
+    self.kind: Hashable = None
+    command = [sys.executable, "-m", module, str(out), ",".join(map(str, own))]
     # a session of its own: Ctrl-C reaches the parent alone, which then closes the input
     self.process: Any = subprocess.Popen(
       command,
       stdin=subprocess.PIPE,
-      stdout=subprocess.DEVNULL,
+      stdout=subprocess.PIPE,
       stderr=subprocess.PIPE,
       text=True,
       errors="replace",
       start_new_session=True,
     )
+    self._over = threading.Event()
 
     def listen() -> None:
       for line in self.process.stderr:
@@ -87,35 +91,55 @@ class Worker:
           self.last = line.strip()
           # where nobody listens any more a full pipe would stop the worker
           with contextlib.suppress(OSError):
-            tell(f"{name}: {self.last}")
+            tell(f"{self.name}: {self.last}")
 
-    self.listener = threading.Thread(target=listen, daemon=True)
-    self.listener.start()
+    def wait() -> None:
+      for line in self.process.stdout:
+        if line.strip() == f"finished {self.name}":
+          self._over.set()
+
+    self.listeners = [threading.Thread(target=own, daemon=True) for own in (listen, wait)]
+    for thread in self.listeners:
+      thread.start()
+
+  def give(self, name: str, kind: Hashable = None) -> None:
+    """Has it run a part; a process that is gone is noticed by `check`."""
+    self.name, self.kind = name, kind
+    with contextlib.suppress(OSError):
+      self.process.stdin.write(f"{name}\n")
+      self.process.stdin.flush()
 
   def check(self) -> bool:
-    """Whether the part is finished.
+    """Whether it has finished its part; it has none from then on.
 
     Raises:
       UserError: with what the worker said last, where it failed over settings.
       FileError: likewise, over files, or where it was ended.
     """
     code = self.process.poll()
+    if code is not None:
+      for thread in self.listeners:
+        thread.join()
+    if self._over.is_set():
+      self._over.clear()
+      self.name = ""
+      return True
     if code is None:
       return False
-    self.listener.join()
-    self.process.stdin.close()
     if code < 0:
       raise FileError(
         f"part {self.name} was ended by signal {-code}; where memory ran out, --jobs 1 needs "
         "least; the same command goes on"
       )
-    if code:
-      kind = UserError if code == 2 else FileError
-      raise kind(
-        f"part {self.name}: "
-        f"{self.last.removeprefix('mjx-cl: ') or f'ended with exit status {code}'}"
-      )
-    return True
+    kind = UserError if code == 2 else FileError
+    raise kind(
+      f"part {self.name}: {self.last.removeprefix('mjx-cl: ') or f'ended with exit status {code}'}"
+    )
+
+  def close(self) -> None:
+    """Has it save and end, if it has not ended yet; `wait` for it afterwards."""
+    with contextlib.suppress(OSError):
+      self.process.stdin.close()
 
 
 def together(
@@ -125,8 +149,10 @@ def together(
   jobs: int,
   finished: Callable[[str], None],
   tell: Callable[[str], None] = lambda text: None,
+  kind: Callable[[str], Hashable] = lambda name: None,
 ) -> None:
-  """Runs the parts `names` of OUT/suite.json, `jobs` at a time, in their order.
+  """Runs the parts `names` of OUT/suite.json, `jobs` at a time, in their order, but that a process
+  goes on with parts of the kind that it has begun, of which it has programs and lives.
 
   Args:
     module: what each process runs, see cli/worker.py.
@@ -135,6 +161,7 @@ def together(
     jobs: how many at a time.
     finished: called with the name of each part as it ends.
     tell: called with each line that a part says.
+    kind: of a part.
 
   Raises:
     UserError: as soon as one fails over settings. Before any of these is raised the others have
@@ -142,26 +169,27 @@ def together(
     FileError: as soon as one fails otherwise.
     KeyboardInterrupt: on a signal.
   """
-  waiting, free, all_cores = list(names), list(range(jobs)), cores()
-  running: list[Worker] = []
+  waiting, all_cores = list(names), cores()
+  workers: list[Worker] = []
   try:
     with Interruptible() as stop:
-      while waiting or running:
-        over = [worker for worker in running if worker.check()]
-        running = [worker for worker in running if worker not in over]
-        free += [worker.share for worker in over]
-        while waiting and free:
-          share = free.pop(0)
-          running.append(
-            Worker(module, pathlib.Path(out), waiting.pop(0), share, all_cores[share::jobs], tell)
-          )
-        for worker in over:
-          finished(worker.name)
+      while waiting or any(worker.name for worker in workers):
+        over = [name for worker in workers if (name := worker.name) and worker.check()]
+        while waiting and len(workers) < jobs:
+          share = len(workers)
+          workers.append(Worker(module, pathlib.Path(out), share, all_cores[share::jobs], tell))
+        for worker in workers:
+          if waiting and not worker.name:
+            alike = (name for name in waiting if kind(name) == worker.kind)
+            name = next(alike, waiting[0])
+            waiting.remove(name)
+            worker.give(name, kind(name))
+        for name in over:
+          finished(name)
         stop.check()
         time.sleep(0.1)
   finally:
-    running = [worker for worker in running if worker.process.poll() is None]
-    for worker in running:  # all at once, then wait for all
-      worker.process.stdin.close()
-    for worker in running:
+    for worker in workers:  # all at once, then wait for all
+      worker.close()
+    for worker in workers:
       worker.process.wait()

@@ -142,6 +142,27 @@ def test_vmap_of_one_and_of_many_give_equal_bits(walker, same):
     assert same(alone, jax.tree.map(lambda x: x[i], many))
 
 
+def test_robots_that_are_the_same_in_every_bit_are_stepped_once(walker, same, monkeypatch):
+  native, sizes = Native(walker, substeps=10), []
+  inner = native.host._step
+  monkeypatch.setattr(
+    native.host, "_step", lambda layout, rows: sizes.append(len(rows)) or inner(layout, rows)
+  )
+  place = np.array([0, 1, 0, 2, 1, 0])
+  (qpos, qvel), gear = starts(3), gears(walker, 3)
+  state, ctrl = jax.vmap(native.init)(qpos, qvel), np.full((3, 6), 0.7, np.float32)
+  step = jax.jit(jax.vmap(native.step))
+  fields = {"actuator_gear": gear}
+  want = step(fields, state, ctrl)
+  got = step({"actuator_gear": gear[place]}, state[place], ctrl[place])
+  assert same(got, jax.tree.map(lambda x: x[place], want)) and sizes == [3, 3]
+  gear[2] *= 2  # no state, but what acts on it
+  gear = gear[place]
+  gear[2] *= np.float32(1.5)
+  step({"actuator_gear": gear}, state[place], ctrl[place])
+  assert sizes[2:] == [4]
+
+
 def test_a_field_without_batch_axis_is_shared_by_all(walker, same):
   native = Native(walker, substeps=10)
   state, gear, ctrl = (

@@ -64,12 +64,12 @@ def one_rollout():
 def make(saved, tmp_path_factory):
   """make(arms, seeds, ...): Runner of tiny agents."""
 
-  def runner(arms=ARMS, seeds=1, out=None, **given):
+  def runner(arms=ARMS, seeds=1, out=None, healthy=None, **given):
     settings = dict(steps=CHUNKS * CHUNK, onset=150, physics="native", adapt=ADAPT)
     settings |= dict(detector="rolling_sigma_plain", settings={"window": 60, "warmup": 30})
     config = RunConfig("walker", fault="gear", agent=str(saved), arms=arms, seeds=seeds)
-    config = dataclasses.replace(config, severity=0.5, **(settings | given))
-    return run.Runner(config, out or tmp_path_factory.mktemp("out"))
+    config = dataclasses.replace(config, **({"severity": 0.5} | settings | given))
+    return run.Runner(config, out or tmp_path_factory.mktemp("out"), healthy=healthy)
 
   return runner
 

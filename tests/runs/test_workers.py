@@ -158,7 +158,8 @@ def test_one_that_fails_is_named_and_none_goes_on(long, tmp_path, monkeypatch):
 
 def test_a_worker_that_is_killed_is_said(mini, tmp_path):  # noqa: F811
   suites.write_plan(suites.suite(str(mini)), tmp_path)
-  worker = workers.Worker(WORKER, tmp_path, "healthy", 0, [], lambda text: None)
+  worker = workers.Worker(WORKER, tmp_path, 0, [], lambda text: None)
+  worker.give("healthy")
   worker.process.kill()
   worker.process.wait()
   with pytest.raises(FileError, match="healthy was ended by signal 9.*the same command goes on"):
