@@ -341,10 +341,14 @@ class Query:
     words: [FOLDER] [SQL]
     within: One more folder, DIR or NAME=DIR: its tables are views that begin with its name.
       Repeatable.
+    limit: Rows at most; None: 100, with --json all.
+    timeout: Seconds that it may take.
   """
 
   words: Positional[tuple[str, ...]] = ()
   within: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(name="in")] = ()
+  limit: int | None = None
+  timeout: float | None = None
   json: bool = False
 
 

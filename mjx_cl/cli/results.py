@@ -11,10 +11,12 @@ import types
 from typing import Any
 
 from mjx_cl.cli.flags import Plot, Query, Report
-from mjx_cl.cli.output import emit
+from mjx_cl.cli.output import emit, say
 from mjx_cl.cli.tables import console, table
 from mjx_cl.errors import FileError, require
 from mjx_cl.io import tables
+
+FIRST = 100  # rows that are printed unless more are asked for, and under one heading
 
 
 def do_plot(args: Plot) -> None:
@@ -37,13 +39,22 @@ def do_query(args: Query) -> None:
     len(folder) <= 1, f"query takes [FOLDER] [SQL], the SQL in quotes; got {len(args.words)} words"
   )
   require(not (folder and args.within), "query takes a folder or --in, not both")
-  names, rows = tables.query(folder[0] if folder else tables.views(args.within), sql)
+  require(args.limit is None or args.limit >= 1, f"--limit must be above 0; got {args.limit}")
+  if args.timeout is not None:
+    require(0 < args.timeout < 1e9, f"--timeout must lie in 0..1e9 s; got {args.timeout:g}")
+  limit = args.limit or (None if args.json or sql is None else FIRST)
+  found = folder[0] if folder else tables.views(args.within)
+  names, rows = tables.query(found, sql, None if limit is None else limit + 1, args.timeout)
+  more, rows = limit is not None and len(rows) > limit, rows[:limit]
   if args.json:
     for k, name in enumerate(names):  # two columns of one name would be one in JSON
       names[k] = name if name not in names[:k] else f"{name}_{k}"
     emit([{n: json_value(x) for n, x in zip(names, r)} for r in rows])
   else:
-    console().print(table(names, rows, left=names))
+    for k in range(0, max(1, len(rows)), FIRST):  # a long table takes long to be set
+      console().print(table(names, rows[k : k + FIRST], left=names))
+  if more:
+    say(f"the first {limit:,} rows; --limit takes a number, --json prints all")
 
 
 def json_value(x: Any) -> Any:

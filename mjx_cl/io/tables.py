@@ -1,11 +1,15 @@
 """Result files: JSON, Parquet, suites in TOML, and SQL views over tables."""
 
+import contextlib
 import json
+import math
 import os
 import pathlib
 import re
+import threading
+import time
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import duckdb
@@ -15,6 +19,9 @@ import pyarrow.parquet
 
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.io import folders
+
+PAGE = 2_000  # rows that are fetched at a time
+TICK_S = 0.05  # how often a signal is looked for
 
 
 def plain(x: Any) -> Any:
@@ -184,15 +191,21 @@ def views(folders: tuple[str, ...] = (), results: str = "results") -> dict[str, 
 
 
 def query(
-  tables: os.PathLike | str | dict[str, pathlib.Path], sql: str | None = None
+  tables: os.PathLike | str | dict[str, pathlib.Path],
+  sql: str | None = None,
+  limit: int | None = None,
+  timeout_s: float | None = None,
 ) -> tuple[list[str], list[tuple]]:
   """Runs SQL over result files, which it can read and not change: SELECT statements alone (FROM,
   DESCRIBE, SHOW and SUMMARIZE are such), no file outside the views, no settings, no extensions.
+  An interrupt ends it at once.
 
   Args:
     tables: a folder, every FOLDER/*.parquet is a view of its own name; or views by name, see
       `views`.
     sql: None lists the views.
+    limit: rows at most; None: all.
+    timeout_s: it may take; None: as long as it takes.
 
   Returns:
     (names of columns, rows).
@@ -207,13 +220,14 @@ def query(
   )
   # nothing is spilled to disk; without external access no Python variable is taken for a table
   # either
-  with duckdb.connect(
+  db = duckdb.connect(
     config={
       "temp_directory": "",
       "autoinstall_known_extensions": False,
       "autoload_known_extensions": False,
     }
-  ) as db:
+  )
+  try:
     # a path is a pattern to read_parquet; a sign in brackets means itself, so that a folder may be
     # called a[1]
     paths = {name: re.sub(r"([*?\[])", r"[\1]", str(file)) for name, file in tables.items()}
@@ -226,20 +240,74 @@ def query(
     db.execute("set allowed_paths = $1", [[*map(str, tables.values()), *paths.values()]])
     db.execute("set enable_external_access = false")
     db.execute("set lock_configuration = true")
-    if sql is None:
-      return ["view", "rows", "columns"], [_describe(db, name) for name in tables]
     try:
+      if sql is None:
+        listed = lambda: [_describe(db, name) for name in tables]
+        return ["view", "rows", "columns"], _interruptible(db, listed, timeout_s)
+      sql.encode()
       statements = duckdb.extract_statements(sql)
       for kind in (x.type.name for x in statements if x.type != duckdb.StatementType.SELECT):
         said = "PIVOT without a list of values" if kind == "MULTI" else kind
         raise UserError(f"query: results are read-only, and {said} is no select; views: {names}")
       if not statements:
         raise UserError(f"query: no statement; views: {names}")
-      for statement in statements:
-        result = db.execute(statement)
-      return [c[0] for c in result.description], result.fetchall()
-    except duckdb.Error as e:
-      raise UserError(f"query: {str(e).splitlines()[0]}; views: {names}") from None
+      return _interruptible(db, lambda: _answer(db, statements, limit), timeout_s)
+    except UserError:
+      raise
+    except UnicodeEncodeError:
+      raise UserError("query: the SQL is no UTF-8 text") from None
+    except Exception as e:  # of DuckDB, and what Python cannot make of a value
+      said = (str(e) or type(e).__name__).splitlines()[0]
+      raise UserError(f"query: {said}; views: {names}") from None
+  finally:
+    with contextlib.suppress(duckdb.Error):  # after a second signal it may be busy still
+      db.close()
+
+
+def _answer(
+  db: duckdb.DuckDBPyConnection, statements: list, limit: int | None
+) -> tuple[list[str], list[tuple]]:
+  for statement in statements:
+    result = db.execute(statement)
+  rows: list[tuple] = []
+  most = math.inf if limit is None else limit
+  while part := result.fetchmany(int(min(PAGE, most - len(rows)))):
+    rows += part
+  return [c[0] for c in result.description], rows
+
+
+def _interruptible(
+  db: duckdb.DuckDBPyConnection, answer: Callable[[], Any], timeout_s: float | None
+) -> Any:
+  """What `answer` gives; it is computed on a thread, since Python notes no signal meanwhile.
+
+  Raises:
+    UserError: it has not come in time.
+  """
+  out: list[Any] = []
+  done = threading.Event()
+
+  def run() -> None:
+    try:
+      out.append((answer(), None))
+    except BaseException as e:
+      out.append((None, e))
+    done.set()
+
+  threading.Thread(target=run, daemon=True).start()
+  end = math.inf if timeout_s is None else time.monotonic() + timeout_s
+  try:
+    while not done.wait(TICK_S):
+      if time.monotonic() > end:
+        raise UserError(f"query: no answer within {timeout_s:g} s; --timeout gives it longer")
+  finally:
+    while not done.is_set():  # again and again: between two pages there is nothing to interrupt
+      db.interrupt()
+      done.wait(TICK_S)
+  value, wrong = out[0]
+  if wrong is not None:
+    raise wrong
+  return value
 
 
 def _describe(db: duckdb.DuckDBPyConnection, name: str) -> tuple[str, int, str]:

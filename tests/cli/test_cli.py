@@ -287,6 +287,31 @@ def test_query(mjx, refused, tmp_path):
   assert "no .parquet" in refused(2, "query", tmp_path / "none", "select 1")
 
 
+def test_query_prints_the_first_rows_and_says_so(mjx, refused, tmp_path):
+  count = 100 * results.FIRST
+  store.write_table(tmp_path / "trace.parquet", {"step": np.arange(count)})
+  for words, rows in (((), results.FIRST), (("--limit", "250"), 250)):
+    code, out, err = mjx("query", tmp_path, "from trace", *words)
+    shown = [line.strip("│ ") for line in out.splitlines() if line.startswith("│")]
+    assert code == 0 and shown == [str(k) for k in range(rows)]
+    assert out.count("step") == -(-rows // results.FIRST) and f"first {rows}" in err
+  code, out, err = mjx("query", tmp_path, "from trace", "--json")
+  assert (code, err) == (0, "") and len(json.loads(out)) == count
+  code, out, err = mjx("query", tmp_path, "from trace", "--json", "--limit", "3")
+  assert "first 3" in err and len(json.loads(out)) == 3
+  code, out, err = mjx("query", tmp_path, "select 7", "--limit", "1", "--timeout", "600")
+  assert (code, err) == (0, "") and "7" in out
+  for words in (("--limit", "0"), ("--timeout", "0"), ("--timeout", "nan")):
+    assert words[0] in refused(2, "query", tmp_path, "from trace", *words)
+  assert "UTF-8" in refused(2, "query", tmp_path, "select '\udcff'")
+
+
+def test_names_are_no_markup(mjx, tmp_path):
+  store.write_table(tmp_path / "trace.parquet", {"[/red]x": ["[/b]"]})
+  code, out, err = mjx("query", tmp_path, "from trace")
+  assert (code, err) == (0, "") and "[/red]x" in out and "[/b]" in out
+
+
 def test_report_elsewhere_than_in_a_checkout_is_one_line(refused, tmp_path, monkeypatch):
   monkeypatch.setattr(results, "__file__", str(tmp_path / "mjx_cl" / "cli" / "results.py"))
   assert "checkout" in refused(2, "report", "--check")

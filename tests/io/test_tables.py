@@ -6,6 +6,8 @@ import math
 import os
 import pathlib
 import re
+import signal
+import threading
 import types
 
 import numpy as np
@@ -172,6 +174,43 @@ def test_a_bad_query_is_one_line_that_names_the_views(folder, sql):
   with pytest.raises(UserError) as error:
     tables.query(folder, sql)
   assert "runs, trace" in one_line(error) and error.value.exit_code == 2
+
+
+ENDLESS = "select count(*) from range(10000000) a, range(10000000) b where a.range < b.range"
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("times", [1, 2])
+def test_a_query_ends_with_a_signal(folder, monkeypatch, number, times):
+  """The last one comes while the first is being acted upon."""
+  begun, inner = threading.Event(), tables._answer
+  monkeypatch.setattr(tables, "_answer", lambda *given: begun.set() or inner(*given))
+
+  def send():
+    begun.wait()
+    for _ in range(times):
+      signal.raise_signal(number)
+
+  sender = threading.Thread(target=send)
+  sender.start()
+  old = signal.signal(number, signal.default_int_handler)
+  try:
+    with pytest.raises(KeyboardInterrupt):
+      tables.query(folder, ENDLESS)
+  finally:
+    signal.signal(number, old)
+    sender.join()
+
+
+def test_a_query_ends_when_its_time_is_over(folder):
+  with pytest.raises(UserError, match="within 0.2 s"):
+    tables.query(folder, ENDLESS, timeout_s=0.2)
+
+
+def test_a_query_gives_as_many_rows_as_asked(folder):
+  for limit in (1, 1999, 2000, 2001, 5000):
+    assert len(tables.query(folder, "from range(4500)", limit)[1]) == min(limit, 4500)
+  assert tables.query(folder, "from range(4500)")[1] == [(k,) for k in range(4500)]
 
 
 def test_query_of_a_folder_without_tables(tmp_path):
