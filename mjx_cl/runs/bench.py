@@ -95,6 +95,7 @@ def offers(
         if text := merge.differs(folder, part.config, merge.SEEDS):
           tell(f"note: {folder} {text}; it is not taken over")
         elif own := merge.seeds_of(folder, part.config):
+          merge.whole(folder)
           there.append((folder, own))
       except UserError as e:
         tell(f"note: {e}; {part.name} is not taken over from there")
@@ -238,6 +239,8 @@ def publish(out: pathlib.Path | str, plan: Suite, to: pathlib.Path | str) -> lis
   """
   out, to = pathlib.Path(out), pathlib.Path(to)
   kept, done = earlier(to, plan), standing(out, plan.parts)[0]
+  for part in done:
+    merge.whole(out / part.name)
   for part in done:
     kept.pop(part.name, None)
     (to / part.name).mkdir(parents=True, exist_ok=True)

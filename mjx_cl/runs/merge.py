@@ -22,6 +22,7 @@ from mjx_cl import envs
 from mjx_cl.adapt.arms import ARMS
 from mjx_cl.config import RunConfig
 from mjx_cl.errors import FileError, UserError, require
+from mjx_cl.io import arrays
 from mjx_cl.io import folders as folder_lib
 from mjx_cl.io import tables as store
 from mjx_cl.render import figures
@@ -41,6 +42,7 @@ ORDER = {
   "residuals": "step",
 }
 KEPT = ("git_commit", "machine", "python", "versions")
+PNG_END = b"IEND\xaeB`\x82"  # of every PNG file, https://www.w3.org/TR/png-3/#11IEND
 SEEDS = ("seeds", "first_seed")  # settings that pieces do not share
 # of config.json, beside the settings: one agent and one backend lived all the seeds
 SAME = ("physics", "agent_card", "arm_cards", "repeat", "control_s")
@@ -176,6 +178,33 @@ def choose(folders: Iterable[pathlib.Path | str], config: RunConfig) -> list[pat
       "--seeds N and another --out, or ask for fewer --seeds"
     )
   return list(dict.fromkeys(found[seed] for seed in sorted(found)))
+
+
+def whole(folder: pathlib.Path) -> None:
+  """Reads all files of a finished run of somebody else's.
+
+  Raises:
+    FileError: one is broken, missing, or a symbolic link, which may lead anywhere.
+  """
+  files = sorted(path for path in folder.rglob("*") if not path.is_dir() or path.is_symlink())
+  for file in files:
+    if file.is_symlink():
+      raise FileError(f"{file} is a symbolic link; put the file itself there")
+  for name in ("config.json", "summary.json", "runs.parquet"):
+    if folder / name not in files:
+      raise FileError(f"{folder} holds no {name}; run that part again")
+  for file in files:
+    try:
+      if file.suffix == ".json":
+        store.read_json(file)
+      elif file.suffix == ".parquet":
+        store.read_arrow(file)
+      elif file.suffix == ".npz":
+        arrays.read(file)
+      elif file.suffix == ".png" and not file.read_bytes().endswith(PNG_END):
+        raise FileError(f"{file} is no whole picture")
+    except FileError as e:
+      raise FileError(f"{e}; copy that run once more, or run it again") from None
 
 
 def join(folders: Iterable[pathlib.Path], out: pathlib.Path | str, config: RunConfig) -> dict:

@@ -15,7 +15,7 @@ from test_cli import mjx, refused  # noqa: F401  fixtures
 
 from mjx_cl.config import RunConfig
 from mjx_cl.errors import FileError, UserError
-from mjx_cl.io import tables
+from mjx_cl.io import arrays, tables
 from mjx_cl.runs import bench, costs, merge, records, summary
 from mjx_cl.runs import suite as suites
 from mjx_cl.scoring import stop_rule
@@ -194,7 +194,7 @@ def test_agents_and_residuals_come_along(tmp_path):
   ]
   for piece, seed in zip(folders, (1, 2)):
     (piece / f"agents/oracle-{seed}").mkdir(parents=True)
-    (piece / f"agents/oracle-{seed}/agent.npz").write_bytes(b"weights of %d" % seed)
+    arrays.write(piece / f"agents/oracle-{seed}/agent.npz", {"weights": np.full(3, seed)})
     rows = [
       (r["stream"], r["arm"], r["seed"], step)
       for r in tables.read_rows(piece / "runs.parquet")
@@ -210,9 +210,10 @@ def test_agents_and_residuals_come_along(tmp_path):
     (tmp_path / "whole", [tmp_path / "joined"]),
   ):
     bench.take(out, [part], bench.offers(out, [part], theirs))
-    assert {p.parent.name: p.read_bytes() for p in (out / "damping/agents").rglob("agent.npz")} == {
-      "oracle-1": b"weights of 1",
-      "oracle-2": b"weights of 2",
+    found = (out / "damping/agents").rglob("agent.npz")
+    assert {p.parent.name: arrays.read(p)["weights"].tolist() for p in found} == {
+      "oracle-1": [1, 1, 1],
+      "oracle-2": [2, 2, 2],
     }
     rows = tables.read_rows(out / "damping/residuals.parquet")
     assert [(r["stream"], r["arm"], r["seed"], r["step"]) for r in rows] == [

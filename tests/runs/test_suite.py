@@ -438,8 +438,8 @@ def test_parts_run_once_go_on_and_merge(mjx, refused, mini, tmp_path, monkeypatc
   monkeypatch.setattr(
     run.Runner,
     "__init__",
-    lambda self, config, folder, programs=None: (
-      begun.append(pathlib.Path(folder).name) or init(self, config, folder, programs)
+    lambda self, config, folder, *shared: (
+      begun.append(pathlib.Path(folder).name) or init(self, config, folder, *shared)
     ),
   )
 
@@ -638,6 +638,39 @@ def test_what_a_merge_refuses_is_named_and_the_rest_is_taken(mjx, tmp_path):  # 
   assert "walker/detector=ewma" not in bench.offers(
     out, parts, [tmp_path / "other"], said.append
   ) and any("is broken" in line for line in said)
+
+
+def truncate(file):
+  file.write_bytes(file.read_bytes()[:-20])
+
+
+@pytest.mark.parametrize(
+  "spoil, words",
+  [
+    (lambda piece: truncate(piece / "runs.parquet"), "run it again"),
+    (lambda piece: truncate(piece / "events.parquet"), "run it again"),
+    (lambda piece: (piece / "runs.parquet").unlink(), "holds no runs.parquet"),
+    (lambda piece: (piece / "figure.png").write_bytes(b"\x89PNG"), "no whole picture"),
+    (lambda piece: (piece / "summary.json").write_text("[]"), "run it again"),
+    (lambda piece: (piece / "agents").symlink_to(piece.parents[1]), "symbolic link"),
+    (lambda piece: (piece / "trace.parquet").symlink_to(piece / "runs.parquet"), "symbolic link"),
+  ],
+)
+def test_a_piece_that_is_not_whole_is_left_and_a_whole_one_taken(tmp_path, spoil, words):  # noqa: F811
+  """Nothing of it is copied, and the part is not taken for finished."""
+  plan, name = suites.suite("loop"), "walker/detector=ewma"
+  (part,) = (p for p in plan.parts if p.name == name)
+  good, bad, out, said = RESULTS / "loop", tmp_path / "bad", tmp_path / "out", []
+  shutil.copytree(good / name, bad / name)
+  assert bench.offers(out, [part], [bad])
+  spoil(bad / name)
+  found = bench.offers(out, [part], [bad], said.append)
+  bench.take(out, [part], found)
+  assert not found and not out.exists() and len(said) == 1 and words in said[0]
+  assert bench.offers(out, [part], [bad, good]) == {name: [good / name]}
+  with pytest.raises(FileError, match=words):
+    bench.publish(bad, plan, tmp_path / "published")
+  assert not (tmp_path / "published").exists()
 
 
 def test_publishing_a_part_keeps_the_others(mjx, refused, tmp_path):  # noqa: F811
