@@ -13,7 +13,9 @@ class UserError(Exception):
 
 
 class PluginError(UserError):
-  """What goes wrong inside a robot, fault or detector of another package."""
+  """What goes wrong inside a robot, fault or detector of another package: exit code 1."""
+
+  exit_code = 1
 
 
 class FileError(UserError):

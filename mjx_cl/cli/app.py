@@ -15,8 +15,10 @@ import os
 import re
 import signal
 import sys
+import threading
+import traceback
 import types
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Annotated, Any, Union
 
 import tyro
@@ -41,7 +43,8 @@ from mjx_cl.cli.flags import (
 )
 from mjx_cl.cli.output import apart, say
 from mjx_cl.config import FaultConfig, quick
-from mjx_cl.errors import FileError, UserError
+from mjx_cl.errors import FileError, PluginError, UserError
+from mjx_cl.io import interrupt, plugins
 from mjx_cl.io.interrupt import Interruptible, Lasting, later
 
 # what is said of a command in flags.py -> the module that does it, imported once it is called
@@ -144,8 +147,10 @@ def attempt(do: Callable[[], object], again: Callable[[], str] = lambda: "") -> 
 
   def stop(number: int, frame: types.FrameType | None) -> None:
     if not later(number, frame):
+      interrupt.note(number)
       raise KeyboardInterrupt
 
+  interrupt.forget()
   signal.signal(signal.SIGTERM, stop)
   if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
     signal.signal(signal.SIGINT, stop)
@@ -189,6 +194,20 @@ def _attempt(do: Callable[[], object], again: Callable[[], str]) -> int:
     return FileError.exit_code
 
 
+@contextlib.contextmanager
+def ours() -> Iterator[None]:
+  """Whoever wants to end the program but the user is named, and so is the place."""
+  try:
+    yield
+  except Exception:
+    raise
+  except BaseException as e:
+    if plugins.of_user(e):
+      raise
+    *_, last = traceback.extract_tb(e.__traceback__)
+    raise PluginError(f"{last.filename}, line {last.lineno}: {plugins.line(e)}") from None
+
+
 def main(argv: list[str] | None = None) -> int:
   """Entry point of `mjx-cl`."""
   command: Any = None
@@ -201,7 +220,7 @@ def main(argv: list[str] | None = None) -> int:
 
       shared = isinstance(command, Train) and command.seeds > 0
       runtime.setup(runtime.sharing(command.seeds) if shared else 1)
-    with apart(command):
+    with apart(command), ours():
       DO[type(command)](command)
 
   def again() -> str:
@@ -210,8 +229,10 @@ def main(argv: list[str] | None = None) -> int:
     return "; the same command goes on where it stopped" * isinstance(command, (Record, Bench))
 
   status = attempt(do, again)
-  # a save that was broken off has threads that would complain of the interpreter's end
-  if status == 130 and argv is None and Interruptible.again:
+  # a save that was broken off has threads that would complain of the interpreter's end; foreign
+  # code may have one that never ends
+  busy = any(not t.daemon and t is not threading.current_thread() for t in threading.enumerate())
+  if argv is None and status and (busy or Interruptible.again):
     for stream in (sys.stdout, sys.stderr):
       with contextlib.suppress(OSError, ValueError):
         stream.flush()

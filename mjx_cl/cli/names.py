@@ -16,7 +16,7 @@ from mjx_cl.training import agents, needs
 
 def first(member: object) -> str:
   """First line of its docstring."""
-  return (member.__doc__ or "").strip().split("\n")[0]
+  return str(member.__doc__ or "").strip().split("\n")[0]
 
 
 TABLES: dict[str, Callable[[], Mapping[str, str]]] = {

@@ -2,6 +2,7 @@
 one object per stream.
 """
 
+import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -12,7 +13,8 @@ import numpy as np
 from mjx_cl.detectors.base import Alarm, Detector
 from mjx_cl.detectors.combine import NAMES, is_channel, on
 from mjx_cl.errors import UserError
-from mjx_cl.io.plugins import find, line
+from mjx_cl.io.apart import apart, check_causal, fresh, run_host
+from mjx_cl.io.plugins import find
 from mjx_cl.rollout.monitor import Residual
 
 
@@ -24,12 +26,16 @@ class HostDetector(NamedTuple):
     host_name: its name in results.
     channel: what it watches, one of combine.CHANNELS.
     log: whether it is given ln max(x, 1e-9).
+    source: what `load` found it by, "": none.
+    settings: keyword arguments of `source`.
   """
 
   factory: Callable[[], Any]
   host_name: str
   channel: str = "opr"
   log: bool = False
+  source: str = ""
+  settings: dict | None = None
 
 
 def load(
@@ -57,123 +63,27 @@ def load(
     raise UserError(f"unknown channel {channel!r}; choose from: {NAMES}")
   build, name = find(source, "host detector"), source.rpartition(":")[2]
   settings = dict(settings or {})
-  host = HostDetector(lambda: build(**settings), host_name or name, channel, log)
-  _fresh(host.factory, host.host_name)
+  host = HostDetector(lambda: build(**settings), host_name or name, channel, log, source, settings)
+  fresh(host.factory, host.host_name)
   return host
 
 
-def _fresh(factory: Callable[[], Any], host_name: str) -> Any:
-  try:
-    detector = factory()
-  except (Exception, SystemExit) as e:
-    raise UserError(f"host detector {host_name} cannot be built: {line(e)}") from None
-  if not callable(getattr(detector, "update", None)) or isinstance(detector, type):
-    raise UserError(f"host detector {host_name}: {type(detector).__name__} has no method update(x)")
-  return detector
-
-
-def _step(detector: Any, x: float) -> tuple[bool, float]:
-  """One sample; TypeError where the answer is no answer."""
-  answer = detector.update(x)
-  if answer is None or answer is detector:
-    if not hasattr(detector, "drift_detected"):
-      raise TypeError("update gave no bool, and there is no attribute drift_detected")
-    answer = detector.drift_detected
-  if not isinstance(answer, (bool, np.bool_)):
-    raise TypeError(f"update must tell a bool, not {type(answer).__name__}")
-  score = getattr(detector, "score", None)
-  return bool(answer), float("nan") if score is None or callable(score) else float(score)
-
-
-def run_host(
-  factory: Callable[[], Any], xs: np.ndarray, host_name: str | None = None
-) -> tuple[np.ndarray, np.ndarray]:
-  """Runs a plain Python detector over recorded streams, sample by sample, a fresh object for each.
-
-    fired[t, s] = what `update(xs[t, s])` returns, a bool; where it returns None or the object
-    itself (river's detectors): its `drift_detected`
-    score[t, s] = its attribute `score` after that, a float, larger is more suspect; nan where it
-    has none or it is None
-
-  A sample that is no finite number is skipped: the object is not called, fired is False, score nan,
-  as with every other detector here. What an object does after its alarm (start anew or not) is its
-  own affair.
-
-  Args:
-    factory: () -> object with `update(x: float)`.
-    xs: (T, S), samples of S streams.
-    host_name: for messages; default: the name of the class.
-
-  Returns:
-    (fired bool (T, S), score float64 (T, S)).
-
-  Raises:
-    UserError, one line with class, step and stream, for whatever the object raises and for an
-    answer that is no bool.
+def run(host: HostDetector, xs: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+  """`run_host` of (T, S) and the seconds that it took; one that was loaded by name runs in a
+  process of its own.
   """
-  xs = np.asarray(xs, np.float64)
-  if xs.ndim != 2:
-    raise UserError(f"run_host takes streams of shape (T, S); got {xs.shape}")
-  fired, scores = np.zeros(xs.shape, bool), np.full(xs.shape, np.nan)
-  objects: list[Any] = []
-  for s in range(xs.shape[1]):
-    detector = _fresh(factory, host_name or str(getattr(factory, "__name__", "of your own")))
-    if any(detector is other for other in objects):
-      raise UserError(
-        f"host detector {type(detector).__name__}: the factory gave the same object twice; "
-        "each stream needs one of its own"
-      )
-    objects.append(detector)
-    for t in np.flatnonzero(np.isfinite(xs[:, s])):
-      try:
-        fired[t, s], scores[t, s] = _step(detector, float(xs[t, s]))
-      except (Exception, SystemExit) as e:
-        raise UserError(
-          f"host detector {type(detector).__name__} failed at step {t} of stream {s}: {line(e)}"
-        ) from None
-  return fired, scores
+  if host.source:
+    return apart(host.source, host.settings or {}, xs, host.host_name)
+  begin = time.perf_counter()
+  return *run_host(host.factory, xs, host.host_name), time.perf_counter() - begin
 
 
-def check_causal(
-  factory: Callable[[], Any],
-  xs: np.ndarray,
-  cuts: tuple[int, ...] | None = None,
-  host_name: str | None = None,
-) -> None:
-  """Refuses a detector whose past answers depend on what came later, on other streams, on an
-  earlier run, or on chance.
-
-    run_host(xs[:n])[t] must equal run_host(xs)[t] for t < n, to the bit, for each n of `cuts` and
-    each stream by itself
-
-  An `init`/`update` pair cannot fail this; a class with shared state, a file read ahead, a clock or
-  an unseeded random number can.
-
-  Args:
-    factory: as in `run_host`.
-    xs: (T, S).
-    cuts: lengths of the beginnings; default: a quarter, a half, and the whole once more.
-    host_name: as in `run_host`.
-
-  Raises:
-    UserError that names class, step and stream of the first difference.
-  """
-  xs = np.asarray(xs, np.float64)
-  whole = run_host(factory, xs, host_name)
-  for n in cuts or (len(xs) // 4, len(xs) // 2, len(xs)):
-    for s in range(xs.shape[1]):
-      part = run_host(factory, xs[:n, s : s + 1], host_name)
-      differ = (part[0][:, 0] != whole[0][:n, s]) | ~(
-        (part[1][:, 0] == whole[1][:n, s]) | (np.isnan(part[1][:, 0]) & np.isnan(whole[1][:n, s]))
-      )
-      if differ.any():
-        name = type(_fresh(factory, host_name or "")).__name__
-        raise UserError(
-          f"host detector {name} is not causal: at step {int(differ.argmax())} of stream {s} "
-          "it answers otherwise when the stream ends "
-          f"after {n} samples than in the whole run (shared state, chance without a seed, or a "
-          "look ahead)"
-        )
+def causal(host: HostDetector, xs: np.ndarray) -> None:
+  """`check_causal`, likewise."""
+  if host.source:
+    apart(host.source, host.settings or {}, xs, host.host_name, causal=True)
+  else:
+    check_causal(host.factory, xs, host_name=host.host_name)
 
 
 def samples(host: HostDetector, residual: Residual) -> np.ndarray:

@@ -10,7 +10,7 @@ from mjx_cl.envs.car_real import CarReal
 from mjx_cl.envs.quadruped import Quadruped
 from mjx_cl.envs.walker import Walker
 from mjx_cl.errors import PluginError, UserError, choose
-from mjx_cl.io.plugins import Registry, line
+from mjx_cl.io.plugins import Registry, line, of_user
 from mjx_cl.physics import PURE_JAX
 from mjx_cl.types import Spec
 
@@ -56,5 +56,7 @@ def make(name: str, physics: str = "auto") -> Any:
     return robot
   except UserError:
     raise
-  except Exception as e:  # whatever a foreign class raises
+  except BaseException as e:  # whatever a foreign class raises
+    if of_user(e):
+      raise
     raise PluginError(f"environment {name!r} cannot be built: {line(e)}") from e

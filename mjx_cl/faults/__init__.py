@@ -36,7 +36,7 @@ from mjx_cl.faults.schedule import FOREVER, Plan, numbers, plan
 from mjx_cl.faults.sensor import SENSOR
 from mjx_cl.faults.task import TASK
 from mjx_cl.faults.transfer import TRANSFER
-from mjx_cl.io.plugins import Registry, line
+from mjx_cl.io.plugins import Registry, line, of_user
 from mjx_cl.types import Array
 
 FAMILIES = {
@@ -82,7 +82,7 @@ class Said(NamedTuple):
 
 def said(name: str) -> Said:
   """`Said` of fault `name`."""
-  paragraphs = [" ".join(x.split()) for x in (inspect.getdoc(FAULTS[name]) or "").split("\n\n")]
+  paragraphs = [" ".join(x.split()) for x in str(inspect.getdoc(FAULTS[name]) or "").split("\n\n")]
   last = paragraphs[-1].replace("`", "")
   hits = [
     re.search(rf"\b{word}:? (.*?)\.(?: [A-Z]|$)", last) for word in ("Severity", "Target", "Owns")
@@ -118,7 +118,9 @@ def make(name: str, env: Any) -> Fault:
     return made
   except UserError:
     raise
-  except Exception as e:  # whatever a foreign function raises
+  except BaseException as e:  # whatever a foreign function raises
+    if of_user(e):
+      raise
     if getattr(e, "name", None) == "mj_model" and not hasattr(env, "mj_model"):
       raise UserError(
         f"fault {name!r} acts on a MuJoCo model, which robot {env.spec.name!r} does not have"

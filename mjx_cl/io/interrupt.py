@@ -4,12 +4,14 @@ Raising inside a physics callback would surface as an XLA error with half a chun
 the chunk end, the state be saved, and then KeyboardInterrupt be raised.
 """
 
+import concurrent.futures
 import contextlib
 import os
 import signal
 import sys
 import threading
 import types
+from collections.abc import Iterator
 from typing import Any, Self, TextIO
 
 
@@ -44,6 +46,40 @@ class Lasting:
 
   def __getattr__(self, name: str) -> object:
     return getattr(self._stream, name)
+
+
+@contextlib.contextmanager
+def threads(count: int, name: str = "") -> Iterator[concurrent.futures.ThreadPoolExecutor]:
+  """A pool of threads. After an error or an interrupt what has not begun never does, and what has
+  is not waited for: it may never end.
+  """
+  pool = concurrent.futures.ThreadPoolExecutor(count, name)
+  try:
+    yield pool
+  except BaseException:
+    pool.shutdown(wait=False, cancel_futures=True)
+    raise
+  pool.shutdown()
+
+
+_SENT: list[int] = []  # signals that have come and were acted upon
+
+
+def note(number: int) -> None:
+  """Notes that a signal has come which ends what is under way."""
+  _SENT.append(number)
+
+
+def forget() -> None:
+  """Forgets signals that have been acted upon."""
+  _SENT.clear()
+
+
+def sent() -> bool:
+  """Whether a KeyboardInterrupt is the user's: a signal has come, or Python's own handler is in
+  place, which tells nobody.
+  """
+  return bool(_SENT) or signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 def later(number: int, frame: types.FrameType | None) -> bool:
@@ -86,8 +122,10 @@ class Interruptible:
       if later(number, frame):
         return
       Interruptible.again = True
+      note(number)
       raise KeyboardInterrupt
     self._set = True
+    note(number)
     with contextlib.suppress(RuntimeError):  # the stream is being written to: a reentrant call
       print("mjx-cl: stopping after this chunk, saving", file=sys.stderr, flush=True)
 

@@ -16,6 +16,7 @@ from collections.abc import Callable
 from typing import Any
 
 from mjx_cl.errors import FileError, PluginError, UserError
+from mjx_cl.io import interrupt
 
 
 class Registry(collections.UserDict):
@@ -66,7 +67,9 @@ class Registry(collections.UserDict):
           )
         try:
           found[entry.name] = entry.load()
-        except (Exception, SystemExit) as e:  # whatever a foreign module raises
+        except BaseException as e:  # whatever a foreign module raises
+          if of_user(e):
+            raise
           raise PluginError(
             f"{self.kind} {entry.name!r} of {entry.value} cannot be loaded: {line(e)}"
           ) from e
@@ -88,9 +91,20 @@ class Registry(collections.UserDict):
     raise KeyError(name)
 
 
-def line(e: BaseException) -> str:
-  """An exception in one line."""
-  return f"{type(e).__name__}: {' '.join(str(e).split()) or 'without a message'}"
+def line(e: BaseException, lines: int | None = None) -> str:
+  """An exception in one line: of its message the first `lines`, None: all."""
+  try:
+    said = " ".join(" ".join(str(e).strip().splitlines()[:lines]).split())
+  except BaseException:  # a foreign one's own method
+    said = "its message cannot be read"
+  return f"{type(e).__name__}: {said or 'without a message'}"
+
+
+def of_user(e: BaseException) -> bool:
+  """Whether an exception is an interrupt that the user has sent, which no code of a plug-in's has
+  raised.
+  """
+  return isinstance(e, KeyboardInterrupt) and interrupt.sent()
 
 
 def file_of(source: str) -> pathlib.Path | None:
@@ -126,7 +140,9 @@ def find(source: str, kind: str) -> Callable:
         "path/to/file.py:Name"
       ) from None
     raise PluginError(f"{kind} {source}: importing {where} failed: {line(e)}") from None
-  except (Exception, SystemExit) as e:  # whatever a foreign module raises
+  except BaseException as e:  # whatever a foreign module raises
+    if of_user(e):
+      raise
     raise PluginError(f"{kind} {source}: importing {where} failed: {line(e)}") from None
   found = getattr(module, name, None)
   if not callable(found):

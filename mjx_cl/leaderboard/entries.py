@@ -7,7 +7,8 @@ from typing import Any, NamedTuple
 import jax
 
 from mjx_cl import detectors as detectors_lib
-from mjx_cl.errors import UserError, choose
+from mjx_cl.errors import PluginError, UserError, choose
+from mjx_cl.io.plugins import line, of_user
 from mjx_cl.rollout.monitor import CHANNELS
 from mjx_cl.scoring.autoregression import ORDER
 
@@ -106,8 +107,7 @@ def one_line(name: str, run: Callable[[], Any]) -> Any:
       f"detector {name!r} cannot be calibrated: its threshold is traced, several run side "
       "by side, so no Python `if` may look at it or at a sample (jnp.where does)"
     ) from e
-  except (Exception, SystemExit) as e:
-    raise UserError(
-      f"detector {name!r} failed: {type(e).__name__}: "
-      f"{(str(e).strip() or 'without a message').splitlines()[0]}"
-    ) from e
+  except BaseException as e:
+    if of_user(e):
+      raise
+    raise PluginError(f"detector {name!r} failed: {line(e, 1)}") from e

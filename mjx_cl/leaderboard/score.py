@@ -13,12 +13,12 @@ import os
 import pathlib
 import time
 from collections.abc import Callable, Collection, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from mjx_cl.io import tables
+from mjx_cl.io.interrupt import threads
 from mjx_cl.leaderboard import calibration, page, sweep
 from mjx_cl.leaderboard import oracle as oracles
 from mjx_cl.leaderboard import program as programs
@@ -154,23 +154,20 @@ def _run(
     return result, rows_of(name, reference, result, data, oracle.result()) if ready else None
 
   # the program of a detector runs on one core, and several run side by side
-  with ThreadPoolExecutor(min(8, os.cpu_count() or 1), "detector") as pool:
+  with threads(min(8, os.cpu_count() or 1), "detector") as pool:
     # one thread's work for a while: detectors run beside it, and are rated once it is there
     oracle = pool.submit(oracles.oracles, streams, data)
     # a long one that begins last would keep one core waiting for another
     longest_first = sorted(jobs, key=lambda job: -took.get(job[0], 0.0))
     begun = {job[0]: pool.submit(rated, job) for job in longest_first}
-    try:
-      known = oracle.result()
-      rows, curves, alarms = oracle_rows(data, known), {}, {}
-      told("oracles")
-      for name, reference, _ in jobs:
-        result, own = begun.pop(name).result()
-        rows += rows_of(name, reference, result, data, known) if own is None else own
-        curves[name], alarms[name] = result.curve, result.fired
-        told(name)
-    finally:  # after an error or Ctrl-C what has not begun never does
-      pool.shutdown(wait=False, cancel_futures=True)
+    known = oracle.result()
+    rows, curves, alarms = oracle_rows(data, known), {}, {}
+    told("oracles")
+    for name, reference, _ in jobs:
+      result, own = begun.pop(name).result()
+      rows += rows_of(name, reference, result, data, known) if own is None else own
+      curves[name], alarms[name] = result.curve, result.fired
+      told(name)
   return known, rows, curves, alarms
 
 

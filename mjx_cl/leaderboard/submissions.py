@@ -3,7 +3,6 @@ scores, and for the latter the streams as plain files.
 """
 
 import pathlib
-import time
 from collections.abc import Callable, Collection
 
 import numpy as np
@@ -190,22 +189,21 @@ def from_host(
 
   def get(data: Data) -> Found:
     detector, value = make(1.0), None
-    run = lambda own, x: host_lib.run_host(own.factory, x, own.host_name)
     tune, score, fault = (
       host_lib.samples(detector, x.residual) for x in (data.tune, data.score, data.fault)
     )
     for x in (tune, score, fault):
-      host_lib.check_causal(detector.factory, x[:, :TRIED], host_name=detector.host_name)
+      host_lib.causal(detector, x[:, :TRIED])
     if threshold_name:
       target = tune.shape[1] * (len(tune) - data.count_from) / data.arl0
-      alarms = lambda v: int(run(make(v), tune)[0][data.count_from :].sum())
+      alarms = lambda v: int(host_lib.run(make(v), tune)[0][data.count_from :].sum())
       value = _least(alarms, target, f"--threshold {threshold_name}")
       detector = make(value)
     steps = min(len(tune), len(score))
-    fired, healthy_score = run(detector, np.concatenate([tune[:steps], score[:steps]], 1))
-    begin = time.perf_counter()
-    fault_fired, fault_score = run(detector, fault)
-    us = (time.perf_counter() - begin) / max(1, np.isfinite(fault).sum()) * 1e6
+    healthy = np.concatenate([tune[:steps], score[:steps]], 1)
+    fired, healthy_score, _ = host_lib.run(detector, healthy)
+    fault_fired, fault_score, seconds = host_lib.run(detector, fault)
+    us = seconds / max(1, np.isfinite(fault).sum()) * 1e6
     return found(data, value, fired, healthy_score, fault_fired, fault_score, us)
 
   return get

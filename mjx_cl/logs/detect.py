@@ -16,7 +16,8 @@ import jax
 import numpy as np
 
 from mjx_cl.detectors import python_class
-from mjx_cl.errors import FileError, UserError, choose
+from mjx_cl.errors import FileError, PluginError, UserError, choose
+from mjx_cl.io import plugins
 from mjx_cl.logs.columns import choose_columns
 from mjx_cl.logs.programs import LEVELS, Program, joint, table
 from mjx_cl.logs.read import Log, read
@@ -242,9 +243,10 @@ def _registered(name: str, xs: np.ndarray, past: np.ndarray, warmup: int, arl0: 
       f"detector {name!r} cannot be calibrated here: its factory asks for a threshold that is a "
       "number; use base.above to check it"
     ) from None
-  except (Exception, SystemExit) as e:
-    why = (str(e).strip() or "without a message").splitlines()[0]
-    raise UserError(f"detector {name!r} failed: {type(e).__name__}: {why}") from e
+  except BaseException as e:
+    if plugins.of_user(e):
+      raise
+    raise PluginError(f"detector {name!r} failed: {plugins.line(e, 1)}") from e
 
 
 def _examined(name: str, xs: np.ndarray, past: np.ndarray, warmup: int, arl0: float) -> Run:
@@ -262,7 +264,7 @@ def _examined(name: str, xs: np.ndarray, past: np.ndarray, warmup: int, arl0: fl
 
 def _host(one: python_class.HostDetector, xs: np.ndarray, past: np.ndarray) -> Run:
   """As `_registered`, of a detector that brings its own threshold."""
-  fired, scores = python_class.run_host(one.factory, np.concatenate([past, xs]), one.host_name)
+  fired, scores, _ = python_class.run(one, np.concatenate([past, xs]))
   return None, None, np.asarray(fired[: len(past)].any(1)), fired[len(past) :], scores[len(past) :]
 
 

@@ -29,6 +29,7 @@ from mjx_cl.adapt.state import ROWS, Digest, Frozen, LoopState, cut, glue
 from mjx_cl.adapt.watch import Minds
 from mjx_cl.config import CHUNK
 from mjx_cl.dreamer.agent import TrainState
+from mjx_cl.io.interrupt import threads
 from mjx_cl.io.runtime import cores
 from mjx_cl.rollout.scan import Row
 from mjx_cl.runs.groups import (
@@ -191,7 +192,7 @@ class Lives:
       tasks = list(self._tasks(group, rows, now, settle))
       return [(who, took / len(tasks), task()) for who, task in tasks]
 
-    with concurrent.futures.ThreadPoolExecutor(len(cores())) as pool:
+    with threads(len(cores())) as pool:
       if len(groups) > MANY * len(cores()):  # rows of a few groups at a time lie in memory
         for told in pool.map(whole, groups):
           yield from told

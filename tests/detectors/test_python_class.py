@@ -9,6 +9,7 @@ import pytest
 
 from mjx_cl.detectors import python_class
 from mjx_cl.errors import UserError
+from mjx_cl.io import apart
 from mjx_cl.rollout.monitor import unknown
 
 
@@ -246,14 +247,14 @@ def test_causality_finds_a_look_ahead():
       self.t += 1
       return bool(x == self.all.max())
 
-  honest = python_class.run_host
+  honest = apart.run_host
   with pytest.MonkeyPatch.context() as patch:  # each run opens what it is run on
 
-    def run(factory, part, host_name=None):
+    def run(factory, part, host_name=None, at=None):
       record["xs"] = part[:, 0]
       return honest(factory, part, host_name)
 
-    patch.setattr(python_class, "run_host", run)
+    patch.setattr(apart, "run_host", run)
     with pytest.raises(UserError, match="at step 1 of stream 0.*ends after 2 samples"):
       python_class.check_causal(Ahead, xs, cuts=(2,))
 
@@ -325,12 +326,12 @@ FILES = {
     ("river.drift:Nothing", {}, 2, ["Nothing", "river.drift"]),
     ("river.drift:PageHinkley", {"thresh": 1}, 2, ["thresh", "cannot be built"]),
     ("{}/none.py:D", {}, 1, ["none.py"]),
-    ("{}/syntax.py:D", {}, 2, ["SyntaxError"]),
-    ("{}/raises.py:D", {}, 2, ["RuntimeError: first second"]),
-    ("{}/leaves.py:D", {}, 2, ["importing", "SystemExit"]),
-    ("leaves_mjx:D", {}, 2, ["importing leaves_mjx failed", "SystemExit"]),
+    ("{}/syntax.py:D", {}, 1, ["SyntaxError"]),
+    ("{}/raises.py:D", {}, 1, ["RuntimeError: first second"]),
+    ("{}/leaves.py:D", {}, 1, ["importing", "SystemExit"]),
+    ("leaves_mjx:D", {}, 1, ["importing leaves_mjx failed", "SystemExit"]),
     ("{}/unbuilt.py:D", {}, 2, ["D cannot be built", "SystemExit: 3"]),
-    ("{}/imports.py:D", {}, 2, ["no_such_module_here"]),
+    ("{}/imports.py:D", {}, 1, ["no_such_module_here"]),
     ("{}/plain.py:D", {}, 2, ["D has no method update"]),
     ("{}/plain.py:x", {}, 2, ["nothing of the name 'x'"]),
     ("{}/plain.py:Needs", {}, 2, ["Needs cannot be built", "'k'"]),

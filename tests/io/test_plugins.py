@@ -127,7 +127,7 @@ def test_a_broken_plug_in_is_one_line(package, tmp_path, entries, argv, words):
     package(entries), *[str(tmp_path / "out") if a.startswith(os.devnull) else a for a in argv]
   )
   assert (
-    out.returncode == 2
+    out.returncode == 1
     and words in out.stderr
     and out.stderr.strip().count("\n") == 0
     and not out.stdout
@@ -232,7 +232,7 @@ def test_settings_of_a_wrong_kind_are_one_line(capsys, tmp_path):
   )
 
 
-def test_json_is_one_value_whatever_a_detector_prints(tmp_path, capsys):
+def test_json_is_one_value_whatever_a_detector_prints(tmp_path, capfd):
   """A user's class prints at every sample; standard output holds the JSON value alone, and is whole
   again afterwards.
   """
@@ -253,11 +253,11 @@ def test_json_is_one_value_whatever_a_detector_prints(tmp_path, capsys):
     str(tmp_path / "out"),
   ]
   assert app.main([*argv, "--json"]) == 0
-  out, err = capsys.readouterr()
+  out, err = capfd.readouterr()
   assert isinstance(json.loads(out), dict) and "seen 3.0" in err
   assert (
     app.main(["list", "arms", "--json"]) == 0
-    and "detector" in json.loads(capsys.readouterr().out)["arms"]
+    and "detector" in json.loads(capfd.readouterr().out)["arms"]
   )
 
 
@@ -677,3 +677,41 @@ def test_the_fault_of_the_docs(tmp_path):
       np.testing.assert_array_equal(np.asarray(ports.ctrl), want)
       differs += ports.ctrl[1] != ctrl[1]
     assert (differs > 3) == (severity > 0)
+
+
+HOSTILE = """
+import mjx_cl.detectors
+class Own(BaseException):
+  def __str__(self): raise ValueError
+def leaves(threshold=1.0): raise SystemExit(0)
+def stops(threshold=1.0): raise KeyboardInterrupt
+def own(threshold=1.0): raise Own
+def number(threshold=1.0): return 7
+number.__doc__ = 3.5
+def late(threshold=1.0):
+  def update(state, x): raise SystemExit(0)
+  return mjx_cl.detectors.Detector(lambda: (), update)
+"""
+
+
+@pytest.mark.parametrize(
+  "name, words",
+  [
+    ("leaves", "SystemExit: 0"),
+    ("stops", "KeyboardInterrupt"),
+    ("own", "Own: its message cannot be read"),
+    ("number", "gives int in place of a Detector"),
+    ("late", "SystemExit: 0"),
+  ],
+)
+@pytest.mark.parametrize("command", ["run", "leaderboard"])
+def test_foreign_code_ends_no_command_but_in_a_line(tmp_path, capfd, command, name, words):
+  """Each names the file, and neither ends as if all had gone well, nor as if the user had asked."""
+  (tmp_path / "hostile.py").write_text(HOSTILE)
+  source, out = f"{tmp_path / 'hostile.py'}:{name}", tmp_path / "out"
+  robot = ["walker", "--seeds", "1", "--steps", "64", "--onset", "10"] * (command == "run")
+  status = app.main([command, *robot, "--detector", source, "--out", str(out)])
+  lines = [line for line in capfd.readouterr().err.splitlines() if line.startswith("mjx-cl: ")]
+  assert status == (2 if name == "number" else 1) and len(lines) == 1, lines
+  assert "hostile.py" in lines[0] and words in lines[0]
+  assert not list(out.rglob("summary.json")) and not list(out.rglob("leaderboard.json"))
