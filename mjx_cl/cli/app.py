@@ -9,6 +9,7 @@ What each command takes stands in flags.py, what does it in the module that COMM
 
 import atexit
 import contextlib
+import dataclasses
 import importlib
 import io
 import os
@@ -44,7 +45,7 @@ from mjx_cl.cli.flags import (
 from mjx_cl.cli.output import apart, say
 from mjx_cl.config import FaultConfig, quick
 from mjx_cl.errors import FileError, PluginError, UserError
-from mjx_cl.io import interrupt, plugins
+from mjx_cl.io import folders, interrupt, plugins
 from mjx_cl.io.interrupt import Interruptible, Lasting, later
 
 # what is said of a command in flags.py -> the module that does it, imported once it is called
@@ -165,12 +166,18 @@ def attempt(do: Callable[[], object], again: Callable[[], str] = lambda: "") -> 
       signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+def shortened(text: str, most: int = 1000) -> str:
+  """A text whose middle is left out where it is longer than `most`."""
+  end = most // 4
+  return text if len(text) <= most else f"{text[: most - end - 5]} ... {text[-end:]}"
+
+
 def _attempt(do: Callable[[], object], again: Callable[[], str]) -> int:
   try:
     do()
     return 0
   except UserError as e:
-    say(f"mjx-cl: {' '.join(str(e).split())}")
+    say(f"mjx-cl: {shortened(' '.join(str(e).split()))}")
     return e.exit_code
   except KeyboardInterrupt:
     say(f"mjx-cl: interrupted{again()}")
@@ -194,6 +201,14 @@ def _attempt(do: Callable[[], object], again: Callable[[], str]) -> int:
     return FileError.exit_code
 
 
+def check_filled(command: Any) -> None:
+  """Refuses an empty text, as of a shell's variable that is not set, where a flag was given."""
+  for field in dataclasses.fields(command):
+    value = getattr(command, field.name)
+    if field.default != "" and (value == "" or (isinstance(value, tuple) and "" in value)):
+      raise UserError(f"--{field.name.replace('_', '-')} was given an empty text")
+
+
 @contextlib.contextmanager
 def ours() -> Iterator[None]:
   """Whoever wants to end the program but the user is named, and so is the place."""
@@ -215,12 +230,16 @@ def main(argv: list[str] | None = None) -> int:
   def do() -> None:
     nonlocal command
     command = parse(argv)
+    check_filled(command)
     if not isinstance(command, (Plot, Query, Report)):
       from mjx_cl.io import runtime
 
       shared = isinstance(command, Train) and command.seeds > 0
       runtime.setup(runtime.sharing(command.seeds) if shared else 1)
-    with apart(command), ours():
+    # a run locks its own folder, and so does each part of a suite
+    whole = isinstance(command, (Train, Certify, Record, Leaderboard, Detect))
+    out = command.out if whole else None
+    with apart(command), ours(), folders.alone(out) if out else contextlib.nullcontext():
       DO[type(command)](command)
 
   def again() -> str:

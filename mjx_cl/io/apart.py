@@ -216,9 +216,9 @@ def _wait(
     try:
       text = said.get(timeout=BEGIN_S if not where else sample_s + 4 * BEAT_S)
     except queue.Empty:  # not even the thread that says where it is gets on
-      place = where.decode().split()
-      at = f"after step {place[1]} of stream {place[0]} it" if place else "importing it"
-      limit = sample_s if place else BEGIN_S
+      last = where.decode().split()
+      at = f"after step {last[1]} of stream {last[0]} it" if last else "importing it"
+      limit = sample_s if last else BEGIN_S
       raise UserError(f"{named}: {at} takes more than {limit:g} s") from None
     if not text:
       code = process.wait()

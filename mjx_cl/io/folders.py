@@ -1,14 +1,23 @@
 """Folders of results: files written whole or not at all, and who may write where."""
 
+import contextlib
+import hashlib
 import itertools
 import os
 import pathlib
 import re
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import BinaryIO
 
 from mjx_cl.errors import FileError, UserError
+
+try:
+  import fcntl
+except ImportError:  # Windows
+  fcntl = None  # type: ignore[assignment]
+
+_HELD: set[str] = set()  # folders that this process writes into
 
 
 def atomic(path: str | os.PathLike, write: Callable[[BinaryIO], object]) -> None:
@@ -46,6 +55,47 @@ def _folder(out: str | os.PathLike) -> pathlib.Path:
   if out.exists() and not out.is_dir():
     raise UserError(f"--out {out} is a file")
   return out
+
+
+@contextlib.contextmanager
+def alone(out: str | os.PathLike) -> Iterator[None]:
+  """No other process of this machine and user that asks likewise writes into `out` meanwhile. A
+  lock ends with its process, however that ends; where the system has none, nothing is asked.
+
+  Raises:
+    UserError: one does.
+  """
+  path = str(_folder(out).resolve())
+  if fcntl is None or path in _HELD:
+    yield
+    return
+  name = f"mjx_cl_locks_{os.getuid()}"
+  folder = pathlib.Path(tempfile.gettempdir(), name)
+  try:
+    folder.mkdir(mode=0o700, exist_ok=True)
+    fd = os.open(folder / hashlib.sha256(path.encode()).hexdigest(), os.O_RDWR | os.O_CREAT, 0o600)
+  except OSError:  # a full disk, another user's folder of that name
+    yield
+    return
+  try:
+    try:
+      fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+      who = os.read(fd, 20).decode(errors="replace").strip()
+      raise UserError(
+        f"{out} is being written by another mjx-cl, process {who or 'unknown'}; wait for it, or "
+        "give another --out"
+      ) from None
+    with contextlib.suppress(OSError):
+      os.ftruncate(fd, 0)
+      os.write(fd, str(os.getpid()).encode())
+    _HELD.add(path)
+    try:
+      yield
+    finally:
+      _HELD.discard(path)
+  finally:
+    os.close(fd)
 
 
 def probe(out: str | os.PathLike) -> None:

@@ -70,6 +70,22 @@ def execute(
   Returns:
     summary.json's value.
   """
+  with folders.alone(out):
+    return _execute(config, out, resume, overwrite, progress, save_every_s, tell, programs, healthy)
+
+
+def _execute(
+  config: RunConfig,
+  out: pathlib.Path | str,
+  resume: bool,
+  overwrite: bool,
+  progress: Callable[[Progress], Any],
+  save_every_s: float,
+  tell: Callable[[str], Any],
+  programs: Programs | None,
+  healthy: Healthy | None,
+) -> dict:
+  """`execute`, alone in its folder."""
   config = check(config)
   fresh = not pathlib.Path(out).exists()
   state = folders.claim_folder(out, resume, overwrite)

@@ -306,6 +306,31 @@ def test_query_prints_the_first_rows_and_says_so(mjx, refused, tmp_path):
   assert "UTF-8" in refused(2, "query", tmp_path, "select '\udcff'")
 
 
+@pytest.mark.parametrize(
+  "argv",
+  [
+    ("leaderboard", "--export", ""),
+    ("leaderboard", "--out", ""),
+    ("bench", "paper", "--out", ""),
+    ("bench", "paper", "--only", ""),
+    ("run", "walker", "--out", ""),
+    ("run", "walker", "--fault", ""),
+    ("train", "walker", "--out", ""),
+    ("certify", "walker", "--out", ""),
+    ("record", ""),
+    ("plot", ""),
+  ],
+)
+def test_an_empty_text_is_not_nothing(refused, tmp_path, monkeypatch, argv):
+  monkeypatch.chdir(tmp_path)
+  assert "empty" in refused(2, *argv) and not list(tmp_path.iterdir())
+
+
+def test_a_line_stays_one_that_can_be_read(refused):
+  line = refused(2, "run", "walker", "--fault", "x" * 100_000)
+  assert "unknown fault" in line and " ... " in line and 900 < len(line) < 1100
+
+
 def test_names_are_no_markup(mjx, tmp_path):
   store.write_table(tmp_path / "trace.parquet", {"[/red]x": ["[/b]"]})
   code, out, err = mjx("query", tmp_path, "from trace")

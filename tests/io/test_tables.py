@@ -7,6 +7,8 @@ import os
 import pathlib
 import re
 import signal
+import subprocess
+import sys
 import threading
 import types
 
@@ -174,6 +176,35 @@ def test_a_bad_query_is_one_line_that_names_the_views(folder, sql):
   with pytest.raises(UserError) as error:
     tables.query(folder, sql)
   assert "runs, trace" in one_line(error) and error.value.exit_code == 2
+
+
+HOLDS = """import sys
+from mjx_cl.io import folders
+with folders.alone(sys.argv[1]):
+  print("held", flush=True)
+  sys.stdin.read()"""
+
+
+def test_a_folder_is_one_processs_alone(tmp_path):
+  """Until that ends, however it does; one process may ask twice, and other folders are free."""
+  out = tmp_path / "out"
+  other = subprocess.Popen(
+    [sys.executable, "-c", HOLDS, str(out)],
+    stdin=subprocess.PIPE,
+    stdout=subprocess.PIPE,
+    text=True,
+  )
+  assert other.stdout.readline() == "held\n"
+  said = pytest.raises(UserError, match=f"out is being written by .* process {other.pid};")
+  with said, folders.alone(tmp_path / "." / "out"):
+    pass
+  with folders.alone(tmp_path / "elsewhere"), folders.alone(tmp_path / "elsewhere"):
+    pass
+  other.kill()
+  other.wait()
+  with folders.alone(out):
+    pass
+  assert not list(tmp_path.iterdir())
 
 
 ENDLESS = "select count(*) from range(10000000) a, range(10000000) b where a.range < b.range"
