@@ -77,9 +77,9 @@ class TrainDisplay(Display):
   def __init__(self, total: int) -> None:
     console = Console(stderr=True)
     bar = Bar(
-      TextColumn("{task.description}"),
+      TextColumn("{task.description}", markup=False),
       BarColumn(),
-      TextColumn("{task.completed:,.0f}/{task.total:,.0f} updates"),
+      TextColumn("{task.completed:,.0f}/{task.total:,.0f} updates", markup=False),
       TimeRemainingColumn(),
       console=console,
     )

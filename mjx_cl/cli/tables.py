@@ -52,7 +52,7 @@ def table(
     title: above it.
     **how: settings of rich.table.Table.
   """
-  out = Table(title=title, title_justify="left", **how)
+  out = Table(title=None if title is None else Text(title), title_justify="left", **how)
   for heading in headings:
     out.add_column(Text(heading), justify="left" if heading in left else "right", overflow="fold")
   for row in rows:

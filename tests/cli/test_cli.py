@@ -4,6 +4,7 @@ earlier result lost.
 
 import dataclasses
 import errno
+import io
 import json
 import os
 import pathlib
@@ -17,6 +18,7 @@ import time
 
 import numpy as np
 import pytest
+from rich.console import Console
 from test_run import saved  # noqa: F401  a fixture
 
 import mjx_cl
@@ -335,6 +337,9 @@ def test_names_are_no_markup(mjx, tmp_path):
   store.write_table(tmp_path / "trace.parquet", {"[/red]x": ["[/b]"]})
   code, out, err = mjx("query", tmp_path, "from trace")
   assert (code, err) == (0, "") and "[/red]x" in out and "[/b]" in out
+  on = Console(file=io.StringIO(), width=80)
+  on.print(shown.table(["[/red]"], [["[bold]"]], title="[/x]"))
+  assert all(text in on.file.getvalue() for text in ("[/red]", "[bold]", "[/x]"))
 
 
 def test_report_elsewhere_than_in_a_checkout_is_one_line(refused, tmp_path, monkeypatch):
