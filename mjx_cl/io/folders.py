@@ -38,7 +38,7 @@ def make(folder: pathlib.Path) -> None:
     raise FileError(f"cannot make {folder}: {e.strerror}") from None
 
 
-def _folder(out: str | os.PathLike) -> pathlib.Path:
+def usable(out: str | os.PathLike) -> pathlib.Path:
   """`out`, which is refused where it can be no folder."""
   if not str(out):
     raise UserError("--out is a folder; got an empty name")
@@ -52,7 +52,7 @@ def probe(out: str | os.PathLike) -> None:
   """Makes the folder `out` and refuses one that cannot be written to, before what goes there is
   computed. An empty folder that was not there is left.
   """
-  out = _folder(out)
+  out = usable(out)
   try:
     out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryFile(dir=out):
@@ -136,7 +136,7 @@ def claim_folder(
   Raises:
     UserError: the folder holds another run and neither --resume nor --overwrite was given.
   """
-  out = _folder(out)
+  out = usable(out)
   if resume and overwrite:
     raise UserError("--resume and --overwrite exclude each other")
   if (out / "config.json").exists():
