@@ -74,9 +74,9 @@ def _held(out: pathlib.Path) -> set[str] | None:
   if not (out / "config.json").exists():
     return None
   try:
-    config = json.loads((out / "config.json").read_text())
+    config = tables.read_json(out / "config.json")
     robots = set(config["suite"]["robots"])
-  except (OSError, ValueError, KeyError, TypeError):
+  except (FileError, KeyError, TypeError):
     raise _foreign(out) from None
   if not {"meta", "schema", "stream_steps"} <= set(config):
     raise _foreign(out)
@@ -175,7 +175,7 @@ def prepare(
       fault, _, target = key.partition(":")
       faults_lib.target_index(faults_lib.make(fault, env), target or None)
     trained = agents.of(env, agent)
-    if int(trained.card.get("repeat", 1)) != 1:
+    if trained.repeat != 1:
       raise UserError(
         f"the agent of {robot!r} holds its actions; streams are recorded with agents that act "
         "in every control step"

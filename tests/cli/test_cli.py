@@ -14,6 +14,7 @@ import signal
 import subprocess
 import sys
 import time
+import zipfile
 
 import numpy as np
 import pytest
@@ -486,10 +487,59 @@ def other_size(folder):
   tamper(folder, dreamer=dataclasses.asdict(PRESETS["cpu"].dreamer))
 
 
+def member(folder, name="a.npy", content=b"garbage"):
+  """Adds a file to the archive of weights."""
+  with zipfile.ZipFile(folder / "agent.npz", "a") as archive:
+    archive.writestr(name, content)
+
+
+def retyped(kind):
+  """The same weights as arrays of another type."""
+
+  def spoil(folder):
+    with np.load(folder / "agent.npz") as z:
+      held = {k: np.zeros(z[k].shape, kind) for k in z.files}
+    np.savez(folder / "agent.npz", **held)
+
+  return spoil
+
+
+def nested(folder):
+  (folder / "card.json").write_text('{"env": ' + "[" * 100_000 + "]" * 100_000 + "}")
+
+
 AGENTS = {
   "another robot": (lambda f: tamper(f, env="car"), 2, "car"),
   "another size": (other_size, 1, "does not fit size size1m"),
-  "unknown size": (lambda f: tamper(f, dreamer={"size": "size3k"}), 2, "size1m"),
+  "unknown size": (lambda f: tamper(f, dreamer={"size": "size3k"}), 1, "size1m"),
+  **{
+    f"repeat {value!r}": (lambda f, value=value: tamper(f, repeat=value), 1, word)
+    for value, word in (
+      *((value, "repeat takes int") for value in ("2", None, [1], 1.5, 1e30, True)),
+      *((value, "repeat must lie in 1..100") for value in (0, -1, 101, 10**30)),
+      *((value, "not finite") for value in (float("nan"), float("inf"))),
+    )
+  },
+  "no robot": (lambda f: tamper(f, env=None), 1, "env takes str; got None"),
+  "a number for a robot": (lambda f: tamper(f, env=3), 1, "env takes str; got 3"),
+  "a word for updates": (lambda f: tamper(f, updates="x"), 1, "updates takes int"),
+  "settings that are a list": (lambda f: tamper(f, dreamer=[]), 1, "dreamer must be a table"),
+  "a word in the settings": (
+    lambda f: tamper(f, dreamer={"size": "size1m", "lr": "x"}),
+    1,
+    "dreamer.lr takes float",
+  ),
+  "a number without end in the settings": (
+    lambda f: tamper(f, dreamer={"size": "size1m", "batch": 10**400}),
+    1,
+    "batch must be above 0 and finite",
+  ),
+  "a score that is no number": (lambda f: tamper(f, eval=float("nan")), 1, "not finite"),
+  "card without a ground": (nested, 1, "nested deeper than 64 levels"),
+  "garbage among the weights": (member, 1, "is no array"),
+  "weights that are text": (retyped("U3"), 1, "does not fit"),
+  "weights that are void": (retyped("V4"), 1, "does not fit"),
+  "weights that are complex": (retyped("c8"), 1, "does not fit"),
   "truncated": (truncated, 1, "agent.npz"),
   "empty": (lambda f: (f / "agent.npz").write_bytes(b""), 1, "agent.npz"),
   "foreign": (foreign, 1, "does not fit"),

@@ -500,6 +500,29 @@ def test_json_that_is_no_object_is_one_line(tmp_path, text, says):
   assert says in one_line(error) and "x.json" in one_line(error)
 
 
+@pytest.mark.parametrize("levels", [65, 600, 100_000])
+def test_what_is_nested_without_end_is_one_line(tmp_path, levels):
+  """Deeper than is said, than Python's own recursion, and than its parsers go."""
+  json_, toml = tmp_path / "x.json", tmp_path / "x.toml"
+  json_.write_text('{"a": ' + "[" * levels + "]" * levels + "}")
+  toml.write_text("a = " + "[" * levels + "]" * levels)
+  for read in (tables.read_json, lambda path: tables.read_suite(str(toml), tmp_path / "none")):
+    with pytest.raises(FileError, match="nested deeper than 64 levels"):
+      read(json_)
+  toml.write_text(".".join("a" * 65) + " = 1")
+  with pytest.raises(FileError, match="nested deeper than 64 levels"):
+    tables.read_suite(str(toml), tmp_path / "none")
+  json_.write_text('{"a": ' + "[" * 63 + "]" * 63 + "}")
+  assert tables.read_json(json_)
+
+
+@pytest.mark.parametrize("number", ["NaN", "-Infinity", "1e999"])
+def test_json_with_a_number_that_is_not_finite_is_one_line(tmp_path, number):
+  (tmp_path / "x.json").write_text(f'{{"a": [{number}]}}')
+  with pytest.raises(FileError, match="not finite"):
+    tables.read_json(tmp_path / "x.json")
+
+
 def test_a_folder_is_probed_before_what_goes_there_is_computed(tmp_path):
   folders.probe(tmp_path / "a/b")
   assert list((tmp_path / "a/b").iterdir()) == []
