@@ -1,14 +1,39 @@
 """Folders of results: files written whole or not at all, and who may write where."""
 
+import contextlib
 import itertools
 import os
 import pathlib
 import re
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import BinaryIO
 
 from mjx_cl.errors import FileError, UserError
+
+# of the outermost `together` that is under way: (temporary name, name) of what is written
+ASIDE: list[list[tuple[pathlib.Path, pathlib.Path]]] = []
+
+
+@contextlib.contextmanager
+def together() -> Iterator[None]:
+  """Files of one result, written within by `atomic`: they are renamed at the end, all or none. One
+  within another ends with it.
+
+  Raises:
+    FileError: as `atomic`.
+  """
+  if ASIDE:
+    yield
+    return
+  ASIDE.append([])
+  try:
+    yield
+    for tmp, path in ASIDE[-1]:
+      _rename(tmp, path)
+  finally:
+    for tmp, _ in ASIDE.pop():
+      tmp.unlink(missing_ok=True)
 
 
 def atomic(path: str | os.PathLike, write: Callable[[BinaryIO], object]) -> None:
@@ -22,12 +47,25 @@ def atomic(path: str | os.PathLike, write: Callable[[BinaryIO], object]) -> None
   try:
     with open(tmp, "wb") as file:
       write(file)
+  except OSError as e:
+    tmp.unlink(missing_ok=True)
+    raise _unwritten(path, e) from None
+  if ASIDE:
+    ASIDE[-1].append((tmp, path))
+  else:
+    _rename(tmp, path)
+
+
+def _rename(tmp: pathlib.Path, path: pathlib.Path) -> None:
+  try:
     os.replace(tmp, path)
   except OSError as e:
     tmp.unlink(missing_ok=True)
-    raise FileError(
-      f"cannot write {path}: {e.strerror or e}; what was there is unchanged"
-    ) from None
+    raise _unwritten(path, e) from None
+
+
+def _unwritten(path: pathlib.Path, e: OSError) -> FileError:
+  return FileError(f"cannot write {path}: {e.strerror or e}; what was there is unchanged")
 
 
 def make(folder: pathlib.Path) -> None:

@@ -92,6 +92,29 @@ def test_a_full_disk_leaves_the_earlier_file(tmp_path, monkeypatch, kind, where)
   assert path.read_bytes() != before
 
 
+def test_files_of_one_result_change_together_or_not_at_all(tmp_path):
+  def interrupt():
+    raise KeyboardInterrupt
+
+  def write(value, then=lambda: None):
+    with folders.together():
+      tables.write_json(tmp_path / "a.json", value)
+      with folders.together():
+        tables.write_table(tmp_path / "b.parquet", {"v": [value]})
+      then()
+
+  write(1)
+  before = {p.name: p.read_bytes() for p in tmp_path.iterdir()}
+  with pytest.raises(FileError, match="No space left.*unchanged"):
+    write(2, lambda: folders.atomic(tmp_path / "c", half_written))
+  with pytest.raises(KeyboardInterrupt):
+    write(2, interrupt)
+  assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == before
+  write(2)
+  after = {p.name: p.read_bytes() for p in tmp_path.iterdir()}
+  assert after.keys() == before.keys() and all(after[name] != before[name] for name in before)
+
+
 def test_a_missing_folder_is_one_line(tmp_path):
   for write in (lambda p: tables.write_json(p, 1), lambda p: tables.write_table(p, {"v": [1]})):
     with pytest.raises(FileError) as error:

@@ -66,9 +66,10 @@ def save(folder: os.PathLike | str, train: TrainState, card: dict) -> None:
       stored[name + _HALF] = value.astype(ml_dtypes.bfloat16).view(np.uint16)
     else:
       stored[name] = value
-  arrays.write(folder / "agent.npz", stored, small=True)
   text = json.dumps(card, indent=1) + "\n"
-  folders.atomic(folder / "card.json", lambda file: file.write(text.encode()))
+  with folders.together():
+    arrays.write(folder / "agent.npz", stored, small=True)
+    folders.atomic(folder / "card.json", lambda file: file.write(text.encode()))
 
 
 def of(env: Any, path: str | None = None, **departures: Any) -> Trained:
