@@ -12,6 +12,7 @@ import numpy as np
 from mjx_cl.detectors.base import Alarm, Detector
 from mjx_cl.detectors.combine import NAMES, is_channel, on
 from mjx_cl.errors import UserError
+from mjx_cl.io import limits
 from mjx_cl.io.plugins import find, line
 from mjx_cl.rollout.monitor import Residual
 
@@ -128,6 +129,8 @@ def run_host(
       try:
         fired[t, s], scores[t, s] = _step(detector, float(xs[t, s]))
       except (Exception, SystemExit) as e:
+        if limits.ran_out(e):
+          raise
         raise UserError(
           f"host detector {type(detector).__name__} failed at step {t} of stream {s}: {line(e)}"
         ) from None

@@ -8,6 +8,7 @@ import jax
 
 from mjx_cl import detectors as detectors_lib
 from mjx_cl.errors import UserError, choose
+from mjx_cl.io import limits
 from mjx_cl.rollout.monitor import CHANNELS
 from mjx_cl.scoring.autoregression import ORDER
 
@@ -107,6 +108,8 @@ def one_line(name: str, run: Callable[[], Any]) -> Any:
       "by side, so no Python `if` may look at it or at a sample (jnp.where does)"
     ) from e
   except (Exception, SystemExit) as e:
+    if limits.ran_out(e):
+      raise
     raise UserError(
       f"detector {name!r} failed: {type(e).__name__}: "
       f"{(str(e).strip() or 'without a message').splitlines()[0]}"

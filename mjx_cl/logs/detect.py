@@ -17,6 +17,7 @@ import numpy as np
 
 from mjx_cl.detectors import python_class
 from mjx_cl.errors import FileError, UserError, choose
+from mjx_cl.io import limits
 from mjx_cl.logs.columns import choose_columns
 from mjx_cl.logs.programs import LEVELS, Program, joint, table
 from mjx_cl.logs.read import Log, read
@@ -243,6 +244,8 @@ def _registered(name: str, xs: np.ndarray, past: np.ndarray, warmup: int, arl0: 
       "number; use base.above to check it"
     ) from None
   except (Exception, SystemExit) as e:
+    if limits.ran_out(e):
+      raise
     why = (str(e).strip() or "without a message").splitlines()[0]
     raise UserError(f"detector {name!r} failed: {type(e).__name__}: {why}") from e
 

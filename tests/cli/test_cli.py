@@ -27,7 +27,7 @@ from mjx_cl.cli import app, results
 from mjx_cl.cli import tables as shown
 from mjx_cl.config import PRESETS, RunConfig
 from mjx_cl.config.sizes import SIZES
-from mjx_cl.errors import FileError
+from mjx_cl.errors import FileError, UserError
 from mjx_cl.faults import presets
 from mjx_cl.io import folders
 from mjx_cl.io import tables as store
@@ -689,12 +689,39 @@ def test_a_full_disk_at_a_checkpoint_is_one_line(mjx, begun, monkeypatch):
   assert content(out) == before
 
 
+MAPS = "libparquet.so.2600: failed to map segment from shared object"
+
+
 def test_a_message_of_several_lines_becomes_one(refused, monkeypatch):
   def fail(_):
     raise FileError("first\n  second\tthird")
 
   monkeypatch.setitem(app.DO, app.List, fail)
   assert refused(1, "list") == "mjx-cl: first second third\n"
+
+
+@pytest.mark.parametrize("raised, said", [(MemoryError(), ""), (ImportError(MAPS), f": {MAPS}")])
+def test_too_little_memory_is_said_as_such(refused, monkeypatch, raised, said):
+  def fail(_):
+    raise raised
+
+  monkeypatch.setitem(app.DO, app.List, fail)
+  assert refused(1, "list") == (
+    f"mjx-cl: out of memory{said}; fewer --seeds, arms or detectors or a smaller batch need less\n"
+  )
+
+
+def test_what_a_part_lacked_memory_for_is_said_with_it(refused, monkeypatch):
+  """A line of this package's that comes of too little memory keeps its words, and says so."""
+
+  def fail(_):
+    try:
+      raise MemoryError("Unable to allocate 8 GiB")
+    except MemoryError:
+      raise UserError("detector 'x' failed") from None
+
+  monkeypatch.setitem(app.DO, app.List, fail)
+  assert "out of memory: detector 'x' failed; fewer --seeds" in refused(1, "list")
 
 
 def test_a_pipe_that_closes_is_no_error(mjx, monkeypatch):

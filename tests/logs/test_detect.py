@@ -633,6 +633,25 @@ def test_a_registered_detector_that_breaks_is_one_line(logs, monkeypatch, update
   assert "detector 'foreign' failed" in one_line(error) and words in one_line(error)
 
 
+@pytest.mark.parametrize("registered", [True, False])
+@pytest.mark.parametrize("raised", [MemoryError(), RuntimeError("std::bad_alloc")])
+def test_too_little_memory_is_not_blamed_on_the_detector(
+  tmp_path, logs, monkeypatch, raised, registered
+):
+  def update(*_):
+    raise raised
+
+  @scalar
+  def foreign(threshold=1.0):
+    return Detector(lambda: jnp.int32(0), update)
+
+  monkeypatch.setitem(detectors.DETECTORS, "foreign", foreign)
+  (tmp_path / "own.py").write_text(f"class Own:\n  def update(self, x):\n    raise {raised!r}\n")
+  name = "foreign" if registered else f"{tmp_path / 'own.py'}:Own"
+  with pytest.raises(type(raised)):
+    detect.detect(*logs, detectors=(name,), arl0=100)
+
+
 # ---- samples -------------------------------------------------------------------------------------
 
 
