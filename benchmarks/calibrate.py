@@ -46,7 +46,7 @@ def record(env, trained, keys, steps, fault="none", severity=0.0, onset=0):
   from mjx_cl.rollout.scan import Rollout, nest, start
 
   agent, its_fault = trained.agent, faults.make(fault, env)
-  rollout = Rollout(env, agent, its_fault, int(trained.card.get("repeat", 1)))
+  rollout = Rollout(env, agent, its_fault, trained.repeat)
   monitor = Monitor(agent, spec=env.spec)
   streams = nest(lambda k: start(env, agent, its_fault, k, severity, onset), 0, 0)(keys[None])
   params = jax.tree.map(lambda x: x[None], trained.train.params)

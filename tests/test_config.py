@@ -1,8 +1,8 @@
-"""Settings that earlier versions wrote."""
+"""Settings as they are read: of the command line, and of earlier versions."""
 
 import pytest
 
-from mjx_cl.config import DreamerConfig, TrainConfig, recorded
+from mjx_cl.config import DreamerConfig, TrainConfig, recorded, settings
 
 
 def test_a_setting_that_is_gone_is_dropped_where_it_meant_nothing():
@@ -16,3 +16,8 @@ def test_a_setting_that_is_gone_is_dropped_where_it_meant_nothing():
 def test_a_setting_that_meant_something_is_named(name, value):
   with pytest.raises(ValueError, match=f"{name}={value} is no setting of this version"):
     recorded(TrainConfig, {"envs": 8, name: value})
+
+
+def test_a_setting_that_is_nested_without_end_is_text():
+  text = "[" * 100_000
+  assert settings([f"a={text}"]) == {"a": text}

@@ -135,7 +135,7 @@ def do_eval(args: Eval) -> None:
     trained.train.params,
     args.episodes,
     args.seed,
-    int(trained.card.get("repeat", 1)),
+    trained.repeat,
     args.deterministic,
   )
   mean, interval = result["return_mean"], result["return_ci"]

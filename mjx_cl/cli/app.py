@@ -45,7 +45,7 @@ from mjx_cl.cli.flags import (
 from mjx_cl.cli.output import apart, say
 from mjx_cl.config import FaultConfig, quick
 from mjx_cl.errors import FileError, PluginError, UserError
-from mjx_cl.io import folders, interrupt, plugins
+from mjx_cl.io import folders, interrupt, limits, plugins
 from mjx_cl.io.interrupt import Interruptible, Lasting, later
 
 # what is said of a command in flags.py -> the module that does it, imported once it is called
@@ -176,9 +176,6 @@ def _attempt(do: Callable[[], object], again: Callable[[], str]) -> int:
   try:
     do()
     return 0
-  except UserError as e:
-    say(f"mjx-cl: {shortened(' '.join(str(e).split()))}")
-    return e.exit_code
   except KeyboardInterrupt:
     say(f"mjx-cl: interrupted{again()}")
     # a second Ctrl-C finds an interpreter that is clearing up
@@ -188,17 +185,30 @@ def _attempt(do: Callable[[], object], again: Callable[[], str]) -> int:
     return (
       0  # of standard output: the reader has what it wanted, results are in their files by then
     )
-  except OSError as e:
-    say(f"mjx-cl: {e.strerror or e}{f': {e.filename}' if e.filename else ''}")
-    return FileError.exit_code
-  except (MemoryError, RuntimeError) as e:  # XLA's error is a RuntimeError
-    if isinstance(e, RuntimeError) and "RESOURCE_EXHAUSTED" not in str(e):
+  except Exception as e:
+    known = _known(e)
+    if known is None:
       raise
-    say(
-      f"mjx-cl: out of memory: {' '.join(str(e).split())[:200]}; fewer --seeds, arms or a "
-      "smaller batch need less"
+    text, status = known
+    say(f"mjx-cl: {text}")
+    return status
+
+
+def _known(error: Exception) -> tuple[str, int] | None:
+  """What is said of an error, in one line, and the exit status; None where it is a bug."""
+  text, ours = " ".join(str(error).split()), isinstance(error, UserError)
+  if limits.ran_out(error.__cause__ or error.__context__ if ours else error):
+    why = f": {text[:200]}" if text else ""
+    return (
+      f"out of memory{why}; fewer --seeds, arms or detectors or a smaller batch need less",
+      FileError.exit_code,
     )
-    return FileError.exit_code
+  if isinstance(error, UserError):
+    return shortened(text), error.exit_code
+  if isinstance(error, OSError):
+    where = f": {error.filename}" if error.filename else ""
+    return f"{error.strerror or error}{where}", FileError.exit_code
+  return None
 
 
 def check_filled(command: Any) -> None:

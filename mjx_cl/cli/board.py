@@ -86,7 +86,8 @@ def do_leaderboard(args: Leaderboard) -> None:
 
   folders.probe(args.out)  # before minutes are spent
   board = score.score(held, entries, robots, extra, progress)
-  files = score.write(board, args.out, about(held, board))
+  with folders.together():
+    files = score.write(board, args.out, about(held, board))
   if args.json:
     emit([{k: v for k, v in r.items() if not k.startswith("stream_")} for r in board.rows])
     return

@@ -62,7 +62,7 @@ def do_render(args: Render) -> None:
   else:
     trained = agents.of(env, args.agent)
     acting |= {"agent": trained.agent, "params": trained.train.params}
-    acting["repeat"] = int(trained.card.get("repeat", 1))
+    acting["repeat"] = trained.repeat
   size = (args.steps, args.width, args.height, args.fps)
   tell = lambda text: say(f"mjx-cl: {text}")
   result = pictures.render(env, out, *size, view=args.view, say=tell, **acting)

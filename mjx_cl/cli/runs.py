@@ -34,7 +34,7 @@ def do_run(args: Run) -> None:
 def do_bench(args: Bench) -> None:
   """Runs, plans, merges or publishes a suite."""
   plan, parts = asked(args)
-  out = pathlib.Path(args.out or f"runs/bench/{plan.name}")
+  out = folders.usable(f"runs/bench/{plan.name}" if args.out is None else args.out)
   check_merge(args.merge, parts)
   if args.publish:
     bench.earlier(args.publish, plan)

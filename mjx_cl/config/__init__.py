@@ -26,7 +26,13 @@ from mjx_cl.config.checks import (  # noqa: F401  some for those who import them
   settings,
   whole,
 )
-from mjx_cl.config.learner import PRESETS, DreamerConfig, Preset, TrainConfig  # noqa: F401
+from mjx_cl.config.learner import (  # noqa: F401
+  MOST_REPEAT,
+  PRESETS,
+  DreamerConfig,
+  Preset,
+  TrainConfig,
+)
 from mjx_cl.errors import require
 
 # decisions between two rounds of updates, of a training as of a run, where the stop rule looks as

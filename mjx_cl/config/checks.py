@@ -6,6 +6,7 @@ import dataclasses
 import json
 import math
 import numbers
+import sys
 from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
 
   Settled = TypeVar("Settled", bound=DataclassInstance)
 
+LARGEST = sys.float_info.max  # a whole number beyond it is no float
 FOREVER = 2**31 - 1  # control steps that no run outlasts
 KINDS = {
   "bool": bool,
@@ -39,12 +41,12 @@ def _each(config: object, names: Iterable[str], holds: Callable[[Any], bool], wh
 
 def positive(config: object, *names: str) -> None:
   """Raises unless every named field is a finite number above 0."""
-  _each(config, names, lambda x: math.isfinite(x) and x > 0, "be above 0")
+  _each(config, names, lambda x: 0 < x <= LARGEST, "be above 0 and finite")
 
 
 def not_below_0(config: object, *names: str) -> None:
   """Raises unless every named field is a finite number of at least 0."""
-  _each(config, names, lambda x: math.isfinite(x) and x >= 0, "be 0 or above")
+  _each(config, names, lambda x: 0 <= x <= LARGEST, "be 0 or above and finite")
 
 
 def whole(config: object, *names: str, most: int = FOREVER - 1) -> None:
@@ -108,7 +110,7 @@ def settings(pairs: Iterable[str]) -> dict:
     require(sign, f"--set takes name=value; got {pair!r}")
     try:
       out[name] = json.loads(value.lower() if value in ("True", "False") else value)
-    except ValueError:
+    except (ValueError, RecursionError):
       out[name] = value
   finite(out, "--set")
   return out

@@ -8,6 +8,8 @@ from mjx_cl.config.checks import fraction, given, not_below_0, positive, whole
 from mjx_cl.config.sizes import SIZES
 from mjx_cl.errors import choose, require
 
+MOST_REPEAT = 100  # control steps; a chunk of decisions takes so many times as long
+
 
 @dataclass(frozen=True)
 class DreamerConfig:
@@ -162,12 +164,12 @@ class TrainConfig:
       "envs",
       "updates",
       "capacity",
-      "repeat",
       "clone",
       "fade",
       "pure",
       "hold",
     )
+    whole(self, "repeat", most=MOST_REPEAT)
     positive(
       self,
       "envs",

@@ -1,8 +1,6 @@
 """Arrays in .npz files: a tree's leaves by the names of their paths; nothing is ever unpickled."""
 
 import os
-import zipfile
-import zlib
 from collections.abc import Mapping
 from typing import Any
 
@@ -43,7 +41,11 @@ def read(path: str | os.PathLike) -> dict[str, np.ndarray]:
   """
   try:
     with np.load(path, allow_pickle=False) as z:
-      return {k: z[k] for k in z.files}
-  except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error) as e:
+      held = {k: z[k] for k in z.files}
+    for name, value in held.items():
+      if not isinstance(value, np.ndarray):
+        raise ValueError(f"{name} in it is no array")
+    return held
+  except Exception as e:  # NumPy and zipfile raise many kinds for a broken file
     why = (str(e).splitlines() or [""])[0] or type(e).__name__
     raise FileError(f"cannot read {path}: {why}") from None

@@ -1,10 +1,14 @@
 """Checkpoints by orbax: written to a temporary name and renamed, two kept, never unpickled."""
 
+import functools
 import itertools
 import logging
+import os
 import pathlib
 import re
+import shutil
 import sys
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -13,7 +17,7 @@ import orbax.checkpoint as ocp
 
 from mjx_cl.errors import FileError
 
-logging.getLogger("absl").setLevel(logging.ERROR)
+logging.getLogger("absl").setLevel(logging.CRITICAL)  # what orbax says of errors it raises as well
 
 
 def _is_key(x: Any) -> bool:
@@ -76,6 +80,20 @@ def _first_line(error: BaseException) -> str:
   return "its contents are not those that are asked for" if "truth value" in why else why
 
 
+def _reason(error: BaseException) -> str:
+  """Why a write failed; TensorStore hides the number of the system's error in a long text."""
+  number = re.search(r"os_error_code='(\d+)'|OS error (\d+)", str(error))
+  return os.strerror(int(number[1] or number[2])) if number else _first_line(error)
+
+
+def _unraisable(before: Callable[[Any], object], told: Any) -> None:
+  """Passes on to the hook `before` all but what a write of TensorStore says whose event loop was
+  closed as another one failed.
+  """
+  if str(told.exc_value) != "Event loop is closed":
+    before(told)
+
+
 def _dtypes(tree: Any) -> dict[tuple[str, ...], np.dtype]:
   """Path -> dtype of every leaf of a tree of arrays or of their metadata, which has dicts and lists
   where the arrays have named tuples.
@@ -104,7 +122,13 @@ class Checkpoints:
     return self._manager.latest_step()
 
   def save(self, number: int, tree: Any, meta: dict) -> None:
-    """Writes one; a kill at any moment leaves the earlier ones whole."""
+    """Writes one; a kill at any moment leaves the earlier ones whole.
+
+    Raises:
+      FileError: the disk is full or the folder refuses; what was written of it is gone.
+    """
+    before = sys.unraisablehook
+    sys.unraisablehook = functools.partial(_unraisable, before)
     try:
       self._manager.save(
         number,
@@ -114,10 +138,14 @@ class Checkpoints:
         force=True,
       )
       self._manager.wait_until_finished()
-    except (OSError, ValueError) as e:
+    except (OSError, ValueError) as e:  # threads of TensorStore may go on complaining
+      for left in self.folder.glob(f"{number}.orbax-checkpoint-tmp*"):
+        shutil.rmtree(left, ignore_errors=True)
       raise FileError(
-        f"cannot write checkpoint {number} in {self.folder}: {e}; the earlier ones are intact"
-      ) from e
+        f"cannot write checkpoint {number} in {self.folder}: {_reason(e)}; the earlier ones are "
+        "intact"
+      ) from None
+    sys.unraisablehook = before
 
   def load(self, like: Any) -> tuple[Any, dict[str, Any]]:
     """Newest checkpoint that can be read, (tree, meta), for a tree like `like`, or, where that is

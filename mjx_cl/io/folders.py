@@ -18,6 +18,29 @@ except ImportError:  # Windows
   fcntl = None  # type: ignore[assignment]
 
 _HELD: set[str] = set()  # folders that this process writes into
+# of the outermost `together` that is under way: (temporary name, name) of what is written
+ASIDE: list[list[tuple[pathlib.Path, pathlib.Path]]] = []
+
+
+@contextlib.contextmanager
+def together() -> Iterator[None]:
+  """Files of one result, written within by `atomic`: they are renamed at the end, all or none. One
+  within another ends with it.
+
+  Raises:
+    FileError: as `atomic`.
+  """
+  if ASIDE:
+    yield
+    return
+  ASIDE.append([])
+  try:
+    yield
+    for tmp, path in ASIDE[-1]:
+      _rename(tmp, path)
+  finally:
+    for tmp, _ in ASIDE.pop():
+      tmp.unlink(missing_ok=True)
 
 
 def atomic(path: str | os.PathLike, write: Callable[[BinaryIO], object]) -> None:
@@ -31,12 +54,25 @@ def atomic(path: str | os.PathLike, write: Callable[[BinaryIO], object]) -> None
   try:
     with open(tmp, "wb") as file:
       write(file)
+  except OSError as e:
+    tmp.unlink(missing_ok=True)
+    raise _unwritten(path, e) from None
+  if ASIDE:
+    ASIDE[-1].append((tmp, path))
+  else:
+    _rename(tmp, path)
+
+
+def _rename(tmp: pathlib.Path, path: pathlib.Path) -> None:
+  try:
     os.replace(tmp, path)
   except OSError as e:
     tmp.unlink(missing_ok=True)
-    raise FileError(
-      f"cannot write {path}: {e.strerror or e}; what was there is unchanged"
-    ) from None
+    raise _unwritten(path, e) from None
+
+
+def _unwritten(path: pathlib.Path, e: OSError) -> FileError:
+  return FileError(f"cannot write {path}: {e.strerror or e}; what was there is unchanged")
 
 
 def make(folder: pathlib.Path) -> None:
@@ -47,7 +83,7 @@ def make(folder: pathlib.Path) -> None:
     raise FileError(f"cannot make {folder}: {e.strerror}") from None
 
 
-def _folder(out: str | os.PathLike) -> pathlib.Path:
+def usable(out: str | os.PathLike) -> pathlib.Path:
   """`out`, which is refused where it can be no folder."""
   if not str(out):
     raise UserError("--out is a folder; got an empty name")
@@ -65,7 +101,7 @@ def alone(out: str | os.PathLike) -> Iterator[None]:
   Raises:
     UserError: one does.
   """
-  path = str(_folder(out).resolve())
+  path = str(usable(out).resolve())
   if fcntl is None or path in _HELD:
     yield
     return
@@ -102,7 +138,7 @@ def probe(out: str | os.PathLike) -> None:
   """Makes the folder `out` and refuses one that cannot be written to, before what goes there is
   computed. An empty folder that was not there is left.
   """
-  out = _folder(out)
+  out = usable(out)
   try:
     out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryFile(dir=out):
@@ -186,7 +222,7 @@ def claim_folder(
   Raises:
     UserError: the folder holds another run and neither --resume nor --overwrite was given.
   """
-  out = _folder(out)
+  out = usable(out)
   if resume and overwrite:
     raise UserError("--resume and --overwrite exclude each other")
   if (out / "config.json").exists():

@@ -7,6 +7,8 @@ import pathlib
 import jax
 import psutil
 
+from mjx_cl.io import limits
+
 MARGIN = 0.85  # share of the free memory that may be planned for
 PROCESS = 7 * 2**28  # bytes of Python, its libraries, compiled programs and their scratch memory
 # of what weights and replays take: weights once more while they are saved, traces, what the
@@ -76,14 +78,18 @@ def _text(path: pathlib.Path | str) -> str:
 
 
 def free() -> int:
-  """Bytes free on the device that computes; of a CPU's memory what the machine has and what the
-  container may take, whichever is less.
+  """Bytes free on the device that computes; of a CPU's memory what the machine has, and what the
+  container and the process may take, whichever is least.
   """
   stats = None if jax.default_backend() == "cpu" else jax.local_devices()[0].memory_stats()
   if stats:
     return stats["bytes_limit"] - stats["bytes_in_use"]
-  machine, limited = psutil.virtual_memory().available, container()
-  return machine if limited is None else min(machine, limited)
+  left = [psutil.virtual_memory().available]
+  if (limited := container()) is not None:
+    left.append(limited)
+  if (space := limits.address_space()) is not None:
+    left.append(max(0, space - psutil.Process().memory_info().vms))
+  return min(left)
 
 
 def held() -> int:

@@ -16,7 +16,7 @@ from collections.abc import Callable
 from typing import Any
 
 from mjx_cl.errors import FileError, PluginError, UserError
-from mjx_cl.io import interrupt
+from mjx_cl.io import interrupt, limits
 
 
 class Registry(collections.UserDict):
@@ -101,10 +101,10 @@ def line(e: BaseException, lines: int | None = None) -> str:
 
 
 def of_user(e: BaseException) -> bool:
-  """Whether an exception is an interrupt that the user has sent, which no code of a plug-in's has
-  raised.
+  """Whether an exception is none of a plug-in's making: an interrupt that the user has sent, or the
+  end of the memory.
   """
-  return isinstance(e, KeyboardInterrupt) and interrupt.sent()
+  return (isinstance(e, KeyboardInterrupt) and interrupt.sent()) or limits.ran_out(e)
 
 
 def file_of(source: str) -> pathlib.Path | None:

@@ -17,6 +17,8 @@ import subprocess
 import sys
 from typing import Any
 
+from mjx_cl.io import limits
+
 # gc's thresholds where nobody has set others: up to Python 3.11, and from 3.12 on
 PYTHONS_OWN = ((700, 10, 10), (2000, 10, 10), (2000, 10, 0))
 _DEVICES_FLAG = "--xla_force_host_platform_device_count"
@@ -119,10 +121,14 @@ def setup(devices: int = 1) -> None:
   and with asynchronous dispatch that conversion can wait for itself (jax issues 24255 and 25861).
   Physics calls the host by name, without a conversion, but falls back to pure_callback where a
   jaxlib does not take that.
+
+  Raises:
+    FileError: where the address space is limited to less than JAX takes.
   """
   global _done
   if _done:
     return
+  limits.check()
   _done = True
   keep_memory()
   collect_seldom()

@@ -1,6 +1,7 @@
 """Result files: JSON, Parquet, suites in TOML, and SQL views over tables."""
 
 import contextlib
+import itertools
 import json
 import math
 import os
@@ -22,6 +23,7 @@ from mjx_cl.io import folders
 
 PAGE = 2_000  # rows that are fetched at a time
 TICK_S = 0.05  # how often a signal is looked for
+DEEPEST = 64  # levels of lists and tables in one another that a file may have
 
 
 def plain(x: Any) -> Any:
@@ -43,16 +45,42 @@ def read_json(path: os.PathLike | str) -> dict[str, Any]:
   Raises:
     FileError: there is none, or something else.
   """
+  value = _parsed(path, json.loads, "is broken")
   try:
-    value = json.loads(pathlib.Path(path).read_text())
-  except OSError as e:
-    raise FileError(f"cannot read {path}: {e.strerror}") from None
-  except ValueError as e:  # of JSON and of UTF-8
-    raise FileError(f"{path} is broken: {str(e).splitlines()[0]}") from None
+    json.dumps(value, allow_nan=False)
+  except ValueError:
+    raise FileError(f"{path} is broken: it holds a number that is not finite") from None
   if not isinstance(value, dict):
     raise FileError(
       f"{path} holds {type(value).__name__} in place of an object; it is not of mjx-cl"
     )
+  return value
+
+
+def _parsed(path: os.PathLike | str, parse: Callable[[str], Any], wrong: str) -> Any:
+  """What `parse` makes of a file's text.
+
+  Raises:
+    FileError: there is none, it is not of that format, or lists and tables lie in one another
+      deeper than DEEPEST.
+  """
+  deep = FileError(f"{path} {wrong}: its lists and tables are nested deeper than {DEEPEST} levels")
+  try:
+    value = parse(pathlib.Path(path).read_text())
+  except OSError as e:
+    raise FileError(f"cannot read {path}: {e.strerror}") from None
+  except ValueError as e:  # of the format, and of UTF-8
+    raise FileError(f"{path} {wrong}: {str(e).splitlines()[0]}") from None
+  except RecursionError:
+    raise deep from None
+  level = [value]
+  for _ in range(DEEPEST):
+    within = (
+      x.values() if isinstance(x, dict) else x for x in level if isinstance(x, (dict, list))
+    )
+    level = list(itertools.chain.from_iterable(within))
+  if level:
+    raise deep
   return value
 
 
@@ -112,12 +140,7 @@ def read_suite(name: str, folder: pathlib.Path) -> tuple[pathlib.Path, dict]:
         f"unknown suite {name!r}; choose from: "
         f"{', '.join(sorted(p.stem for p in folder.glob('*.toml')))}; or give a .toml file"
       )
-  try:
-    return path, tomllib.loads(path.read_text())
-  except OSError as e:
-    raise FileError(f"cannot read {path}: {e.strerror}") from None
-  except ValueError as e:
-    raise FileError(f"{path} is no TOML: {e}") from None
+  return path, _parsed(path, tomllib.loads, "is no TOML")
 
 
 def read_arrow(path: os.PathLike | str) -> pyarrow.Table:

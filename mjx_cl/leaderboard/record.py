@@ -22,7 +22,7 @@ from mjx_cl import envs
 from mjx_cl import faults as faults_lib
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.io import arrays, folders, runtime, tables
-from mjx_cl.leaderboard import lives, set_tables
+from mjx_cl.leaderboard import lives, room, set_tables
 from mjx_cl.leaderboard.streams import META, SCHEMA, VERSION
 from mjx_cl.leaderboard.suite import Suite
 from mjx_cl.rollout.monitor import watched
@@ -74,9 +74,9 @@ def _held(out: pathlib.Path) -> set[str] | None:
   if not (out / "config.json").exists():
     return None
   try:
-    config = json.loads((out / "config.json").read_text())
+    config = tables.read_json(out / "config.json")
     robots = set(config["suite"]["robots"])
-  except (OSError, ValueError, KeyError, TypeError):
+  except (FileError, KeyError, TypeError):
     raise _foreign(out) from None
   if not {"meta", "schema", "stream_steps"} <= set(config):
     raise _foreign(out)
@@ -156,8 +156,8 @@ def prepare(
   """Robot -> (env, agent) of a recording; all robots of the suite where none is named.
 
   Raises:
-    UserError, before hours are spent: an unknown robot, fault, target or agent, or an agent that
-      does not act in every control step.
+    UserError, before hours are spent: an unknown robot, fault, target or agent, an agent that does
+      not act in every control step, or more than memory holds.
   """
   out = {}
   for robot in robots or suite.robots:
@@ -175,11 +175,12 @@ def prepare(
       fault, _, target = key.partition(":")
       faults_lib.target_index(faults_lib.make(fault, env), target or None)
     trained = agents.of(env, agent)
-    if int(trained.card.get("repeat", 1)) != 1:
+    if trained.repeat != 1:
       raise UserError(
         f"the agent of {robot!r} holds its actions; streams are recorded with agents that act "
         "in every control step"
       )
+    room.check(suite, robot, env.spec, trained.agent.config)
     out[robot] = env, trained
   return out
 
@@ -213,12 +214,12 @@ def record(
     {robot: stream-steps per second of its parts}, plus the size of the files.
   """
   out = pathlib.Path(out)
+  ready = prepare(suite, robots, physics, agent)
   staged = out / "work" / "set"
   staged.mkdir(parents=True, exist_ok=True)
   for p in staged.iterdir():
     if p.name != HELD:
       p.unlink()
-  ready = prepare(suite, robots, physics, agent)
   old, table = _old(suite, out, robots)
   kept = [r for r in old["suite"]["robots"] if r not in robots] if old else []
   rows = [row for row in table if row["robot"] in kept]

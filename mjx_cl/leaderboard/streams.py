@@ -13,7 +13,6 @@ groups and latents), of the logarithm where they cannot be negative: a column's 
 0.5 % (2 %), the files shrink to a third. config.json holds the steps.
 """
 
-import json
 import pathlib
 from collections.abc import Collection, Sequence
 from typing import Any, NamedTuple
@@ -124,10 +123,10 @@ class StreamSet:
     none = f"{self.folder} holds no recorded streams"
     make = "make some with `mjx-cl record`"
     try:
-      self.config = json.loads((self.folder / "config.json").read_text())
-    except (OSError, ValueError):
+      self.config = tables.read_json(self.folder / "config.json")
+    except FileError:
       raise FileError(f"{none} (no readable config.json); {make}") from None
-    version = self.config.get("version") if isinstance(self.config, dict) else None
+    version = self.config.get("version")
     if version is None:
       raise FileError(f"{none}: its config.json is of something else; {make}")
     if version != VERSION:

@@ -15,6 +15,7 @@ TABLES = {
   "nominal": {"steps", "score", "tune"},
   "latents": {"nominal", "after_s"},
 }
+LIMIT = 2**31  # files hold steps, seeds and streams in 31 bits
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,17 +54,25 @@ class Suite:
     }
     for name, values in whole.items():
       self._need(
-        all(type(v) is int for v in values),
-        f"{name} must be made of whole numbers; got {', '.join(map(str, values))}",
+        all(type(v) is int and v < LIMIT for v in values),
+        f"{name} must be made of whole numbers below {LIMIT:,}; got {', '.join(map(str, values))}",
       )
+    self._need(isinstance(self.name, str), "name must be text")
     self._need(all(len(v) == 2 for v in self.seeds.values()), "[seeds] are [first, last]")
-    self._need(self.arl0 > 0 and self.horizon_s > 0, "arl0 and horizon_s must be above 0")
     self._need(
       len(self.onset) == 2 and 0 <= self.count_from <= self.onset[0] < self.onset[1],
       "onset must be [low, high] with count_from <= low < high",
     )
     for name, keys in TABLES.items():
       self._need(set(getattr(self, name)) == keys, f"[{name}] needs {', '.join(sorted(keys))}")
+    after_s = self.latents["after_s"]
+    for name, value in (("arl0", self.arl0), ("horizon_s", self.horizon_s), ("after_s", after_s)):
+      self._need(
+        type(value) in (int, float) and 0 <= value < LIMIT,
+        f"{name} must be a number from 0 to {LIMIT:,}; got {value!r}",
+      )
+    self._need(self.arl0 > 0 and self.horizon_s > 0, "arl0 and horizon_s must be above 0")
+    self._need(self.latents["nominal"] >= 0, "[latents] nominal must be 0 or above")
     self._need(self.nominal["steps"] > self.count_from, "nominal steps must exceed count_from")
     self._need(
       min(self.nominal["score"], self.nominal["tune"]) >= 1,
@@ -94,7 +103,7 @@ class Suite:
       f"{robot}: {', '.join(sorted(score & tune))} is to tune and to score; take different faults",
     )
     for key, severities in ((k, v) for s in splits.values() for k, v in s.items()):
-      sound = all(isinstance(x, (int, float)) and 0 < x <= 1 for x in severities)
+      sound = all(type(x) in (int, float) and 0 < x <= 1 for x in severities)
       self._need(severities and sound, f"{robot}, {key}: severities in (0, 1]")
     for table in splits.values():
       named = [f"{key.split(':')[0]} {float(x):g}" for key, own in table.items() for x in own]

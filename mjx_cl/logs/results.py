@@ -78,9 +78,10 @@ def write(result: Detection, out: pathlib.Path | str) -> None:
       at = "" if result.seconds is None else f"{result.seconds[t]:.9g}"
       told = f"{score:.9g}" if np.isfinite(score) else ""
       alarms.writerow((detector, names[c], t, at, told))
-  folders.atomic(out / "alarms.csv", lambda file: file.write(text.getvalue().encode()))
-  folders.atomic(out / "detect.png", lambda file: figure(result, file))
-  tables.write_json(out / "detect.json", result.summary)
+  with folders.together():
+    folders.atomic(out / "alarms.csv", lambda file: file.write(text.getvalue().encode()))
+    folders.atomic(out / "detect.png", lambda file: figure(result, file))
+    tables.write_json(out / "detect.json", result.summary)
 
 
 def figure(result: Detection, file: pathlib.Path | str | BinaryIO, panels: int = 8) -> None:

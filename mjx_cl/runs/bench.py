@@ -8,7 +8,6 @@ is in scores.py. Parts are independent: several machines share a suite by `shard
 
 import contextlib
 import functools
-import json
 import os
 import pathlib
 import shutil
@@ -306,7 +305,7 @@ def redraw(results: pathlib.Path | str) -> list[pathlib.Path]:
   out = []
   for folder in sorted(p.parent for p in pathlib.Path(results).glob("*/bench.json")):
     try:
-      value = json.loads((folder / "bench.json").read_text())
+      value = tables.read_json(folder / "bench.json")
       out += draw(folder, _published(folder, value["suite"]), value)
     except (OSError, ValueError, KeyError, TypeError, UserError) as e:
       kind = "" if isinstance(e, UserError) else f"{type(e).__name__}: "

@@ -70,8 +70,9 @@ def write(folder: pathlib.Path | str, rows: list[dict]) -> None:
   which = lambda r: (r["robot"], r["fault"], r["physics"])
   new = {which(r) for r in rows}
   rows = [r for r in old_rows(folder) if which(r) not in new] + rows
-  tables.write_table(folder / "certificates.parquet", {k: [r[k] for r in rows] for k in COLUMNS})
-  folders.atomic(folder / "certificates.md", lambda file: file.write(table(rows).encode()))
+  with folders.together():
+    tables.write_table(folder / "certificates.parquet", {k: [r[k] for r in rows] for k in COLUMNS})
+    folders.atomic(folder / "certificates.md", lambda file: file.write(table(rows).encode()))
 
 
 ABOUT = """# Certificates: every fault acts

@@ -42,7 +42,7 @@ class Cost:
   def __init__(self, env: Any, trained: agents.Trained, faults: dict, episodes: int) -> None:
     self.faults, self.episodes = faults, episodes
     self.params = jax.tree.map(lambda x: x[None], trained.train.params)
-    agent, own, repeat = trained.agent, tuple(faults.values()), int(trained.card.get("repeat", 1))
+    agent, own, repeat = trained.agent, tuple(faults.values()), trained.repeat
     self.chunks = -(-env.spec.episode_steps // repeat // CHUNK)
     self.rollout = Rollout(env, agent, own, repeat)
     self.monitor = Monitor(agent, spec=env.spec)

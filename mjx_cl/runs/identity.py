@@ -40,7 +40,7 @@ def arm_agents(config: RunConfig, env: Any) -> dict[str, agents.Trained]:
       other = agents.of(env, name)
     except UserError as e:
       raise type(e)(f"arm {arm!r}: {e}") from None
-    same = lambda t: (t.agent.config.size, t.agent.config.obs_scale, int(t.card.get("repeat", 1)))
+    same = lambda t: (t.agent.config.size, t.agent.config.obs_scale, t.repeat)
     require(
       same(other) == same(trained),
       f"arm {arm!r}: agent {name!r} differs from the run's in size, obs_scale or repeat",

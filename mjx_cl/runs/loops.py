@@ -46,7 +46,7 @@ def make_loop(
   found = threshold_of(config)
   settings = config.settings | ({"threshold": found.value} if found else {})
   detector = detectors.make(config.detector, **({"robot": robot} | settings))
-  repeat, episode = int(trained.card.get("repeat", 1)), min(r.spec.episode_steps for r in robots)
+  repeat, episode = trained.repeat, min(r.spec.episode_steps for r in robots)
   records = lambda steps: capacity(steps, episode, repeat)
   size = (agent.config.size, len(spec.obs), len(spec.act))
   bounded = ("steps", records)

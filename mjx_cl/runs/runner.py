@@ -99,7 +99,7 @@ class Runner:
     adapt = ("lr", "policy_lr", "anchor", "last_starts", "batch")
     departures = {name: getattr(config.adapt, name) for name in adapt}
     self.trained = agents.of(self.env, config.agent, **departures)
-    self.repeat = int(self.trained.card.get("repeat", 1))
+    self.repeat = self.trained.repeat
     self.others = arm_agents(config, self.env)
     self.changes = changes(config)
     self.stops = stop_rule.told(config)

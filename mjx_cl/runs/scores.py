@@ -10,7 +10,7 @@ from typing import Any
 
 from mjx_cl.adapt.arms import ARMS, ONSET
 from mjx_cl.errors import FileError, UserError
-from mjx_cl.io import tables
+from mjx_cl.io import folders, tables
 from mjx_cl.render import figures
 from mjx_cl.runs.suite import Part, Suite, standing
 from mjx_cl.scoring import ablation, normalised_recovery, survival
@@ -127,12 +127,13 @@ def collect(
     "finished": len(entries),
     "entries": entries,
   }
-  if rows:
-    names = dict.fromkeys(name for row in rows for name in row)
-    table = {name: [row.get(name) for row in rows] for name in names}
-    tables.write_table(out / "bench.parquet", table)
-    draw(out, plan, value)
-  tables.write_json(out / "bench.json", value)
+  with folders.together():
+    if rows:
+      names = dict.fromkeys(name for row in rows for name in row)
+      table = {name: [row.get(name) for row in rows] for name in names}
+      tables.write_table(out / "bench.parquet", table)
+      draw(out, plan, value)
+    tables.write_json(out / "bench.json", value)
   return value
 
 

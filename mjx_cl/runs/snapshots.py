@@ -107,7 +107,7 @@ class Snapshots:
     folder: pathlib.Path,
   ) -> None:
     self.config, self.changes, self.labels, self.folder = config, changes, labels, folder
-    self.repeat = int(trained.card.get("repeat", 1))
+    self.repeat = trained.repeat
     self.setting = (env, trained.agent, faults)
     self.kept = np.array([never_stops(ARMS[arm]) for arm, _ in labels])
     acts = {k: trained.train.params[k] for k in ACTS}

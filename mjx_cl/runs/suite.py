@@ -10,11 +10,13 @@ NAME/severity=0.25,adapt.ratio=4 and so on. What is not given is RunConfig's def
 import dataclasses
 import itertools
 import json
+import math
+import os
 import pathlib
 import re
 import tomllib
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from mjx_cl.adapt.arms import ARMS
 from mjx_cl.config import AdaptConfig, RunConfig, field_kinds, replace
@@ -25,6 +27,10 @@ from mjx_cl.runs import merge, settings
 SUITES = pathlib.Path(__file__).parent / "suites"
 # what the names of suites and entries are made of
 FOLDER, LETTERS = r"\w[\w .,=+-]*", "letters, digits, spaces and _ - + . , ="
+LONGEST = 250  # bytes of a folder's name, which has a suffix while it is written
+MOST = 1000  # parts; each takes a minute or more
+# what OUT holds besides parts
+OWN = ("suite.json", "bench.json", "bench.parquet", "recovery.png", "ratio.png")
 
 
 class Part(NamedTuple):
@@ -77,10 +83,7 @@ def suite(name: str, change: dict | None = None) -> Suite:
   wrong = f"unknown {', '.join(map(repr, unknown))}" if unknown else "no name"
   require(not unknown and "name" in data, f"{where}: {wrong}; it takes: name, about, run, entries")
   called, run, entries = data["name"], data.get("run", {}), data.get("entries", {})
-  require(
-    isinstance(called, str) and re.fullmatch(FOLDER, called),
-    f"{where}: name {called!r} is a folder's name and takes {LETTERS} alone",
-  )
+  _check_name(f"{where}: name", called)
   require(
     isinstance(run, dict), f"{where}: run is a table of settings for every entry; got {run!r}"
   )
@@ -90,17 +93,46 @@ def suite(name: str, change: dict | None = None) -> Suite:
     and all(isinstance(entry, dict) for entry in entries.values()),
     f"{where}: it needs tables [entries.NAME]",
   )
-  parts: list[Part] = []
-  for key, entry in entries.items():
+  whole = {key: merged(merged(run, entry), change or {}) for key, entry in entries.items()}
+  for key in entries:
+    _check_name(f"{where}: entry", key)
     require(
-      re.fullmatch(FOLDER, key),
-      f"{where}: entry {key!r} is a folder's name and takes {LETTERS} alone",
+      key not in OWN,
+      f"{where}: entry {key!r} is a file of the results, as are {', '.join(OWN)}; give another",
     )
-    parts += grid(f"{where}, entry {key!r}", key, merged(merged(run, entry), change or {}))
-  names = [p.name for p in parts]
-  for k, part in enumerate(names):
-    require(part not in names[:k], f"{where}: part {part} is there twice")
+  count = sum(
+    math.prod(map(len, _lists(f"{where}, entry {key!r}", own).values()))
+    for key, own in whole.items()
+  )
+  require(count <= MOST, f"{where}: {count:,} parts; it takes {MOST:,} at most: shorten its lists")
+  parts = [part for key, own in whole.items() for part in grid(f"{where}, entry {key!r}", key, own)]
+  seen: set[str] = set()
+  for name, _ in parts:
+    require(name not in seen, f"{where}: part {name} is there twice")
+    seen.add(name)
   return Suite(called, str(data.get("about", "")), tuple(parts))
+
+
+def _check_name(what: str, name: Any) -> None:
+  """Raises UserError for a name that no folder of a suite may have."""
+  require(
+    isinstance(name, str) and re.fullmatch(FOLDER, name),
+    f"{what} {name!r} is a folder's name and takes {LETTERS} alone",
+  )
+  _check_folder(what, name)
+
+
+def _check_folder(what: str, name: str) -> None:
+  """Raises UserError for a folder that could not be written."""
+  size = len(os.fsencode(name))
+  require(
+    size <= LONGEST,
+    f"{what} {name[:40]!r}... is a folder's name of {size} bytes; it takes {LONGEST} at most",
+  )
+  require(
+    not name.endswith(".tmp"),
+    f"{what} {name!r} ends in .tmp, as what is being written does; give another",
+  )
 
 
 def merged(first: dict, second: dict) -> dict:
@@ -117,6 +149,20 @@ def grid(where: str, name: str, values: dict) -> list[Part]:
   Raises:
     UserError: for an empty list, a list of tables, or what `config` refuses.
   """
+  lists, parts = _lists(where, values), []
+  for combination in itertools.product(*lists.values()):
+    own = values
+    labels = []
+    for path, value in zip(lists, combination):
+      own = merged(own, {path[0]: {path[1]: value} if path[1:] else value})
+      labels.append(f"{'.'.join(path)}={str(value).replace('/', '-')}")
+    _check_folder(f"{where}: part", label := ",".join(labels))
+    parts.append(Part("/".join(filter(None, (name, label))), config(where, own)))
+  return parts
+
+
+def _lists(where: str, values: dict) -> dict[tuple[str, ...], list]:
+  """The settings of an entry that are lists, by their path."""
   for table in ("adapt", "settings"):
     own = values.get(table, {})
     require(isinstance(own, dict), f"{where}: {table} is a table of settings; got {own!r}")
@@ -125,15 +171,7 @@ def grid(where: str, name: str, values: dict) -> list[Part]:
   lists |= {("adapt", k): v for k, v in values.get("adapt", {}).items() if isinstance(v, list)}
   for path, choices in lists.items():
     require(choices, f"{where}: {'.'.join(path)} is an empty list")
-  parts = []
-  for combination in itertools.product(*lists.values()):
-    own = values
-    labels = []
-    for path, value in zip(lists, combination):
-      own = merged(own, {path[0]: {path[1]: value} if path[1:] else value})
-      labels.append(f"{'.'.join(path)}={str(value).replace('/', '-')}")
-    parts.append(Part("/".join(filter(None, (name, ",".join(labels)))), config(where, own)))
-  return parts
+  return lists
 
 
 def config(where: str, values: dict) -> RunConfig:
@@ -198,9 +236,9 @@ def finished(out: pathlib.Path, part: Part) -> bool:
   """Whether OUT/PART holds this part's results.
 
   Raises:
-    UserError: where it holds a run with other settings.
+    UserError: where it holds a run with other settings, or a file.
   """
-  folder = pathlib.Path(out) / part.name
+  folder = folders.usable(pathlib.Path(out) / part.name)
   text = merge.differs(folder, part.config)
   require(
     not text, f"{folder} {text}; give the same settings or another --out, or remove that folder"

@@ -1,6 +1,5 @@
 """The stop rule with each signal left out, lived once more over the recorded signals."""
 
-import json
 import os
 import pathlib
 from typing import Any
@@ -14,6 +13,7 @@ from mjx_cl.adapt.arms import ARMS, never_stops
 from mjx_cl.adapt.decide import REASONS, SIGNALS, START, STOP
 from mjx_cl.config import AdaptConfig
 from mjx_cl.errors import FileError, UserError
+from mjx_cl.io import tables
 from mjx_cl.scoring import events, intervals, stop_rule
 
 # settings of AdaptConfig that it may change
@@ -59,10 +59,8 @@ def ablation(folder: str | os.PathLike, **rule: Any) -> list[dict]:
       f"{', '.join(RULE)}"
     )
   try:
-    config = AdaptConfig(
-      **json.loads((pathlib.Path(folder) / "config.json").read_text())["adapt"] | rule
-    )
-  except (OSError, ValueError, KeyError, TypeError) as e:
+    config = AdaptConfig(**tables.read_json(pathlib.Path(folder) / "config.json")["adapt"] | rule)
+  except (FileError, KeyError, TypeError) as e:
     raise FileError(f"{folder} holds no run: {e}") from None
   chunks, known = stop_rule.read(folder, "signals"), {}
   if (pathlib.Path(folder) / "snapshots.parquet").exists():

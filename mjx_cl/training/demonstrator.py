@@ -147,7 +147,7 @@ def latest(out: pathlib.Path, env: Any) -> tuple[list[dict], tuple]:
     rows = json.loads((out / "curve.json").read_text())
     params = serialization.from_bytes(_template(env), (out / "latest.msgpack").read_bytes())
     done = rows[-1]["step"]
-  except (OSError, ValueError, KeyError, IndexError) as e:
+  except (OSError, ValueError, KeyError, IndexError, TypeError, RecursionError) as e:
     raise FileError(
       f"{out} holds no demonstrator training that can go on ({e}); leave out --resume to start one"
     ) from None

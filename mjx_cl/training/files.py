@@ -150,7 +150,7 @@ def _begun(path: pathlib.Path, seeds: int) -> dict[str, Any]:
   the training its default.
   """
   try:
-    old = json.loads(path.read_text())
+    old = tables.read_json(path)
     return {
       "env": old["env"],
       "seed": old["seed"],
@@ -161,8 +161,8 @@ def _begun(path: pathlib.Path, seeds: int) -> dict[str, Any]:
       **recorded(TrainConfig, old["train"]),
       "agent": old.get("started_from"),
     }
-  except (OSError, ValueError, KeyError, TypeError) as e:
-    why = f": {e}" if type(e) is ValueError else ""
+  except (FileError, ValueError, KeyError, TypeError) as e:
+    why = f": {e}" if type(e) in (FileError, ValueError) else ""
     raise FileError(f"{path} is not a training's{why}; give --overwrite or another --out") from None
 
 

@@ -116,7 +116,7 @@ def _check_agent(env: Any, dreamer: DreamerConfig, config: TrainConfig, name: st
   has, wanted = (
     {"size": c.size, "bins": c.bins, "obs_scale": scaled(env, c).obs_scale, "repeat": repeat}
     for c, repeat in (
-      (trained.agent.config, int(trained.card.get("repeat", 1))),
+      (trained.agent.config, trained.repeat),
       (dreamer, config.repeat),
     )
   )

@@ -15,6 +15,7 @@ import signal
 import subprocess
 import sys
 import time
+import zipfile
 
 import numpy as np
 import pytest
@@ -28,7 +29,7 @@ from mjx_cl.cli import app, results
 from mjx_cl.cli import tables as shown
 from mjx_cl.config import PRESETS, RunConfig
 from mjx_cl.config.sizes import SIZES
-from mjx_cl.errors import FileError
+from mjx_cl.errors import FileError, UserError
 from mjx_cl.faults import presets
 from mjx_cl.io import folders
 from mjx_cl.io import tables as store
@@ -541,10 +542,59 @@ def other_size(folder):
   tamper(folder, dreamer=dataclasses.asdict(PRESETS["cpu"].dreamer))
 
 
+def member(folder, name="a.npy", content=b"garbage"):
+  """Adds a file to the archive of weights."""
+  with zipfile.ZipFile(folder / "agent.npz", "a") as archive:
+    archive.writestr(name, content)
+
+
+def retyped(kind):
+  """The same weights as arrays of another type."""
+
+  def spoil(folder):
+    with np.load(folder / "agent.npz") as z:
+      held = {k: np.zeros(z[k].shape, kind) for k in z.files}
+    np.savez(folder / "agent.npz", **held)
+
+  return spoil
+
+
+def nested(folder):
+  (folder / "card.json").write_text('{"env": ' + "[" * 100_000 + "]" * 100_000 + "}")
+
+
 AGENTS = {
   "another robot": (lambda f: tamper(f, env="car"), 2, "car"),
   "another size": (other_size, 1, "does not fit size size1m"),
-  "unknown size": (lambda f: tamper(f, dreamer={"size": "size3k"}), 2, "size1m"),
+  "unknown size": (lambda f: tamper(f, dreamer={"size": "size3k"}), 1, "size1m"),
+  **{
+    f"repeat {value!r}": (lambda f, value=value: tamper(f, repeat=value), 1, word)
+    for value, word in (
+      *((value, "repeat takes int") for value in ("2", None, [1], 1.5, 1e30, True)),
+      *((value, "repeat must lie in 1..100") for value in (0, -1, 101, 10**30)),
+      *((value, "not finite") for value in (float("nan"), float("inf"))),
+    )
+  },
+  "no robot": (lambda f: tamper(f, env=None), 1, "env takes str; got None"),
+  "a number for a robot": (lambda f: tamper(f, env=3), 1, "env takes str; got 3"),
+  "a word for updates": (lambda f: tamper(f, updates="x"), 1, "updates takes int"),
+  "settings that are a list": (lambda f: tamper(f, dreamer=[]), 1, "dreamer must be a table"),
+  "a word in the settings": (
+    lambda f: tamper(f, dreamer={"size": "size1m", "lr": "x"}),
+    1,
+    "dreamer.lr takes float",
+  ),
+  "a number without end in the settings": (
+    lambda f: tamper(f, dreamer={"size": "size1m", "batch": 10**400}),
+    1,
+    "batch must be above 0 and finite",
+  ),
+  "a score that is no number": (lambda f: tamper(f, eval=float("nan")), 1, "not finite"),
+  "card without a ground": (nested, 1, "nested deeper than 64 levels"),
+  "garbage among the weights": (member, 1, "is no array"),
+  "weights that are text": (retyped("U3"), 1, "does not fit"),
+  "weights that are void": (retyped("V4"), 1, "does not fit"),
+  "weights that are complex": (retyped("c8"), 1, "does not fit"),
   "truncated": (truncated, 1, "agent.npz"),
   "empty": (lambda f: (f / "agent.npz").write_bytes(b""), 1, "agent.npz"),
   "foreign": (foreign, 1, "does not fit"),
@@ -694,12 +744,39 @@ def test_a_full_disk_at_a_checkpoint_is_one_line(mjx, begun, monkeypatch):
   assert content(out) == before
 
 
+MAPS = "libparquet.so.2600: failed to map segment from shared object"
+
+
 def test_a_message_of_several_lines_becomes_one(refused, monkeypatch):
   def fail(_):
     raise FileError("first\n  second\tthird")
 
   monkeypatch.setitem(app.DO, app.List, fail)
   assert refused(1, "list") == "mjx-cl: first second third\n"
+
+
+@pytest.mark.parametrize("raised, said", [(MemoryError(), ""), (ImportError(MAPS), f": {MAPS}")])
+def test_too_little_memory_is_said_as_such(refused, monkeypatch, raised, said):
+  def fail(_):
+    raise raised
+
+  monkeypatch.setitem(app.DO, app.List, fail)
+  assert refused(1, "list") == (
+    f"mjx-cl: out of memory{said}; fewer --seeds, arms or detectors or a smaller batch need less\n"
+  )
+
+
+def test_what_a_part_lacked_memory_for_is_said_with_it(refused, monkeypatch):
+  """A line of this package's that comes of too little memory keeps its words, and says so."""
+
+  def fail(_):
+    try:
+      raise MemoryError("Unable to allocate 8 GiB")
+    except MemoryError:
+      raise UserError("detector 'x' failed") from None
+
+  monkeypatch.setitem(app.DO, app.List, fail)
+  assert "out of memory: detector 'x' failed; fewer --seeds" in refused(1, "list")
 
 
 def test_a_pipe_that_closes_is_no_error(mjx, monkeypatch):

@@ -146,6 +146,41 @@ def test_a_broken_checkpoint_is_set_aside_and_its_number_is_free(folder, same, c
   ]  # what is set aside does not count among the two
 
 
+FULL = """
+import resource, signal, sys
+from mjx_cl.io import runtime
+runtime.setup()
+import numpy as np
+from mjx_cl.cli import app
+from mjx_cl.io.checkpoints import Checkpoints
+store = Checkpoints(sys.argv[1])
+rng = np.random.default_rng(0)
+tree = {name: rng.random((200, 1000)) for name in "abcd"}  # what no compression makes small
+store.save(1, {"a": np.zeros(3)}, {})
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, resource.RLIM_INFINITY))
+sys.exit(app.attempt(lambda: store.save(2, tree, {})))
+"""
+
+
+def test_a_checkpoint_that_does_not_fit_is_one_line(tmp_path):
+  """Orbax, TensorStore and asyncio say nothing of their own; half a checkpoint takes no room."""
+  done = subprocess.run(
+    [sys.executable, "-c", FULL, str(tmp_path / "store")],
+    capture_output=True,
+    text=True,
+    timeout=1200,
+    env=os.environ | {"JAX_PLATFORMS": "cpu"},
+  )
+  assert done.returncode == 1
+  (line,) = [x for x in done.stderr.splitlines() if "cpu_aot" not in x]
+  assert line == (
+    f"mjx-cl: cannot write checkpoint 2 in {tmp_path / 'store'}: File too large; the earlier ones "
+    "are intact"
+  )
+  assert [p.name for p in (tmp_path / "store").iterdir()] == ["1"]
+
+
 @pytest.mark.parametrize("other", [{"n": jnp.float32(4)}, {"w": jnp.zeros((2, 3), jnp.float16)}])
 def test_another_dtype_is_refused_and_not_cast(folder, other):
   before, (name,) = contents(folder), other

@@ -96,6 +96,29 @@ def test_a_full_disk_leaves_the_earlier_file(tmp_path, monkeypatch, kind, where)
   assert path.read_bytes() != before
 
 
+def test_files_of_one_result_change_together_or_not_at_all(tmp_path):
+  def interrupt():
+    raise KeyboardInterrupt
+
+  def write(value, then=lambda: None):
+    with folders.together():
+      tables.write_json(tmp_path / "a.json", value)
+      with folders.together():
+        tables.write_table(tmp_path / "b.parquet", {"v": [value]})
+      then()
+
+  write(1)
+  before = {p.name: p.read_bytes() for p in tmp_path.iterdir()}
+  with pytest.raises(FileError, match="No space left.*unchanged"):
+    write(2, lambda: folders.atomic(tmp_path / "c", half_written))
+  with pytest.raises(KeyboardInterrupt):
+    write(2, interrupt)
+  assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == before
+  write(2)
+  after = {p.name: p.read_bytes() for p in tmp_path.iterdir()}
+  assert after.keys() == before.keys() and all(after[name] != before[name] for name in before)
+
+
 def test_a_missing_folder_is_one_line(tmp_path):
   for write in (lambda p: tables.write_json(p, 1), lambda p: tables.write_table(p, {"v": [1]})):
     with pytest.raises(FileError) as error:
@@ -568,6 +591,29 @@ def test_json_that_is_no_object_is_one_line(tmp_path, text, says):
   with pytest.raises(FileError) as error:
     tables.read_json(tmp_path / "x.json")
   assert says in one_line(error) and "x.json" in one_line(error)
+
+
+@pytest.mark.parametrize("levels", [65, 600, 100_000])
+def test_what_is_nested_without_end_is_one_line(tmp_path, levels):
+  """Deeper than is said, than Python's own recursion, and than its parsers go."""
+  json_, toml = tmp_path / "x.json", tmp_path / "x.toml"
+  json_.write_text('{"a": ' + "[" * levels + "]" * levels + "}")
+  toml.write_text("a = " + "[" * levels + "]" * levels)
+  for read in (tables.read_json, lambda path: tables.read_suite(str(toml), tmp_path / "none")):
+    with pytest.raises(FileError, match="nested deeper than 64 levels"):
+      read(json_)
+  toml.write_text(".".join("a" * 65) + " = 1")
+  with pytest.raises(FileError, match="nested deeper than 64 levels"):
+    tables.read_suite(str(toml), tmp_path / "none")
+  json_.write_text('{"a": ' + "[" * 63 + "]" * 63 + "}")
+  assert tables.read_json(json_)
+
+
+@pytest.mark.parametrize("number", ["NaN", "-Infinity", "1e999"])
+def test_json_with_a_number_that_is_not_finite_is_one_line(tmp_path, number):
+  (tmp_path / "x.json").write_text(f'{{"a": [{number}]}}')
+  with pytest.raises(FileError, match="not finite"):
+    tables.read_json(tmp_path / "x.json")
 
 
 def test_a_folder_is_probed_before_what_goes_there_is_computed(tmp_path):

@@ -217,6 +217,9 @@ def test_suites_that_ship_are_sound():
         faults.target_index(faults.make(fault, env), target or None)
 
 
+BEYOND = ("x", None, True, -1.0, float("nan"), float("inf"), 1e300, 10**400)
+
+
 @pytest.mark.parametrize(
   "edit, text",
   [
@@ -229,6 +232,14 @@ def test_suites_that_ship_are_sound():
     ({"robots": {"walker": {"score": {"gear": [1.5]}}}}, "severities in"),
     ({"robots": {}}, "no \\[robots"),
     ({"nominal": {"steps": 5}}, "needs"),
+    *[({"latents": {"nominal": 1, "after_s": x}}, "after_s must be a number") for x in BEYOND],
+    *[({name: x}, f"{name} must be a number") for name in ("horizon_s", "arl0") for x in BEYOND],
+    ({"latents": {"nominal": -1, "after_s": 1.0}}, "nominal must be 0 or above"),
+    ({"nominal": {"steps": 10**13, "score": 1, "tune": 1}}, "steps must be .* below 2,147,483,648"),
+    ({"onset": (10**14, 10**14 + 1)}, "onset must be .* below 2,147,483,648"),
+    ({"seeds": {"score": (0, 9), "tune": (2**31, 2**31)}}, "tune must be .* below 2,147,483,648"),
+    ({"name": 3}, "name must be text"),
+    ({"robots": {"walker": {"score": {"gear": (True,)}}}}, "severities in"),
   ],
 )
 def test_unsound_suites_are_refused_in_one_line(edit, text):

@@ -13,11 +13,15 @@ from test_cli import mjx, refused  # noqa: F401  fixtures
 from test_leaderboard import submission, trailing
 from test_run import saved  # noqa: F401  a fixture
 
+from mjx_cl import envs
 from mjx_cl.cli import app
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.io import tables
-from mjx_cl.leaderboard import lives, streams
+from mjx_cl.leaderboard import lives, room, streams
 from mjx_cl.leaderboard import record as recording
+from mjx_cl.training import agents
+
+SPLITS = ("score", "tune")
 
 SUITE = """
 name = "mini"
@@ -162,8 +166,40 @@ robots.car = {score = {friction = [0.5]}, tune = {wind = [1.0]}}
 def test_counts_of_a_suite_are_whole_numbers(tmp_path, good, bad):
   """TOML's 5e1 is a float, which indexes nothing: said before hours of recording."""
   (tmp_path / "two.toml").write_text(TWO.replace(good, bad))
-  with pytest.raises(UserError, match="whole numbers; got .*[.T]"):
+  with pytest.raises(UserError, match="whole numbers below .*; got .*[.T]"):
     streams.suite(str(tmp_path / "two.toml"))
+
+
+@pytest.mark.parametrize(
+  "good, bad",
+  [
+    ("steps = 128", "steps = 2_000_000_000"),
+    ("onset = [100, 120]", "onset = [2_000_000_000, 2_000_000_001]"),
+    ("horizon_s = 2.0", "horizon_s = 2e9"),
+    ("tune = [100, 101]", "tune = [100, 2_000_000_000]"),
+    ("steps = 128, score = 1", "steps = 128, score = 2_000_000_000"),
+  ],
+)
+def test_what_memory_does_not_hold_is_refused_before_the_first_step(refused, tmp_path, good, bad):  # noqa: F811
+  (tmp_path / "two.toml").write_text(TWO.replace(good, bad))
+  text = refused(2, "record", tmp_path / "two.toml", "--out", tmp_path / "set")
+  assert "suite 'two': streams of walker need" in text and "GiB may be used; fewer seeds" in text
+  assert not list((tmp_path / "set").iterdir())
+
+
+def test_the_memory_of_a_recording_follows_its_lanes_and_steps(tmp_path):
+  (tmp_path / "two.toml").write_text(TWO)
+  suite, env = streams.suite(str(tmp_path / "two.toml")), envs.make("walker", "native")
+  learner, after = agents.of(env).agent.config, lambda s: s.after(env.spec.control_s)
+  need = lambda s: room.of(s, "walker", env.spec, learner)
+  lanes = lambda kind: sum(
+    len(recording._who(suite, "walker", split, kind, env.spec.control_s)[0]) for split in SPLITS
+  )
+  row = room.COPIES * room.ROW
+  more = dataclasses.replace(suite, nominal=suite.nominal | {"steps": 1128})
+  assert need(more) - need(suite) == row * lanes("nominal") * 1000
+  later = dataclasses.replace(suite, horizon_s=4.0)
+  assert need(later) - need(suite) == row * lanes("fault") * (after(later) - after(suite))
 
 
 @pytest.fixture

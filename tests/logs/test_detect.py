@@ -21,7 +21,7 @@ from mjx_cl import detectors
 from mjx_cl.cli import app
 from mjx_cl.detectors import Alarm, Detector, scalar
 from mjx_cl.errors import FileError, UserError
-from mjx_cl.io import tables
+from mjx_cl.io import folders
 from mjx_cl.logs import detect, programs, results
 from mjx_cl.logs.read import read
 
@@ -633,6 +633,25 @@ def test_a_registered_detector_that_breaks_is_one_line(logs, monkeypatch, update
   assert "detector 'foreign' failed" in one_line(error) and words in one_line(error)
 
 
+@pytest.mark.parametrize("registered", [True, False])
+@pytest.mark.parametrize("raised", [MemoryError(), RuntimeError("std::bad_alloc")])
+def test_too_little_memory_is_not_blamed_on_the_detector(
+  tmp_path, logs, monkeypatch, raised, registered
+):
+  def update(*_):
+    raise raised
+
+  @scalar
+  def foreign(threshold=1.0):
+    return Detector(lambda: jnp.int32(0), update)
+
+  monkeypatch.setitem(detectors.DETECTORS, "foreign", foreign)
+  (tmp_path / "own.py").write_text(f"class Own:\n  def update(self, x):\n    raise {raised!r}\n")
+  name = "foreign" if registered else f"{tmp_path / 'own.py'}:Own"
+  with pytest.raises(type(raised)):
+    detect.detect(*logs, detectors=(name,), arl0=100)
+
+
 # ---- samples -------------------------------------------------------------------------------------
 
 
@@ -1040,22 +1059,29 @@ def test_bad_input_is_one_line(tmp_path, logs, mjx, monkeypatch, change, code, w
   assert sorted(os.listdir(tmp_path)) == before
 
 
-def test_a_full_disk_leaves_the_earlier_detection(tmp_path, logs, monkeypatch):
-  result = detect.detect(*logs, detectors=("cusum",), arl0=100)
-  results.write(result, tmp_path)
+@pytest.mark.parametrize("name", ["alarms.csv", "detect.png", "detect.json", None])
+def test_a_full_disk_leaves_the_earlier_detection(tmp_path, logs, monkeypatch, name):
+  """The disk is full at one of the files, which is written after others, or as all are renamed."""
+  results.write(detect.detect(*logs, detectors=("cusum",), arl0=100), tmp_path)
   before = {name: (tmp_path / name).read_bytes() for name in results.FILES}
+  other, atomic = detect.detect(*logs, detectors=("page_hinkley",), arl0=100), folders.atomic
 
   def full(*_, **__):
     raise OSError(28, "No space left on device")
 
-  monkeypatch.setattr(tables.os, "replace", full)
+  if name:
+    fills = lambda path, write: atomic(path, full if path.name == name else write)
+    monkeypatch.setattr(folders, "atomic", fills)
+  else:
+    monkeypatch.setattr(os, "replace", full)
   with pytest.raises(FileError) as error:
-    results.write(result, tmp_path)
-  assert (
-    "No space left" in one_line(error)
-    and {name: (tmp_path / name).read_bytes() for name in results.FILES} == before
-  )
+    results.write(other, tmp_path)
+  assert "No space left" in one_line(error) and "unchanged" in one_line(error)
+  assert {p.name: p.read_bytes() for p in tmp_path.iterdir() if p.name in before} == before
   assert not [name for name in os.listdir(tmp_path) if name.endswith(".tmp")]
+  monkeypatch.undo()
+  results.write(other, tmp_path)
+  assert (tmp_path / "alarms.csv").read_bytes() != before["alarms.csv"]
 
 
 def test_a_spike_survives_the_drawing():

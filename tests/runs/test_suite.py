@@ -145,6 +145,31 @@ BAD = {
     'name = "x"\n[entries."../../evil"]\nenv = "walker"',
     ["../../evil", "letters, digits"],
   ),
+  "an entry is a file": (
+    'name = "x"\n[entries."bench.json"]\nenv = "walker"',
+    ["'bench.json' is a file of the results", "suite.json", "another"],
+  ),
+  "an entry is what is being written": (
+    'name = "x"\n[entries."a.tmp"]\nenv = "walker"',
+    ["'a.tmp' ends in .tmp", "another"],
+  ),
+  "an entry beyond the file system": (
+    f'name = "x"\n[entries."{"ä" * 126}"]\nenv = "walker"',
+    ["entry 'ä", "252 bytes", "250 at most"],
+  ),
+  "a name beyond the file system": (
+    f'name = "{"x" * 300}"\n[entries.a]\nenv = "walker"',
+    ["name 'x", "300 bytes", "250 at most"],
+  ),
+  "a list beyond the file system": (
+    f'name = "x"\n[entries.a]\nenv = "walker"\nagent = ["{"x" * 250}"]',
+    ["entry 'a': part 'agent=x", "256 bytes", "250 at most"],
+  ),
+  "more parts than anyone waits for": (
+    f'name = "x"\n[entries.a]\nenv = "walker"\nonset = {list(range(707))}\n'
+    f"steps = {list(range(10000, 10707))}",
+    ["499,849 parts", "1,000 at most"],
+  ),
   "a truth for a number": (
     'name = "x"\n[entries.a]\nenv = "walker"\nseverity = true',
     ["severity takes float", "True"],
@@ -234,6 +259,28 @@ def test_a_wrong_suite_is_one_line_and_runs_nothing(refused, tmp_path, text, wor
   message = refused(1 if words == ["TOML"] else 2, "bench", name, "--out", out)
   assert all(word in message for word in words), message
   assert not out.exists()
+
+
+@pytest.mark.parametrize("more", [[], ["--plan"]])
+def test_out_that_is_a_file_is_refused_before_anything_runs(refused, mini, tmp_path, more):  # noqa: F811
+  (tmp_path / "thesis.tex").write_bytes(b"years")
+  assert "thesis.tex is a file" in refused(
+    2, "bench", mini, "--out", tmp_path / "thesis.tex", *more
+  )
+  assert "empty name" in refused(2, "bench", mini, "--out", "", *more)
+  (tmp_path / "out").mkdir()
+  (tmp_path / "out" / "healthy").write_bytes(b"years")
+  assert "healthy is a file" in refused(2, "bench", mini, "--out", tmp_path / "out", *more)
+
+
+def test_no_part_is_named_as_a_file_of_a_published_suite():
+  files = {
+    p.name
+    for bench_ in RESULTS.glob("*/bench.json")
+    for p in bench_.parent.iterdir()
+    if p.is_file() and p.name != "README.md"
+  }
+  assert files >= {"bench.json", "suite.json"} and files <= set(suites.OWN)
 
 
 def test_wrong_arguments_are_one_line(refused, mini, tmp_path):  # noqa: F811

@@ -16,13 +16,15 @@ import ml_dtypes
 import numpy as np
 
 from mjx_cl import envs
-from mjx_cl.config import DreamerConfig, recorded
+from mjx_cl.config import MOST_REPEAT, DreamerConfig, field_kinds, kinds, recorded
 from mjx_cl.dreamer.agent import Agent, TrainState
-from mjx_cl.errors import FileError, UserError
-from mjx_cl.io import arrays, folders
+from mjx_cl.errors import FileError, UserError, require
+from mjx_cl.io import arrays, folders, tables
 
 HERE = pathlib.Path(__file__).parent
 _HALF = "|bfloat16"  # suffix of a moment that is stored as the upper half of its float32
+# what a card must hold besides `dreamer`; where it has no `repeat` that is 1
+CARD = {"env": "str", "repeat": "int", "updates": "int | None"}
 
 
 class Trained(NamedTuple):
@@ -39,6 +41,11 @@ class Trained(NamedTuple):
   train: TrainState
   card: dict
   path: str
+
+  @property
+  def repeat(self) -> int:
+    """Control steps for which an action is held."""
+    return self.card.get("repeat", 1)
 
 
 def shipped() -> list[str]:
@@ -59,9 +66,10 @@ def save(folder: os.PathLike | str, train: TrainState, card: dict) -> None:
       stored[name + _HALF] = value.astype(ml_dtypes.bfloat16).view(np.uint16)
     else:
       stored[name] = value
-  arrays.write(folder / "agent.npz", stored, small=True)
   text = json.dumps(card, indent=1) + "\n"
-  folders.atomic(folder / "card.json", lambda file: file.write(text.encode()))
+  with folders.together():
+    arrays.write(folder / "agent.npz", stored, small=True)
+    folders.atomic(folder / "card.json", lambda file: file.write(text.encode()))
 
 
 def of(env: Any, path: str | None = None, **departures: Any) -> Trained:
@@ -81,6 +89,27 @@ def of(env: Any, path: str | None = None, **departures: Any) -> Trained:
 def is_shipped(env: Any) -> bool:
   """Whether there is an agent for this robot without a path."""
   return not {env.spec.name, getattr(env, "agents_of", None)}.isdisjoint(shipped())
+
+
+def read_card(folder: pathlib.Path) -> tuple[dict, DreamerConfig]:
+  """The card of an agent, and the settings of its learner.
+
+  Raises:
+    FileError: a card that is broken or of something else.
+  """
+  path, where = folder / "card.json", "its settings"
+  card = tables.read_json(path)
+  held = {"env": None, "repeat": 1, "dreamer": None} | card
+  try:
+    kinds(where, CARD, held)
+    fits = 1 <= held["repeat"] <= MOST_REPEAT
+    require(fits, f"repeat must lie in 1..{MOST_REPEAT}; got {held['repeat']}")
+    require(isinstance(held["dreamer"], dict), "dreamer must be a table of settings")
+    dreamer = recorded(DreamerConfig, held["dreamer"])
+    field_kinds(where, DreamerConfig, dreamer, "dreamer.")
+    return card, DreamerConfig(**dreamer)
+  except (UserError, ValueError, TypeError) as e:
+    raise FileError(f"{path} is not an agent's card: {e}") from None
 
 
 def load(
@@ -117,13 +146,9 @@ def load(
       f"no agent {name!r}; shipped: {', '.join(shipped()) or 'none'}; or give a folder that "
       "holds agent.npz and card.json"
     )
-  try:
-    card = json.loads((folder / "card.json").read_text())
-    config = DreamerConfig(**recorded(DreamerConfig, card["dreamer"]))
-  except (OSError, ValueError, KeyError, TypeError) as e:
-    raise FileError(f"{folder / 'card.json'} is not an agent's card: {e}") from None
-  if card.get("env") not in (env_name, related):
-    raise UserError(f"agent {name!r} was trained on {card.get('env')!r}, not on {env_name!r}")
+  card, config = read_card(folder)
+  if card["env"] not in (env_name, related):
+    raise UserError(f"agent {name!r} was trained on {card['env']!r}, not on {env_name!r}")
   # whatever goes on from here does so at full learning rate
   other = {"warmup": 0} | {k: v for k, v in departures.items() if v is not None}
   config = dataclasses.replace(config, **other)
@@ -131,10 +156,10 @@ def load(
   like = jax.eval_shape(agent.init, jax.random.key(0))
   stored, leaves = arrays.read(folder / "agent.npz"), []
   for key, want in arrays.named(like).items():
-    value = stored.get(key)
-    if value is None and key + _HALF in stored:
-      value = stored[key + _HALF].view(ml_dtypes.bfloat16).astype(np.float32)
-    if value is None or value.shape != want.shape:
+    value, half = stored.get(key), stored.get(key + _HALF)
+    if value is None and half is not None and half.dtype == np.uint16:
+      value = half.view(ml_dtypes.bfloat16).astype(np.float32)
+    if value is None or value.shape != want.shape or value.dtype.kind not in "fiub":
       raise FileError(
         f"{folder / 'agent.npz'} does not fit size {config.size} with {obs_size} observations "
         f"and {act_size} actions: {key}"

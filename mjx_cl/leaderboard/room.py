@@ -1,0 +1,42 @@
+"""What memory a recording takes at most, known before it begins."""
+
+from mjx_cl.config import CHUNK, DreamerConfig
+from mjx_cl.errors import require
+from mjx_cl.io import memory
+from mjx_cl.leaderboard.streams import COLUMNS, PROJECTION
+from mjx_cl.leaderboard.suite import Suite
+from mjx_cl.runs.room import LIFE
+from mjx_cl.training import needs
+from mjx_cl.types import Spec
+
+ROW = (
+  4 * len(COLUMNS) + 2 * len(PROJECTION) + 3
+)  # bytes of a lane and control step, as `live` gives
+COPIES = 4  # of them: as lived, rounded, as one table, and that once more while it is written
+
+
+def of(suite: Suite, robot: str, spec: Spec, learner: DreamerConfig) -> int:
+  """Bytes that a process grows to which records a robot of the suite."""
+  rows, most = 0, 0
+  end = suite.onset[1] - 1 + suite.after(spec.control_s)
+  for split, (first, last) in suite.seeds.items():
+    faulty = 1 + sum(map(len, suite.robots[robot]["score"].values()))
+    if split == "tune":
+      faulty += sum(map(len, suite.robots[robot].get("tune", {}).values()))
+    healthy, seeds = suite.nominal[split], last - first + 1
+    rows += seeds * (healthy * suite.nominal["steps"] + faulty * end)
+    most = max(most, seeds * max(healthy, faulty))
+  record = needs.need(learner.size, len(spec.obs), len(spec.act), 0, learner.bins).record
+  return memory.resident(most * (LIFE + 2 * CHUNK * record)) + COPIES * ROW * rows
+
+
+def check(suite: Suite, robot: str, spec: Spec, learner: DreamerConfig) -> None:
+  """Refuses a recording that would not fit."""
+  grown = of(suite, robot, spec, learner)
+  space = int(memory.MARGIN * memory.free()) + memory.held()
+  require(
+    grown <= space,
+    f"suite {suite.name!r}: streams of {robot} need {grown / 2**30:,.1f} GiB, "
+    f"{space / 2**30:.1f} GiB may be used; fewer seeds, nominal streams or steps, or an earlier "
+    "onset or horizon would fit",
+  )
