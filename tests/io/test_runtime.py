@@ -199,9 +199,12 @@ def test_256_mjx_walkers_finish_and_agree_with_mujoco(walker, pair, fields, crow
 
 def test_20000_callbacks_with_160_streams(walker, within):
   """The known risk is a deadlock (jax issues 24255, 25861); the oracle is plain mj_step, bit for
-  bit.
+  bit. The walkers float, which takes MuJoCo a third of the time; what crosses JAX is as large.
   """
   streams, calls, watched = 160, 20_000, np.array([3, 158])
+  walker = walker.__copy__()
+  walker.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+  walker.opt.gravity[:] = 0
   native = Native(walker, substeps=1)
   rng = np.random.default_rng(2)
   gear = (np.asarray(walker.actuator_gear) * rng.uniform(0.5, 1.5, (streams, 6, 1))).astype(
