@@ -216,7 +216,7 @@ def check_filled(command: Any) -> None:
   for field in dataclasses.fields(command):
     value = getattr(command, field.name)
     if field.default != "" and (value == "" or (isinstance(value, tuple) and "" in value)):
-      raise UserError(f"--{field.name.replace('_', '-')} was given an empty text")
+      raise UserError(f"--{field.name.replace('_', '-')} got an empty name or text")
 
 
 @contextlib.contextmanager

@@ -3,6 +3,7 @@ process of their own, which can be ended whatever they do. Free of JAX.
 """
 
 import contextlib
+import ctypes
 import io
 import json
 import os
@@ -287,6 +288,8 @@ def _answer(how: dict, out: BinaryIO) -> None:
 
 def main(argument: str) -> None:
   """Answers on what was standard output; whatever else is printed goes to standard error."""
+  if sys.platform == "linux":  # it ends with its parent, also where that is killed
+    ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG, prctl(2)
   signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interrupt is the parent's affair
   with os.fdopen(os.dup(1), "wb") as out:
     os.dup2(2, 1)

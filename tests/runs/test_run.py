@@ -778,7 +778,7 @@ class Stub:
 
   room = "memory"
 
-  def __init__(self, config, out, programs=None):
+  def __init__(self, config, out, *shared):
     self.chunk = 0
 
   def step(self):
