@@ -5,7 +5,7 @@ help. Free of JAX.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 from tyro.conf import Positional
@@ -214,6 +214,8 @@ class Bench:
     shard: K/N: this machine runs every N-th part from the K-th on.
     jobs: Parts side by side, each on its share of the cores; default: one per core as far as
       memory allows.
+    on: here, or ray: on the machines of a Ray cluster, a core a part.
+    address: Of the cluster; default: one is started on this machine.
     merge: Folders of the same suite from other machines; their finished parts are copied here
       and not run, seeds of a part that several hold are joined.
     publish: Copy finished parts' tables and figures, without the traces, to this folder.
@@ -230,6 +232,8 @@ class Bench:
   plan: bool = False
   shard: str = "0/1"
   jobs: int | None = None
+  on: Literal["here", "ray"] = "here"
+  address: str | None = None
   merge: tuple[str, ...] = ()
   publish: str | None = None
   json: bool = False

@@ -60,16 +60,26 @@ def do_bench(args: Bench) -> None:
     say(f"{name}: taken over")
   needs = [estimates[p.name].bytes for p in parts if p.name not in done]
   most, space = max(needs, default=0), int(memory.MARGIN * memory.free())
+  require(args.address is None or args.on == "ray", "--address is of a cluster; give --on ray")
   require(
-    most <= space,
+    most <= space or args.on == "ray",
     f"a part needs {most / 2**30:.1f} GiB, {space / 2**30:.1f} GiB may be used; fewer "
     "--seeds would fit",
   )
-  jobs = workers.number(args.jobs, needs, space)
+  jobs = 1 if args.on == "ray" else workers.number(args.jobs, needs, space)
   for line in lines:
     say(line)
   value = bench.execute(
-    plan, out, parts, estimates, say, RunDisplay, jobs=jobs, worker="mjx_cl.cli.worker"
+    plan,
+    out,
+    parts,
+    estimates,
+    say,
+    RunDisplay,
+    jobs=jobs,
+    worker="mjx_cl.cli.worker",
+    on=args.on,
+    address=args.address,
   )
   if args.publish:
     bench.publish(out, plan, args.publish)

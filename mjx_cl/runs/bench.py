@@ -18,7 +18,7 @@ from typing import Any, BinaryIO
 from mjx_cl.errors import FileError, UserError, require
 from mjx_cl.io import folders as folder_lib
 from mjx_cl.io import tables
-from mjx_cl.runs import merge, run, workers
+from mjx_cl.runs import cluster, merge, run, workers
 from mjx_cl.runs.costs import Estimate
 from mjx_cl.runs.doubts import notes as notes_of
 from mjx_cl.runs.healthy import Healthy
@@ -132,9 +132,11 @@ def _together(
   tell: Tell,
   jobs: int,
   worker: str,
+  needs: dict[str, int] | None = None,
+  address: str | None = None,
 ) -> dict[str, dict]:
   """Runs parts side by side; arguments as of `execute`, `guess` gives the seconds that parts take,
-  0 where nobody knows.
+  0 where nobody knows, `needs` the bytes that each takes where they run on a cluster.
 
   Returns:
     name -> scores of the parts that are finished.
@@ -152,6 +154,9 @@ def _together(
       left = f"; at most about {round(rest / 60) or 1} min left"
     tell(f"{name} finished, {len(over)} of {len(names)}{left}")
 
+  if needs is not None:
+    cluster.together(worker, out, names, needs, end, tell, address)
+    return known
   robots = {part.name: part.config.env for part in plan.parts}
   workers.together(worker, out, names, min(jobs, len(names)), end, tell, robots.get)
   return known
@@ -173,6 +178,8 @@ def execute(
   save_every_s: float = 60.0,
   jobs: int = 1,
   worker: str = "",
+  on: str = "here",
+  address: str | None = None,
 ) -> dict:
   """Runs the parts that are not finished, in order; one that was cut off goes on from its last
   checkpoint.
@@ -188,6 +195,8 @@ def execute(
     jobs: parts side by side, see workers.py, the longest first. The last digits of a run depend on
       how many cores it has.
     worker: module that such a process runs.
+    on: here, or ray, see cluster.py, which needs `estimates`.
+    address: of a Ray cluster.
 
   Returns:
     bench.json's value.
@@ -197,6 +206,11 @@ def execute(
   todo = [p for p in parts if not finished(out, p)]
   guess = lambda names: sum(estimates[name].seconds for name in names) if estimates else 0.0
   names = [p.name for p in todo]
+  if on == "ray" and todo and estimates:
+    names.sort(key=lambda name: -guess([name]))
+    needs = {name: estimates[name].bytes for name in names}
+    done = _together(plan, out, names, guess, tell, 1, worker, needs, address)
+    return collect(out, plan, done)
   if jobs > 1 and len(todo) > 1:
     names.sort(key=lambda name: -guess([name]))
     return collect(out, plan, _together(plan, out, names, guess, tell, jobs, worker))

@@ -1,0 +1,331 @@
+"""Parts of a suite on the machines of a Ray cluster.
+
+A part is a Ray task, which starts the process that runs parts on one machine too (runs/workers.py),
+on cores of its own. Where a machine sees the folder of the suite it writes there; elsewhere into a
+folder of its own, which comes back as bytes. A part whose task, process or machine is lost begins
+again, from its newest checkpoint where that can be reached. A part is never divided.
+"""
+
+import contextlib
+import functools
+import os
+import pathlib
+import platform
+import shutil
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+import uuid
+from collections.abc import Callable, Iterator
+from typing import Any, BinaryIO, NamedTuple
+
+from mjx_cl import __version__
+from mjx_cl.errors import FileError, UserError
+from mjx_cl.io import folders, runtime
+from mjx_cl.io.interrupt import Interruptible
+from mjx_cl.runs import merge
+
+AGAIN = 3  # times that a part whose process was lost begins anew
+TOLD_S = 2.0  # between two lines of a part
+HERE = ".ray"  # file in OUT by which a machine knows that it sees the driver's
+
+
+class Given(NamedTuple):
+  """What a task is given.
+
+  Attributes:
+    module: what its process runs, see cli/worker.py.
+    out: folder of the suite where the driver runs.
+    token: what OUT/.ray holds there.
+    suite: text of OUT/suite.json.
+    cores: of the part.
+    versions: that a machine must have.
+  """
+
+  module: str
+  out: str
+  token: str
+  suite: str
+  cores: int
+  versions: dict[str, str]
+
+
+class Told(NamedTuple):
+  """What became of a part.
+
+  Attributes:
+    code: exit status; negative: the signal that ended its process; None: another version.
+    line: what it said last.
+    files: path below the part's folder -> bytes; None: they lie in the driver's folder.
+  """
+
+  code: int | None
+  line: str = ""
+  files: dict[str, bytes] | None = None
+
+
+def versions() -> dict[str, str]:
+  """What the bits of a result depend on."""
+  own = runtime.provenance()
+  return {"mjx_cl": __version__, "python": own["python"], **own["versions"]}
+
+
+@contextlib.contextmanager
+def own_cores(count: int) -> Iterator[list[int]]:
+  """`count` cores of this machine that no other part of this user's has; fewer where fewer are
+  free, all where none is.
+  """
+  with contextlib.ExitStack() as held:
+    mine: list[int] = []
+    for core in runtime.cores():
+      if len(mine) < count:
+        with contextlib.suppress(UserError):
+          held.enter_context(folders.alone(pathlib.Path(tempfile.gettempdir(), f"core-{core}")))
+          mine.append(core)
+    yield mine or runtime.cores()
+
+
+def folder_of(given: Given) -> tuple[pathlib.Path, bool]:
+  """Where this machine writes the suite, and whether that is the driver's folder."""
+  out = pathlib.Path(given.out)
+  with contextlib.suppress(OSError):
+    if (out / HERE).read_text() == given.token:
+      return out, True
+  user = os.getuid() if hasattr(os, "getuid") else "all"
+  name = "".join(c if c.isalnum() else "_" for c in given.out)[-80:]
+  return pathlib.Path(tempfile.gettempdir(), f"mjx_cl_ray_{user}", name), False
+
+
+def run_part(name: str, given: Given, tell: Callable[[str], Any]) -> Told:
+  """Runs a part on this machine."""
+  found = versions()
+  wrong = [
+    f"{k} {found.get(k)} in place of {v}" for k, v in given.versions.items() if found.get(k) != v
+  ]
+  if wrong:
+    return Told(None, f"{platform.node()} has {', '.join(wrong)}")
+  out, shared = folder_of(given)
+  if not shared:
+    folders.make(out)
+    folders.atomic(out / "suite.json", lambda file: file.write(given.suite.encode()))
+  with own_cores(given.cores) as cores:
+    told = _process(name, given.module, out, cores, tell)
+  if told.code or shared:
+    return told
+  folder = out / name
+  paths = [path for path in sorted(folder.rglob("*")) if path.is_file() and not path.is_symlink()]
+  return told._replace(files={str(p.relative_to(folder)): p.read_bytes() for p in paths})
+
+
+def _process(
+  name: str, module: str, out: pathlib.Path, cores: list[int], tell: Callable[[str], Any]
+) -> Told:
+  process: Any = subprocess.Popen(
+    [sys.executable, "-m", module, str(out), ",".join(map(str, cores))],
+    stdin=subprocess.PIPE,
+    stdout=subprocess.PIPE,
+    stderr=subprocess.PIPE,
+    text=True,
+    errors="replace",
+    start_new_session=True,
+  )
+  last, told = "", 0.0
+
+  def listen() -> None:
+    nonlocal last, told
+    for line in process.stderr:
+      if line.strip():
+        last = line.strip()
+        if time.monotonic() - told > TOLD_S:
+          told = time.monotonic()
+          tell(last)
+
+  thread = threading.Thread(target=listen, daemon=True)
+  thread.start()
+  try:
+    process.stdin.write(f"{name}\n")
+    process.stdin.flush()
+    for line in process.stdout:
+      if line.strip() == f"finished {name}":
+        return Told(0)
+    code = process.wait()
+    thread.join()
+    return Told(code or 1, last.removeprefix("mjx-cl: "))
+  except OSError:
+    return Told(process.wait(), last)
+  finally:
+    with contextlib.suppress(OSError):
+      process.stdin.close()
+    process.wait()
+
+
+class Board:
+  """What parts say, kept for the driver."""
+
+  def __init__(self) -> None:
+    self.lines: dict[str, str] = {}
+
+  def put(self, name: str, line: str) -> None:
+    """Takes a line of a part."""
+    self.lines[name] = line
+
+  def take(self) -> dict[str, str]:
+    """The newest line of each part that has said something since."""
+    lines, self.lines = self.lines, {}
+    return lines
+
+
+def _ray() -> Any:
+  os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing is sent anywhere
+  try:
+    import ray
+  except ImportError:
+    raise UserError("--on ray needs the package ray: pip install 'mjx_cl[ray]'") from None
+  return ray
+
+
+def together(
+  module: str,
+  out: str | os.PathLike,
+  names: list[str],
+  needs: dict[str, int],
+  finished: Callable[[str], None],
+  tell: Callable[[str], None] = lambda text: None,
+  address: str | None = None,
+  cores: int = 1,
+) -> None:
+  """Runs the parts `names` of OUT/suite.json on a cluster, in their order as machines are free.
+
+  Args:
+    module: what each process runs, see cli/worker.py.
+    out: folder of the suite.
+    names: of the parts.
+    needs: bytes that each takes.
+    finished: called with the name of each part as it ends.
+    tell: called with each line that a part says.
+    address: of the cluster; None: one is started here.
+    cores: of each part.
+
+  Raises:
+    UserError: as soon as one fails over settings, a machine has other versions, or no machine is
+      large enough. Before any of these is raised the others have saved what they had lived.
+    FileError: as soon as one fails otherwise.
+    KeyboardInterrupt: on a signal.
+  """
+  ray, out = _ray(), pathlib.Path(out).resolve()
+  own = {} if address else {"num_cpus": len(runtime.cores()), "include_dashboard": False}
+  paths = os.pathsep.join(filter(None, sys.path))
+  try:
+    ray.init(
+      address,
+      log_to_driver=False,
+      logging_level="ERROR",
+      runtime_env={"env_vars": {} if address else {"PYTHONPATH": paths}},
+      **own,
+    )
+  except (ConnectionError, ValueError, RuntimeError) as e:
+    raise UserError(f"--address {address}: no Ray cluster answers ({e})") from None
+  token = uuid.uuid4().hex
+  folders.atomic(out / HERE, lambda file: file.write(token.encode()))
+  given = Given(module, str(out), token, (out / "suite.json").read_text(), cores, versions())
+  try:
+    _drive(ray, out, given, names, needs, finished, tell)
+  finally:
+    ray.shutdown()
+    (out / HERE).unlink(missing_ok=True)
+
+
+def _check_room(ray: Any, names: list[str], needs: dict[str, int], cores: int) -> None:
+  nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+  for name in names:
+    if not any(n.get("CPU", 0) >= cores and n.get("memory", 0) >= needs[name] for n in nodes):
+      raise UserError(
+        f"no machine of the cluster has {cores} cores and {needs[name] / 2**30:.1f} GiB for part "
+        f"{name}; fewer --seeds need less"
+      )
+
+
+def _drive(
+  ray: Any,
+  out: pathlib.Path,
+  given: Given,
+  names: list[str],
+  needs: dict[str, int],
+  finished: Callable[[str], None],
+  tell: Callable[[str], None],
+) -> None:
+  _check_room(ray, names, needs, given.cores)
+  board = ray.remote(Board).options(num_cpus=0).remote()
+
+  def task(name: str, given: Given) -> Told:
+    return run_part(name, given, lambda line: board.put.remote(name, line))
+
+  def submit(name: str) -> Any:
+    how = {"num_cpus": given.cores, "memory": needs[name], "max_retries": -1}
+    return ray.remote(task).options(**how).remote(name, given)
+
+  lost = dict.fromkeys(names, 0)
+  running = {submit(name): name for name in names}
+  try:
+    with Interruptible() as stop:
+      while running:
+        ready, _ = ray.wait(list(running), timeout=0.5)
+        for name, line in ray.get(board.take.remote()).items():
+          tell(f"{name}: {line}")
+        for reference in ready:
+          name = running.pop(reference)
+          told = ray.get(reference)
+          if told.code == 0:
+            if told.files is not None:
+              place(out, name, told.files)
+            finished(name)
+            continue
+          again = told.code is not None and told.code < 0 and lost[name] < AGAIN
+          if not again:
+            raise _failure(name, told)
+          lost[name] += 1
+          tell(f"{name}: ended by signal {-told.code}; it begins again")
+          running[submit(name)] = name
+        stop.check()
+  finally:
+    for reference in running:  # its process saves and ends as its standard input closes
+      ray.cancel(reference, force=True)
+
+
+def _failure(name: str, told: Told) -> UserError:
+  if told.code is None:
+    return UserError(f"{told.line}; install the driver's versions there")
+  if told.code < 0:
+    return FileError(f"part {name} was ended by signal {-told.code}, {AGAIN + 1} times")
+  kind = UserError if told.code == UserError.exit_code else FileError
+  return kind(f"part {name}: {told.line or f'ended with exit status {told.code}'}")
+
+
+def place(out: pathlib.Path, name: str, files: dict[str, bytes]) -> None:
+  """Writes a part's files to OUT/NAME, whole or not at all.
+
+  Raises:
+    FileError: a path leads out of the folder, or a file is broken.
+  """
+  folder, tmp = out / name, out / (name + ".tmp")
+  with contextlib.ExitStack() as stack:
+    stack.callback(_remove, tmp)
+    for path, value in files.items():
+      target = (tmp / path).resolve()
+      if not target.is_relative_to(tmp.resolve()):
+        raise FileError(f"part {name}: {path} leads out of its folder")
+      folders.make(target.parent)
+      folders.atomic(target, functools.partial(_write, value))
+    merge.whole(tmp)
+    _remove(folder)
+    os.replace(tmp, folder)
+
+
+def _write(value: bytes, file: BinaryIO) -> None:
+  file.write(value)
+
+
+def _remove(folder: pathlib.Path) -> None:
+  shutil.rmtree(folder, ignore_errors=True)
