@@ -19,6 +19,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from mjx_cl.errors import UserError
+from mjx_cl.io.limits import ran_out
 from mjx_cl.io.plugins import find, line, of_user
 
 BEAT_S = 0.5  # how often a process says how far it is
@@ -177,6 +178,7 @@ def apart(
 
   Raises:
     UserError: as those, and where the time is over, or the process ended.
+    MemoryError: where the process lacked memory.
   """
   how = {"source": source, "settings": settings, "name": host_name, "causal": causal}
   process: Any = subprocess.Popen(
@@ -228,6 +230,8 @@ def _wait(
       answer = json.loads(text)
       if "error" in answer:
         raise UserError(answer["error"])
+      if "memory" in answer:
+        raise MemoryError(answer["memory"])
       arrays = io.BytesIO(said.get())
       fired, score = (np.load(arrays, allow_pickle=False) for _ in range(2))
       return fired, score, answer["seconds"]
@@ -276,6 +280,10 @@ def _answer(how: dict, out: BinaryIO) -> None:
       fired, score = run_host(factory, xs, how["name"], at)
   except UserError as e:
     said = {"error": str(e)}
+  except Exception as e:
+    if not ran_out(e):
+      raise
+    said = {"memory": line(e)}
   over.set()
   if thread.ident:
     thread.join()

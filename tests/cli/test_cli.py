@@ -31,7 +31,7 @@ from mjx_cl.config import PRESETS, RunConfig
 from mjx_cl.config.sizes import SIZES
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.faults import presets
-from mjx_cl.io import folders
+from mjx_cl.io import folders, interrupt
 from mjx_cl.io import tables as store
 from mjx_cl.runs import run
 from mjx_cl.training import agents
@@ -633,6 +633,7 @@ def begun(mjx, saved, tmp_path, monkeypatch):  # noqa: F811
   """
 
   def cut(self):
+    interrupt.note(signal.SIGINT)
     raise KeyboardInterrupt
 
   monkeypatch.setattr(run.Runner, "step", cut)

@@ -6,6 +6,7 @@ import dataclasses
 import json
 import pathlib
 import shutil
+import signal
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +21,7 @@ from mjx_cl.adapt.arms import ARMS, NEVER
 from mjx_cl.config import CHUNK, AdaptConfig, RunConfig
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.faults.presets import becomes
-from mjx_cl.io import folders, memory, tables
+from mjx_cl.io import folders, interrupt, memory, tables
 from mjx_cl.render import figures
 from mjx_cl.runs import bench, clock, costs, loops, merge, outlook, run, scores, settings
 from mjx_cl.runs import suite as suites
@@ -494,6 +495,7 @@ def test_parts_run_once_go_on_and_merge(mjx, refused, mini, tmp_path, monkeypatc
 
   def cut(self):
     if self.done_chunks == 1:
+      interrupt.note(signal.SIGINT)
       raise KeyboardInterrupt
     progress = step(self)
     self.save()
