@@ -21,10 +21,10 @@ WORKER = "mjx_cl.cli.worker"
 PARTS = ["grip/severity=0.5", "grip/severity=1.0"]
 
 
-def given(out, **other):
-  suites_text = (out / "suite.json").read_text()
-  known = dict(module=WORKER, out=str(out), token="", suite=suites_text, cores=1)
-  return cluster.Given(**known | {"versions": cluster.versions()} | other)
+def given(folder, **other):
+  suites_text = (folder / "suite.json").read_text()
+  known = dict(module=WORKER, out=str(folder), token="", suite=suites_text, cores=1)
+  return cluster.Given(**known, versions=cluster.versions())._replace(**other)
 
 
 @pytest.fixture
