@@ -8,6 +8,7 @@ import json
 import os
 import pathlib
 import shutil
+import signal
 import subprocess
 import sys
 import types
@@ -24,7 +25,7 @@ from mjx_cl.config import PRESETS, TrainConfig, replace
 from mjx_cl.dreamer import replay as replay_lib
 from mjx_cl.dreamer.agent import CAUSES
 from mjx_cl.errors import FileError, UserError
-from mjx_cl.io import checkpoints
+from mjx_cl.io import checkpoints, interrupt
 from mjx_cl.training import agents, demonstrator, files, premises
 from mjx_cl.training import trainer as train
 
@@ -233,6 +234,7 @@ def begun(tmp_path, monkeypatch):
   """(arguments, folder) of a training that was cut off before its first chunk."""
 
   def cut(self):
+    interrupt.note(signal.SIGINT)
     raise KeyboardInterrupt
 
   monkeypatch.setattr(train.Trainer, "step", cut)
