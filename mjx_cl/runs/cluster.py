@@ -12,6 +12,7 @@ import os
 import pathlib
 import platform
 import shutil
+import socket
 import subprocess
 import sys
 import tempfile
@@ -28,6 +29,7 @@ from mjx_cl.io.interrupt import Interruptible
 from mjx_cl.runs import merge
 
 AGAIN = 3  # times that a part whose process was lost begins anew
+ANSWER_S = 10.0  # that a cluster may take to answer
 TOLD_S = 2.0  # between two lines of a part
 HERE = ".ray"  # file in OUT by which a machine knows that it sees the driver's
 
@@ -186,6 +188,17 @@ def _ray() -> Any:
   return ray
 
 
+def _answers(address: str) -> None:
+  """Raises UserError where nothing listens at HOST:PORT, for which Ray would look for minutes."""
+  host, _, port = address.removeprefix("ray://").rpartition(":")
+  if not host or not port.isdigit():
+    raise UserError(f"--address is HOST:PORT of a Ray cluster, as ray start says it; got {address}")
+  try:
+    socket.create_connection((host, int(port)), ANSWER_S).close()
+  except (OSError, OverflowError) as e:
+    raise UserError(f"--address {address}: no Ray cluster answers ({e})") from None
+
+
 def together(
   module: str,
   out: str | os.PathLike,
@@ -215,6 +228,8 @@ def together(
     KeyboardInterrupt: on a signal.
   """
   ray, out = _ray(), pathlib.Path(out).resolve()
+  if address:
+    _answers(address)
   own = {} if address else {"num_cpus": len(runtime.cores()), "include_dashboard": False}
   paths = os.pathsep.join(filter(None, sys.path))
   try:

@@ -190,5 +190,6 @@ def test_no_cluster_and_too_large_a_part_are_one_line(plan, machines):
   )
   with pytest.raises(UserError, match="no machine of the cluster has 1 cores and 1048576.0 GiB"):
     run(2**50, machines[0].address)
-  with pytest.raises(UserError, match="no Ray cluster answers"):
-    run(1, "127.0.0.1:1")
+  for address, words in (("127.0.0.1:1", "no Ray cluster answers"), ("here", "HOST:PORT")):
+    with pytest.raises(UserError, match=words):
+      run(1, address)
