@@ -229,7 +229,7 @@ def test_a_broken_set_gets_one_line(tmp_path):
   make_set(tmp_path)
   config = json.loads((tmp_path / "config.json").read_text())
   for value, text in (
-    ([], "of something else"),
+    ([], "no readable config.json"),
     ({"a": 1}, "of something else"),
     ({"version": streams.VERSION}, "names no suite"),
     (config | {"suite": {"name": "x"}}, "names no suite"),
