@@ -5,9 +5,9 @@ fusions, and a hash of what it computes.
 
 `update`: a learner's update (size1m, 16 x 64, preset `cpu`); what a run does with a chunk of the
 walker: `watch` (monitor, detector, signals) and `learn` (rule, updates). Processor time, since it
-changes less than wall time beside other work. The hash is of one call: one update from new weights; a first chunk, in
-which no stream updates yet. Where it differs between two settings, so do the bits; where it does
-not, that much is shown.
+changes less than wall time beside other work. The hash is of one call: one update from new weights;
+a first chunk, in which no stream updates yet. Where it differs between two settings, so do the
+bits; where it does not, that much is shown.
 """
 
 from __future__ import annotations

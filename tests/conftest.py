@@ -14,9 +14,9 @@ os.environ.setdefault(
   "MJX_CL_CACHE", str(pathlib.Path(tempfile.gettempdir()) / "mjx_cl_tests_cache")
 )  # shared by all runs and processes; XLA keys what it holds by the flags below
 # Most of the tests' time is compiling. LLVM leaves programs as they are, kernels come from the
-# older emitters, which need no MLIR, and passes are left out that cost more than they save: half of a
-# learner's compile time. Flags of one's own come later and win; processes that tests start inherit
-# them.
+# older emitters, which need no MLIR, and passes are left out that cost more than they save: half of
+# a learner's compile time. Flags of one's own come later and win; processes that tests start
+# inherit them.
 QUICK = {
   "xla_backend_optimization_level": 0,
   "xla_cpu_parallel_codegen_split_count": 1,

@@ -96,7 +96,6 @@ def chosen(args: Train) -> tuple[DreamerConfig, TrainConfig]:
   dreamer = replace(preset.dreamer, **rest)
   require(args.seeds >= 1, f"seeds must be above 0; got {args.seeds}")
   check_seeds(args.seed)
-  require(args.agent != "", "--agent is a shipped name or a folder; got an empty name")
   every = args.save_every_s
   require(0 < every < math.inf, f"--save-every-s must be above 0; got {every}")
   return dreamer, config
@@ -126,7 +125,6 @@ def do_eval(args: Eval) -> None:
     f"episodes must lie in 1..{MOST_EPISODES:,}, which are lived side by side; got {args.episodes}",
   )
   check_seeds(args.seed, args.episodes)
-  require(args.agent != "", "--agent is a shipped name or a folder; got an empty name")
   env = envs.make(args.env, args.physics)
   trained = agents.of(env, args.agent)
   result: dict[str, Any] = evaluate.evaluate(

@@ -61,6 +61,7 @@ def do_bench(args: Bench) -> None:
   needs = [estimates[p.name].bytes for p in parts if p.name not in done]
   most, space = max(needs, default=0), int(memory.MARGIN * memory.free())
   require(args.address is None or args.on == "ray", "--address is of a cluster; give --on ray")
+  require(args.jobs is None or args.on == "here", "--jobs is of this machine; leave out --on ray")
   require(
     most <= space or args.on == "ray",
     f"a part needs {most / 2**30:.1f} GiB, {space / 2**30:.1f} GiB may be used; fewer "

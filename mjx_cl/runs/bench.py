@@ -195,7 +195,7 @@ def execute(
     jobs: parts side by side, see workers.py, the longest first. The last digits of a run depend on
       how many cores it has.
     worker: module that such a process runs.
-    on: here, or ray, see cluster.py, which needs `estimates`.
+    on: here, or ray, see cluster.py.
     address: of a Ray cluster.
 
   Returns:
@@ -206,9 +206,9 @@ def execute(
   todo = [p for p in parts if not finished(out, p)]
   guess = lambda names: sum(estimates[name].seconds for name in names) if estimates else 0.0
   names = [p.name for p in todo]
-  if on == "ray" and todo and estimates:
+  if on == "ray" and todo:
     names.sort(key=lambda name: -guess([name]))
-    needs = {name: estimates[name].bytes for name in names}
+    needs = {name: estimates[name].bytes if estimates else 0 for name in names}
     done = _together(plan, out, names, guess, tell, 1, worker, needs, address)
     return collect(out, plan, done)
   if jobs > 1 and len(todo) > 1:

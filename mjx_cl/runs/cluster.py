@@ -1,7 +1,7 @@
 """Parts of a suite on the machines of a Ray cluster.
 
 A part is a Ray task, which starts the process that runs parts on one machine too (runs/workers.py),
-on cores of its own. Where a machine sees the folder of the suite it writes there; elsewhere into a
+on a core of its own. Where a machine sees the folder of the suite it writes there; elsewhere into a
 folder of its own, which comes back as bytes. A part whose task, process or machine is lost begins
 again, from its newest checkpoint where that can be reached. A part is never divided.
 """
@@ -13,10 +13,8 @@ import pathlib
 import platform
 import shutil
 import socket
-import subprocess
 import sys
 import tempfile
-import threading
 import time
 import uuid
 from collections.abc import Callable, Iterator
@@ -26,11 +24,10 @@ from mjx_cl import __version__
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.io import folders, runtime
 from mjx_cl.io.interrupt import Interruptible
-from mjx_cl.runs import merge
+from mjx_cl.runs import merge, workers
 
 AGAIN = 3  # times that a part whose process was lost begins anew
 ANSWER_S = 10.0  # that a cluster may take to answer
-TOLD_S = 2.0  # between two lines of a part
 HERE = ".ray"  # file in OUT by which a machine knows that it sees the driver's
 
 
@@ -42,7 +39,6 @@ class Given(NamedTuple):
     out: folder of the suite where the driver runs.
     token: what OUT/.ray holds there.
     suite: text of OUT/suite.json.
-    cores: of the part.
     versions: that a machine must have.
   """
 
@@ -50,7 +46,6 @@ class Given(NamedTuple):
   out: str
   token: str
   suite: str
-  cores: int
   versions: dict[str, str]
 
 
@@ -75,18 +70,16 @@ def versions() -> dict[str, str]:
 
 
 @contextlib.contextmanager
-def own_cores(count: int) -> Iterator[list[int]]:
-  """`count` cores of this machine that no other part of this user's has; fewer where fewer are
-  free, all where none is.
-  """
+def own_core() -> Iterator[list[int]]:
+  """A core of this machine that no other part of this user's has; all where none is free."""
   with contextlib.ExitStack() as held:
-    mine: list[int] = []
-    for core in runtime.cores():
-      if len(mine) < count:
-        with contextlib.suppress(UserError):
-          held.enter_context(folders.alone(pathlib.Path(tempfile.gettempdir(), f"core-{core}")))
-          mine.append(core)
-    yield mine or runtime.cores()
+    mine = runtime.cores()
+    for core in mine:
+      with contextlib.suppress(UserError):
+        held.enter_context(folders.alone(pathlib.Path(tempfile.gettempdir(), f"core-{core}")))
+        mine = [core]
+        break
+    yield mine
 
 
 def folder_of(given: Given) -> tuple[pathlib.Path, bool]:
@@ -112,7 +105,7 @@ def run_part(name: str, given: Given, tell: Callable[[str], Any]) -> Told:
   if not shared:
     folders.make(out)
     folders.atomic(out / "suite.json", lambda file: file.write(given.suite.encode()))
-  with own_cores(given.cores) as cores:
+  with own_core() as cores:
     told = _process(name, given.module, out, cores, tell)
   if told.code or shared:
     return told
@@ -124,43 +117,17 @@ def run_part(name: str, given: Given, tell: Callable[[str], Any]) -> Told:
 def _process(
   name: str, module: str, out: pathlib.Path, cores: list[int], tell: Callable[[str], Any]
 ) -> Told:
-  process: Any = subprocess.Popen(
-    [sys.executable, "-m", module, str(out), ",".join(map(str, cores))],
-    stdin=subprocess.PIPE,
-    stdout=subprocess.PIPE,
-    stderr=subprocess.PIPE,
-    text=True,
-    errors="replace",
-    start_new_session=True,
-  )
-  last, told = "", 0.0
-
-  def listen() -> None:
-    nonlocal last, told
-    for line in process.stderr:
-      if line.strip():
-        last = line.strip()
-        if time.monotonic() - told > TOLD_S:
-          told = time.monotonic()
-          tell(last)
-
-  thread = threading.Thread(target=listen, daemon=True)
-  thread.start()
+  worker = workers.Worker(module, out, 0, cores, tell)
   try:
-    process.stdin.write(f"{name}\n")
-    process.stdin.flush()
-    for line in process.stdout:
-      if line.strip() == f"finished {name}":
-        return Told(0)
-    code = process.wait()
-    thread.join()
-    return Told(code or 1, last.removeprefix("mjx-cl: "))
-  except OSError:
-    return Told(process.wait(), last)
+    worker.give(name)
+    while not worker.check():
+      time.sleep(0.1)
+    return Told(0)
+  except UserError as e:
+    return Told(worker.process.returncode or FileError.exit_code, str(e))
   finally:
-    with contextlib.suppress(OSError):
-      process.stdin.close()
-    process.wait()
+    worker.close()
+    worker.process.wait()
 
 
 class Board:
@@ -173,10 +140,10 @@ class Board:
     """Takes a line of a part."""
     self.lines[name] = line
 
-  def take(self) -> dict[str, str]:
+  def take(self) -> list[str]:
     """The newest line of each part that has said something since."""
     lines, self.lines = self.lines, {}
-    return lines
+    return list(lines.values())
 
 
 def _ray() -> Any:
@@ -207,7 +174,6 @@ def together(
   finished: Callable[[str], None],
   tell: Callable[[str], None] = lambda text: None,
   address: str | None = None,
-  cores: int = 1,
 ) -> None:
   """Runs the parts `names` of OUT/suite.json on a cluster, in their order as machines are free.
 
@@ -219,7 +185,6 @@ def together(
     finished: called with the name of each part as it ends.
     tell: called with each line that a part says.
     address: of the cluster; None: one is started here.
-    cores: of each part.
 
   Raises:
     UserError: as soon as one fails over settings, a machine has other versions, or no machine is
@@ -244,7 +209,7 @@ def together(
     raise UserError(f"--address {address}: no Ray cluster answers ({e})") from None
   token = uuid.uuid4().hex
   folders.atomic(out / HERE, lambda file: file.write(token.encode()))
-  given = Given(module, str(out), token, (out / "suite.json").read_text(), cores, versions())
+  given = Given(module, str(out), token, (out / "suite.json").read_text(), versions())
   try:
     _drive(ray, out, given, names, needs, finished, tell)
   finally:
@@ -252,13 +217,13 @@ def together(
     (out / HERE).unlink(missing_ok=True)
 
 
-def _check_room(ray: Any, names: list[str], needs: dict[str, int], cores: int) -> None:
+def _check_room(ray: Any, names: list[str], needs: dict[str, int]) -> None:
   nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
   for name in names:
-    if not any(n.get("CPU", 0) >= cores and n.get("memory", 0) >= needs[name] for n in nodes):
+    if not any(n.get("CPU", 0) >= 1 and n.get("memory", 0) >= needs[name] for n in nodes):
       raise UserError(
-        f"no machine of the cluster has {cores} cores and {needs[name] / 2**30:.1f} GiB for part "
-        f"{name}; fewer --seeds need less"
+        f"no machine of the cluster has a core and {needs[name] / 2**30:.1f} GiB for part {name}; "
+        "fewer --seeds need less"
       )
 
 
@@ -271,14 +236,18 @@ def _drive(
   finished: Callable[[str], None],
   tell: Callable[[str], None],
 ) -> None:
-  _check_room(ray, names, needs, given.cores)
-  board = ray.remote(Board).options(num_cpus=0).remote()
+  _check_room(ray, names, needs)
+  # on the driver's machine, which no part can do without
+  here = ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy(
+    ray.get_runtime_context().get_node_id(), soft=False
+  )
+  board = ray.remote(Board).options(num_cpus=0, scheduling_strategy=here).remote()
 
   def task(name: str, given: Given) -> Told:
     return run_part(name, given, lambda line: board.put.remote(name, line))
 
   def submit(name: str) -> Any:
-    how = {"num_cpus": given.cores, "memory": needs[name], "max_retries": -1}
+    how = {"num_cpus": 1, "memory": needs[name], "max_retries": -1}
     return ray.remote(task).options(**how).remote(name, given)
 
   lost = dict.fromkeys(names, 0)
@@ -287,8 +256,8 @@ def _drive(
     with Interruptible() as stop:
       while running:
         ready, _ = ray.wait(list(running), timeout=0.5)
-        for name, line in ray.get(board.take.remote()).items():
-          tell(f"{name}: {line}")
+        for line in ray.get(board.take.remote()):
+          tell(line)
         for reference in ready:
           name = running.pop(reference)
           told = ray.get(reference)
@@ -299,7 +268,7 @@ def _drive(
             continue
           again = told.code is not None and told.code < 0 and lost[name] < AGAIN
           if not again:
-            raise _failure(name, told)
+            raise _failure(told)
           lost[name] += 1
           tell(f"{name}: ended by signal {-told.code}; it begins again")
           running[submit(name)] = name
@@ -309,13 +278,10 @@ def _drive(
       ray.cancel(reference, force=True)
 
 
-def _failure(name: str, told: Told) -> UserError:
+def _failure(told: Told) -> UserError:
   if told.code is None:
     return UserError(f"{told.line}; install the driver's versions there")
-  if told.code < 0:
-    return FileError(f"part {name} was ended by signal {-told.code}, {AGAIN + 1} times")
-  kind = UserError if told.code == UserError.exit_code else FileError
-  return kind(f"part {name}: {told.line or f'ended with exit status {told.code}'}")
+  return (UserError if told.code == UserError.exit_code else FileError)(told.line)
 
 
 def place(out: pathlib.Path, name: str, files: dict[str, bytes]) -> None:

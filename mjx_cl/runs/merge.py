@@ -187,7 +187,7 @@ def whole(folder: pathlib.Path) -> None:
     FileError: one is broken, missing, or a symbolic link, which may lead anywhere.
   """
   files = sorted(path for path in folder.rglob("*") if not path.is_dir() or path.is_symlink())
-  for file in files:
+  for file in (folder, *files):
     if file.is_symlink():
       raise FileError(f"{file} is a symbolic link; put the file itself there")
   for name in ("config.json", "summary.json", "runs.parquet"):

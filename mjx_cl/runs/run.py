@@ -70,30 +70,38 @@ def execute(
   Returns:
     summary.json's value.
   """
+  config = check(config)
   with folders.alone(out):
-    return _execute(config, out, resume, overwrite, progress, save_every_s, tell, programs, healthy)
+    runner = _begun(config, out, resume, overwrite, programs, healthy)
+    if runner is None:
+      return tables.read_json(pathlib.Path(out) / "summary.json")
+    for text in notes(config):
+      tell(f"note: {text}")
+    tell(
+      f"{len(config.arms) * config.seeds} streams of {config.steps:,} control steps; what is not "
+      "compiled yet is compiled first, a minute or two"
+    )
+    tell(str(runner.room))
+    last = live(runner, progress, save_every_s)
+    return finish(runner, lambda text: last and progress(last._replace(note=text)))
 
 
-def _execute(
+def _begun(
   config: RunConfig,
   out: pathlib.Path | str,
   resume: bool,
   overwrite: bool,
-  progress: Callable[[Progress], Any],
-  save_every_s: float,
-  tell: Callable[[str], Any],
   programs: Programs | None,
   healthy: Healthy | None,
-) -> dict:
-  """`execute`, alone in its folder."""
-  config = check(config)
+) -> Runner | None:
+  """A run that is ready for its next chunk; None where it is finished. Arguments of `execute`."""
   fresh = not pathlib.Path(out).exists()
   state = folders.claim_folder(out, resume, overwrite)
   out = pathlib.Path(out)  # not before: it would make the current folder of an empty name
   if state == "done":
     # `auto` physics is resolved there
     check_same(out, {k: v for k, v in identity(config).items() if k != "physics"})
-    return tables.read_json(out / "summary.json")
+    return None
   try:
     # refuses wrong names and broken agents before anything of an earlier run is removed
     runner = Runner(config, out, programs, healthy)
@@ -112,15 +120,7 @@ def _execute(
     runner.open()
     tables.write_json(out / "config.json", values)
     runner.fork()
-  for text in notes(config):
-    tell(f"note: {text}")
-  tell(
-    f"{len(config.arms) * config.seeds} streams of {config.steps:,} control steps; what is not "
-    "compiled yet is compiled first, a minute or two"
-  )
-  tell(str(runner.room))
-  last = live(runner, progress, save_every_s)
-  return finish(runner, lambda text: last and progress(last._replace(note=text)))
+  return runner
 
 
 def live(

@@ -1,4 +1,4 @@
-"""Plain Python detectors in a process of their own: the same answers, and an end whatever they do."""
+"""Plain Python detectors in a process of their own: the same answers, and an end to each."""
 
 import os
 import signal

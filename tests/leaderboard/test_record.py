@@ -180,7 +180,7 @@ def test_counts_of_a_suite_are_whole_numbers(tmp_path, good, bad):
     ("steps = 128, score = 1", "steps = 128, score = 2_000_000_000"),
   ],
 )
-def test_what_memory_does_not_hold_is_refused_before_the_first_step(refused, tmp_path, good, bad):  # noqa: F811
+def test_what_memory_does_not_hold_is_refused_at_first(refused, tmp_path, good, bad):  # noqa: F811
   (tmp_path / "two.toml").write_text(TWO.replace(good, bad))
   text = refused(2, "record", tmp_path / "two.toml", "--out", tmp_path / "set")
   assert "suite 'two': streams of walker need" in text and "GiB may be used; fewer seeds" in text

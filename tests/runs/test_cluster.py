@@ -5,6 +5,8 @@ lost on the way.
 import os
 import pathlib
 import signal
+import subprocess
+import sys
 import threading
 
 import psutil
@@ -23,7 +25,7 @@ PARTS = ["grip/severity=0.5", "grip/severity=1.0"]
 
 def given(folder, **other):
   suites_text = (folder / "suite.json").read_text()
-  known = dict(module=WORKER, out=str(folder), token="", suite=suites_text, cores=1)
+  known = dict(module=WORKER, out=str(folder), token="", suite=suites_text)
   return cluster.Given(**known, versions=cluster.versions())._replace(**other)
 
 
@@ -31,11 +33,8 @@ def given(folder, **other):
 def plan(mini, tmp_path):  # noqa: F811
   """Folder of a suite that is to be run."""
 
-  def write(name, **change):
-    text = mini.read_text()
-    for k, v in change.items():
-      text = text.replace("steps = 192", f"{k} = {v}")
-    mini.write_text(text)
+  def write(name, steps=192):
+    mini.write_text(mini.read_text().replace("steps = 192", f"steps = {steps}"))
     suites.write_plan(suites.suite(str(mini)), tmp_path / name)
     return tmp_path / name
 
@@ -61,7 +60,7 @@ def test_a_machine_with_other_versions_runs_nothing(plan):
   out = plan("out")
   told = cluster.run_part("healthy", given(out, versions={"jax": "0.0.1"}), print)
   assert told.code is None and not (out / "healthy").exists()
-  wrong = cluster._failure("healthy", told)
+  wrong = cluster._failure(told)
   assert "in place of 0.0.1" in str(wrong) and "\n" not in str(wrong)
 
 
@@ -91,15 +90,38 @@ def test_what_a_part_says_last_is_why_it_failed(plan):
   tables.write_json(out / "suite.json", value)
   (out / cluster.HERE).write_text("7")
   told = cluster.run_part("healthy", given(out, token="7"), lambda line: None)
-  wrong = cluster._failure("healthy", told)
+  wrong = cluster._failure(told)
   assert type(wrong) is UserError and "part healthy: no agent" in str(wrong)
 
 
-def test_parts_of_a_machine_have_cores_of_their_own(monkeypatch):
-  monkeypatch.setattr(cluster.runtime, "cores", lambda: [0, 1, 2])
-  monkeypatch.setattr(cluster.folders, "_HELD", set())
-  with cluster.own_cores(2) as first:
-    assert first == [0, 1]
+TAKES = """import sys
+from mjx_cl.io import runtime
+from mjx_cl.runs import cluster
+runtime.cores = lambda: [0, 1]
+with cluster.own_core() as mine:
+  print(*mine, flush=True)
+  sys.stdin.read()"""
+
+
+def test_parts_of_a_machine_have_cores_of_their_own(tmp_path):
+  """A part beyond the cores has all of them, and a core is free again when its part has gone."""
+  take = lambda: subprocess.Popen(
+    [sys.executable, "-c", TAKES],
+    stdin=subprocess.PIPE,
+    stdout=subprocess.PIPE,
+    text=True,
+    env=os.environ | {"TMPDIR": str(tmp_path)},
+  )
+  held = []
+  for want in ("0", "1", "0 1"):
+    held.append(take())
+    assert held[-1].stdout.readline().strip() == want
+  held[0].kill()
+  held[0].wait()
+  held.append(take())
+  assert held[-1].stdout.readline().strip() == "0"
+  for process in held[1:]:
+    process.communicate()
 
 
 # ---- a cluster -----------------------------------------------------------------------------------
@@ -114,12 +136,11 @@ def machines(monkeypatch):
   monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
   monkeypatch.setenv("PYTHONPATH", str(pathlib.Path(cluster.__file__).parents[2]))
   made = Cluster()
-  head = made.add_node(num_cpus=0, include_dashboard=False)  # the driver's, which runs no part
+  made.add_node(num_cpus=0, include_dashboard=False)  # the driver's, which runs no part
   nodes = [made.add_node(num_cpus=1) for _ in range(2)]
   made.wait_for_nodes()
   yield made, nodes
   made.shutdown()
-  assert head
 
 
 def together(machines, out, tell=lambda text: None):
@@ -188,7 +209,7 @@ def test_no_cluster_and_too_large_a_part_are_one_line(plan, machines):
   run = lambda needs, address: cluster.together(
     WORKER, out, PARTS, dict.fromkeys(PARTS, needs), print, address=address
   )
-  with pytest.raises(UserError, match="no machine of the cluster has 1 cores and 1048576.0 GiB"):
+  with pytest.raises(UserError, match="no machine of the cluster has a core and 1048576.0 GiB"):
     run(2**50, machines[0].address)
   for address, words in (("127.0.0.1:1", "no Ray cluster answers"), ("here", "HOST:PORT")):
     with pytest.raises(UserError, match=words):

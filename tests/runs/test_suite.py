@@ -263,7 +263,7 @@ def test_a_wrong_suite_is_one_line_and_runs_nothing(refused, tmp_path, text, wor
 
 
 @pytest.mark.parametrize("more", [[], ["--plan"]])
-def test_out_that_is_a_file_is_refused_before_anything_runs(refused, mini, tmp_path, more):  # noqa: F811
+def test_out_that_is_a_file_is_refused_at_first(refused, mini, tmp_path, more):  # noqa: F811
   (tmp_path / "thesis.tex").write_bytes(b"years")
   assert "thesis.tex is a file" in refused(
     2, "bench", mini, "--out", tmp_path / "thesis.tex", *more
@@ -703,10 +703,11 @@ def truncate(file):
     (lambda piece: (piece / "summary.json").write_text("[]"), "run it again"),
     (lambda piece: (piece / "agents").symlink_to(piece.parents[1]), "symbolic link"),
     (lambda piece: (piece / "trace.parquet").symlink_to(piece / "runs.parquet"), "symbolic link"),
+    (lambda piece: piece.rename(piece.parent / "x") and piece.symlink_to("x"), "symbolic link"),
   ],
 )
-def test_a_piece_that_is_not_whole_is_left_and_a_whole_one_taken(tmp_path, spoil, words):  # noqa: F811
-  """Nothing of it is copied, and the part is not taken for finished."""
+def test_a_piece_that_is_not_whole_is_left(tmp_path, spoil, words):
+  """Nothing of it is copied, the part is not taken for finished, and a whole piece is taken."""
   plan, name = suites.suite("loop"), "walker/detector=ewma"
   (part,) = (p for p in plan.parts if p.name == name)
   good, bad, out, said = RESULTS / "loop", tmp_path / "bad", tmp_path / "out", []
