@@ -192,8 +192,7 @@ def execute(
     tell: called with each line for the user.
     display: context manager that gives run.execute's progress.
     save_every_s: most seconds of work that a kill loses.
-    jobs: parts side by side, see workers.py, the longest first. The last digits of a run depend on
-      how many cores it has.
+    jobs: parts side by side, see workers.py, the longest first.
     worker: module that such a process runs.
     on: here, or ray, see cluster.py.
     address: of a Ray cluster.
