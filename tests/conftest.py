@@ -64,11 +64,11 @@ def resident_gib() -> float:
 @pytest.fixture(scope="session", autouse=True)
 def programs():
   """All runs of a test process share their compiled programs, as the parts of a suite do."""
-  from mjx_cl.runs import loops, run
+  from mjx_cl.runs import run, runner
 
   kept = run.Programs()
   with pytest.MonkeyPatch.context() as patch:
-    for module in (loops, run):
+    for module in (run, runner):
       patch.setattr(module, "Programs", lambda: kept)
     yield kept
 

@@ -31,22 +31,22 @@ __all__ = ["WIDTH", "Choices", "Digest", "Loop", "LoopState", "Once", "Programs"
 
 
 class Programs:
-  """Compiled programs of Loops, for runs of one process that follow each other.
+  """Robots, rollouts and compiled programs, for runs of one process that follow each other.
 
   Args:
     most: as many are kept, the newest: a compiled program takes memory.
   """
 
-  def __init__(self, most: int = 8) -> None:
+  def __init__(self, most: int = 16) -> None:
     self.most = most
     self.kept: dict[Hashable, Any] = {}  # the newest last
 
-  def share(self, key: Hashable, program: Any) -> Any:
-    """The program that is kept under `key`, else `program`, which is kept from now on."""
+  def share(self, key: Hashable, make: Callable[[], Any]) -> Any:
+    """What is kept under `key`, else what `make` gives, which is kept from now on."""
     try:
-      program = self.kept.pop(key, program)
-    except TypeError:  # it holds a list, such as the spec of another package may
-      return program
+      program = self.kept.pop(key) if key in self.kept else make()
+    except TypeError:  # the key holds a list, such as the spec of another package may
+      return make()
     self.kept[key] = program
     while len(self.kept) > self.most:
       del self.kept[next(iter(self.kept))]
@@ -139,13 +139,13 @@ class Loop:
   ) -> None:
     self.agent, self.monitor, self.detector, self.spec = agent, monitor, detector, spec
     self.config, self.repeat, self.capacity = config, repeat, capacity
-    own = Jitted(
+    own = lambda: Jitted(
       Once(jax.jit(self._watch)),
       Once(jax.jit(self._rest)),
       Once(jax.jit(self._learn, donate_argnums=0)),
     )
     shared = same is not None and programs is not None
-    self.programs = programs.share((same, repeat), own) if shared and programs else own
+    self.programs = programs.share((same, repeat), own) if shared and programs else own()
 
   def init(self, train: TrainState, groups: int, rollback: bool = False) -> LoopState:
     """State before the first step.

@@ -28,7 +28,7 @@ def make_loop(
   robots: list[Any],
   trained: agents.Trained,
   learners: int,
-  programs: Programs | None,
+  programs: Programs,
 ) -> Loop:
   """The run's Loop.
 
@@ -73,5 +73,5 @@ def make_loop(
     repeat,
     capacity=records(config.steps),
     same=same,
-    programs=programs or Programs(),
+    programs=programs,
   )

@@ -92,9 +92,10 @@ class Runner:
     self.out = pathlib.Path(out)
     self.work = self.out / "work"
     # the robots, their agents and what befalls them
-    self.env = envs.make(config.env, config.physics)
+    self.programs = Programs() if programs is None else programs
+    self.env = self._robot(config.env)
     into = becomes(config)
-    self.other = None if into is None else envs.make(into, config.physics)
+    self.other = None if into is None else self._robot(into)
     self.robots = [self.env] if self.other is None else [self.env, self.other]
     adapt = ("lr", "policy_lr", "anchor", "last_starts", "batch")
     departures = {name: getattr(config.adapt, name) for name in adapt}
@@ -113,7 +114,7 @@ class Runner:
     self.breaks = np.asarray([ARMS[arm].breaks for arm, _ in self.labels])
     self.chunk_steps = CHUNK * self.repeat
     self.chunks = -(-config.steps // self.chunk_steps)
-    self._begin(plan, target, programs)
+    self._begin(plan, target)
     self.choices = self._choices()
     learner = (self.env.spec, self.trained.agent.config, self.repeat)
     self.clock = clock_of(config, *learner, self.stops)
@@ -136,13 +137,19 @@ class Runner:
       what = (self.robots[-1], self.trained, self.faults, self.changes, self.labels)
       self.snapshots = Snapshots(config, *what, self.work / "snapshots")
 
-  def _begin(self, plan: faults.Plan, target: Any, programs: Programs | None) -> None:
+  def _robot(self, name: str) -> Any:
+    """The robot of that name, one for all runs that share programs."""
+    physics = self.config.physics
+    own = ("robot", envs.ENVS.get(name), name, physics)
+    return self.programs.share(own, lambda: envs.make(name, physics))
+
+  def _begin(self, plan: faults.Plan, target: Any) -> None:
     """What moves the streams, and the streams before their first step."""
     keys = jnp.stack([jax.random.key(seed) for _, seed in self.labels])[:, None]
     self.keys = jax.vmap(lambda k: jax.random.fold_in(k, OfSeed.ADAPTATION))(keys[:, 0])
     self.rollout, begin = self._rollout(plan, target)
     learners = sum(ARMS[arm].learns for arm, _ in self.labels)
-    self.loop = make_loop(self.config, self.robots, self.trained, learners, programs)
+    self.loop = make_loop(self.config, self.robots, self.trained, learners, self.programs)
     trains = [self.others.get(arm, self.trained).train for arm, _ in self.labels]
     self.lives = Lives(
       self.rollout,
@@ -159,12 +166,16 @@ class Runner:
     """The rollout, and what begins a stream of it, given its key and whether its robot breaks."""
     env, agent, own, onset = self.env, self.trained.agent, self.faults, self.config.onset
     how = (self.repeat, self.config.deterministic)
+    # rollouts of the same robots, agent and faults are the same, however severe the faults are
+    what = [faults.FAULTS.get(change.fault) for change in self.changes]
+    mind = (agent.config, agent.obs_size, agent.act_size, agent.stepwise)
+    same = ("rollout", *self.robots, mind, *what, *how)
     # without any severity for a robot that does not break
     spared = lambda breaks: plan._replace(severity=jnp.where(breaks, plan.severity, 0.0))
     if self.other is None:
       begin = lambda key, breaks: start(env, agent, own, key, target=target, plan=spared(breaks))
-      return Rollout(env, agent, own, *how), begin
-    moves = Transfer(env, self.other, agent, own, *how)
+      return self.programs.share(same, lambda: Rollout(env, agent, own, *how)), begin
+    moves = self.programs.share(same, lambda: Transfer(env, self.other, agent, own, *how))
     due = lambda breaks: jnp.where(breaks, onset, FOREVER)
     return moves, lambda key, breaks: moves.start(key, target, spared(breaks), due(breaks))
 

@@ -24,8 +24,7 @@ from mjx_cl.io import tables
 from mjx_cl.rollout import transfer as transfer_lib
 from mjx_cl.rollout.scan import Rollout, nest, start
 from mjx_cl.rollout.transfer import Transfer
-from mjx_cl.runs import certify, loops, run, settings
-from mjx_cl.runs import runner as runner_lib
+from mjx_cl.runs import certify, run, settings
 from mjx_cl.training import agents
 
 EPISODE, SEEDS, ONSET, CHUNK, CHUNKS = 50, 5, 70, 64, 5
@@ -390,21 +389,8 @@ ADAPT = AdaptConfig(
 def short():
   """Table entries in place: short robots, of which only the second one's task can be done, and a
   preset that goes on after SECOND steps.
-
-  Programs are pure functions of their arguments: those of the first Runner serve the others, which
-  differ in their data alone.
   """
   with pytest.MonkeyPatch.context() as patch:
-    made = {}
-    for module, name in ((runner_lib, "Transfer"), (loops, "Loop")):
-      build = getattr(module, name)
-      patch.setattr(
-        module,
-        name,
-        lambda *args, name=name, build=build, **kw: (
-          made.setdefault(name, None) or made.update({name: build(*args, **kw)}) or made[name]
-        ),
-      )
     patch.setitem(envs.ENVS, "car", shorten(Car, acceptance=1e9))
     patch.setitem(envs.ENVS, "car_real", shorten(CarReal, acceptance=-1e9))
     patch.setitem(

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_lives import make, one_rollout, saved  # noqa: F401  fixtures
+from test_lives import make, saved  # noqa: F401  fixtures
 
 from mjx_cl import envs, faults
 from mjx_cl.config import CHUNK, PRESETS, RunConfig

@@ -15,7 +15,6 @@ from mjx_cl.adapt.choices import Choices
 from mjx_cl.config import CHUNK, FOREVER, AdaptConfig, RunConfig
 from mjx_cl.errors import FileError
 from mjx_cl.io.checkpoints import Checkpoints
-from mjx_cl.rollout.scan import Rollout
 from mjx_cl.runs import groups, lives, packing, run
 from mjx_cl.runs import runner as runner_lib
 from mjx_cl.training import agents
@@ -48,16 +47,6 @@ def saved(tiny, tmp_path_factory):
     card | {"dreamer": dataclasses.asdict(tiny.config)},
   )
   return folder
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_rollout():
-  """Runners of one agent share what is compiled of their rollout."""
-  kept = {}
-  make = lambda env, agent, *more: kept.setdefault(agent.config.size, Rollout(env, agent, *more))
-  with pytest.MonkeyPatch.context() as patch:
-    patch.setattr(runner_lib, "Rollout", make)
-    yield
 
 
 @pytest.fixture(scope="module")
