@@ -39,6 +39,19 @@ class Run(RunConfig):
 
 
 @dataclass(frozen=True)
+class Machines:
+  """Where the parts of a command run.
+
+  Attributes:
+    on: here, or ray: on the machines of a Ray cluster, a core a part.
+    address: Of the cluster; default: one is started on this machine.
+  """
+
+  on: Literal["here", "ray"] = "here"
+  address: str | None = None
+
+
+@dataclass(frozen=True)
 class Train:
   """Pretrains an agent; ends with OUT/agent (weights, card), which every --agent takes.
 
@@ -119,7 +132,7 @@ class Certify:
 
 
 @dataclass(frozen=True)
-class Record:
+class Record(Machines):
   """Records residual streams of a suite: frozen agents, healthy and faulty robots side by side, to
   Parquet that pandas alone reads.
 
@@ -147,7 +160,7 @@ class Record:
 
 
 @dataclass(frozen=True)
-class Leaderboard:
+class Leaderboard(Machines):
   """Scores every registered detector on recorded streams; writes leaderboard.parquet and
   leaderboard.html into --out.
 
@@ -194,7 +207,7 @@ class Leaderboard:
 
 
 @dataclass(frozen=True)
-class Bench:
+class Bench(Machines):
   """Runs a suite: runs over robots, faults and settings, each in a folder of its own; prints its
   plan first.
 
@@ -214,8 +227,7 @@ class Bench:
     shard: K/N: this machine runs every N-th part from the K-th on.
     jobs: Parts side by side, each on its share of the cores; default: one per core as far as
       memory allows.
-    on: here, or ray: on the machines of a Ray cluster, a core a part.
-    address: Of the cluster; default: one is started on this machine.
+    gpu: On ray: a GPU of its machine for each part, besides its core.
     merge: Folders of the same suite from other machines; their finished parts are copied here
       and not run, seeds of a part that several hold are joined.
     publish: Copy finished parts' tables and figures, without the traces, to this folder.
@@ -232,8 +244,7 @@ class Bench:
   plan: bool = False
   shard: str = "0/1"
   jobs: int | None = None
-  on: Literal["here", "ray"] = "here"
-  address: str | None = None
+  gpu: bool = False
   merge: tuple[str, ...] = ()
   publish: str | None = None
   json: bool = False

@@ -147,7 +147,9 @@ def together(machines, out, tell=lambda text: None):
   """Runs PARTS on the cluster: names of those that ended."""
   ended = []
   needs = dict.fromkeys(PARTS, 2**20)
-  cluster.together(WORKER, out, PARTS, needs, ended.append, tell, machines[0].address)
+  cluster.together(
+    WORKER, out, PARTS, needs, ended.append, tell, cluster.Cluster(machines[0].address)
+  )
   return ended
 
 
@@ -207,7 +209,7 @@ def test_an_interrupt_leaves_nothing_running_and_the_same_command_goes_on(plan, 
 def test_no_cluster_and_too_large_a_part_are_one_line(plan, machines):
   out = plan("out")
   run = lambda needs, address: cluster.together(
-    WORKER, out, PARTS, dict.fromkeys(PARTS, needs), print, address=address
+    WORKER, out, PARTS, dict.fromkeys(PARTS, needs), print, on=cluster.Cluster(address)
   )
   with pytest.raises(UserError, match="no machine of the cluster has a core and 1048576.0 GiB"):
     run(2**50, machines[0].address)
