@@ -33,6 +33,9 @@ def do_run(args: Run) -> None:
 
 def do_bench(args: Bench) -> None:
   """Runs, plans, merges or publishes a suite."""
+  require(not args.gpu or args.on == "ray", "--gpu is of a cluster; give --on ray")
+  require(args.jobs is None or args.on == "here", "--jobs is of this machine; leave out --on ray")
+  on = cluster.of(args.on, args.address, args.gpu)
   plan, parts = asked(args)
   out = folders.usable(f"runs/bench/{plan.name}" if args.out is None else args.out)
   check_merge(args.merge, parts)
@@ -60,9 +63,6 @@ def do_bench(args: Bench) -> None:
     say(f"{name}: taken over")
   needs = [estimates[p.name].bytes for p in parts if p.name not in done]
   most, space = max(needs, default=0), int(memory.MARGIN * memory.free())
-  require(not args.gpu or args.on == "ray", "--gpu is of a cluster; give --on ray")
-  require(args.jobs is None or args.on == "here", "--jobs is of this machine; leave out --on ray")
-  on = cluster.of(args.on, args.address, args.gpu)
   require(
     most <= space or on is not None,
     f"a part needs {most / 2**30:.1f} GiB, {space / 2**30:.1f} GiB may be used; fewer "
