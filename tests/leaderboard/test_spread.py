@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from test_cli import mjx, refused  # noqa: F401  fixtures
-from test_cluster import machines  # noqa: F401  a fixture
+from test_cluster import build, machines  # noqa: F401  fixtures
 from test_leaderboard import late, small  # noqa: F401  fixtures
 from test_record import recorded  # noqa: F401  a fixture
 from test_run import saved  # noqa: F401  a fixture
