@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 from mjx_cl.cli.flags import Leaderboard, Record
+from mjx_cl.cli.machines import WORKER
 from mjx_cl.cli.output import clock, command_line, emit, say
 from mjx_cl.cli.tables import console, table
 from mjx_cl.config import settings
@@ -16,8 +17,6 @@ from mjx_cl.errors import require
 from mjx_cl.io import folders, runtime
 from mjx_cl.leaderboard import record, score, spread, streams, submissions
 from mjx_cl.runs import cluster
-
-WORKER = "mjx_cl.cli.worker"  # a part's process
 
 
 class Paced:

@@ -7,6 +7,7 @@ from collections.abc import Collection, Mapping, Sequence
 
 from mjx_cl.cli.flags import Bench, Run
 from mjx_cl.cli.live import RunDisplay
+from mjx_cl.cli.machines import WORKER
 from mjx_cl.cli.output import clock, emit, say
 from mjx_cl.cli.tables import show_summary
 from mjx_cl.config import RunConfig, quick
@@ -79,7 +80,7 @@ def do_bench(args: Bench) -> None:
     say,
     RunDisplay,
     jobs=jobs,
-    worker="mjx_cl.cli.worker",
+    worker=WORKER,
     on=on,
   )
   if args.publish:

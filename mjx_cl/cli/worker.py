@@ -6,10 +6,12 @@ import functools
 import os
 import pathlib
 import queue
+import shutil
 import signal
 import sys
 import threading
 from collections.abc import Callable
+from typing import Any
 
 from mjx_cl.cli import app
 from mjx_cl.io import runtime, tables
@@ -83,8 +85,26 @@ def detectors(folder: pathlib.Path) -> Do:
   return lambda name, values: spread.examine(folder, name, values, say)
 
 
+def trainings(folder: pathlib.Path) -> Do:
+  """Trainings of one seed each."""
+  from mjx_cl import envs
+  from mjx_cl.cli import agents
+  from mjx_cl.cli.flags import Train
+
+  def do(name: str, values: dict) -> None:
+    flags: dict[str, Any] = values["flags"]
+    own: dict[str, Any] = flags | {"set": tuple(flags["set"])}
+    args = Train(**own, seed=values["seed"], out=str(folder / name), resume=True)
+    env = envs.make(args.env, args.physics)
+    agents.trained(args, env, *agents.chosen(args), values["command"])
+    # of use to nobody once the agent is there, and as large as its replay
+    shutil.rmtree(folder / name / "checkpoints", ignore_errors=True)
+
+  return do
+
+
 # command -> what does its parts; JAX starts there
-COMMANDS = {"bench": runs, "record": streams, "leaderboard": detectors}
+COMMANDS = {"bench": runs, "record": streams, "leaderboard": detectors, "train": trainings}
 
 
 def main(arguments: list[str]) -> int:
