@@ -28,6 +28,7 @@ from mjx_cl.runs import merge, workers
 
 AGAIN = 3  # times that a part whose process was lost begins anew
 ANSWER_S = 10.0  # that a cluster may take to answer
+SAVE_S = 120.0  # that parts may take to save, where others were interrupted or have failed
 HERE = ".ray"  # file in OUT by which a machine knows that it sees the driver's
 
 
@@ -308,8 +309,12 @@ def _drive(
           running[submit(name)] = name
         stop.check()
   finally:
-    for reference in running:  # its process saves and ends as its standard input closes
-      ray.cancel(reference, force=True)
+    # a KeyboardInterrupt to each task, which closes its process's standard input and waits until
+    # that has saved; what Ray ends by force takes its processes along
+    for reference in running:
+      ray.cancel(reference)
+    if running:
+      ray.wait(list(running), num_returns=len(running), timeout=SAVE_S)
 
 
 def _failure(told: Told) -> UserError:
