@@ -106,7 +106,8 @@ def do_leaderboard(args: Leaderboard) -> None:
     found = spread.examine_all(held, entries, robots, out, WORKER, on, say)
   board = score.score(held, entries, robots, extra, progress, found)
   board = board._replace(seconds=time.perf_counter() - begin)
-  spread.clear(out)
+  if on:
+    spread.clear(out)
   with folders.together():
     files = score.write(board, args.out, about(held, board))
   if args.json:
