@@ -81,11 +81,11 @@ def record(
     for split, kind in parts_of.PARTS:
       name = f"{robot}-{split}-{kind}"
       own = parts_of.part(suite, robot, split, kind, env, trained, physics)
+      which = {"robot": robot, "split": split, "kind": kind}
+      values[name] = {"suite": plain, **which, "physics": physics, "agent": agent}
       if parts_of.kept(work / f"{name}.npz", own) is not None:
         continue
       wanted[name] = own
-      which = {"robot": robot, "split": split, "kind": kind}
-      values[name] = {"suite": plain, **which, "physics": physics, "agent": agent}
       rows = own.steps * len(own.who)
       needs[name] = room.grown(len(own.who), rows, env.spec, trained.agent.config)
   if not wanted:

@@ -17,6 +17,7 @@ import sys
 import tempfile
 import time
 import uuid
+import zlib
 from collections.abc import Callable, Iterator
 from typing import Any, BinaryIO, NamedTuple
 
@@ -106,13 +107,16 @@ def own_core() -> Iterator[list[int]]:
 
 
 def folder_of(given: Given) -> tuple[pathlib.Path, bool]:
-  """Where this machine writes the suite, and whether that is the driver's folder."""
+  """Where this machine writes the suite, and whether that is the driver's folder. A folder of its
+  own is named after this very suite, so that what other settings left is none of it.
+  """
   out = pathlib.Path(given.out)
   with contextlib.suppress(OSError):
     if (out / HERE).read_text() == given.token:
       return out, True
   user = os.getuid() if hasattr(os, "getuid") else "all"
   name = "".join(c if c.isalnum() else "_" for c in given.out)[-80:]
+  name += f"_{zlib.crc32(given.suite.encode()):08x}"
   return pathlib.Path(tempfile.gettempdir(), f"mjx_cl_ray_{user}", name), False
 
 

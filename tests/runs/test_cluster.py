@@ -77,6 +77,7 @@ def test_a_part_comes_back_as_bytes_where_no_disk_is_shared(plan, tmp_path, monk
   assert suites.finished(here, plan_) and not list(here.glob("*.tmp"))
   again = cluster.run_part("healthy", own, lambda line: None)
   assert {k for k in again.files} == {k for k in told.files}  # finished there: not run again
+  assert cluster.folder_of(own) != cluster.folder_of(own._replace(suite="{}"))
   broken = told.files | {"runs.parquet": told.files["runs.parquet"][:-9]}
   for files, words in ((broken, "run it again"), ({"../x": b""}, "leads out")):
     with pytest.raises(FileError, match=words):
