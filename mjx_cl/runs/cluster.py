@@ -265,7 +265,7 @@ def _check_room(ray: Any, names: list[str], needs: dict[str, int], gpu: bool) ->
   if most > max((n.get("memory", 0) for n in nodes), default=-1):
     raise UserError(
       f"no machine of the cluster has a core{', a GPU' * gpu} and {most / 2**30:.1f} GiB for part "
-      f"{name}; fewer --seeds need less"
+      f"{name}"
     )
 
 
