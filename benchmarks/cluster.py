@@ -74,7 +74,7 @@ def main() -> None:
   args = parser.parse_args()
   os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
   # Ray's is 15: other work on this machine would weigh on its parts alone
-  os.environ["RAY_worker_niceness"] = "0"
+  os.environ["RAY_worker_niceness"] = "0"  # noqa: SIM112  Ray spells it so
   root = str(pathlib.Path(__file__).parents[1])
   os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (root, os.environ.get("PYTHONPATH"))))
   runtime.setup()
