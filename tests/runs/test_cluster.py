@@ -185,11 +185,11 @@ def alone(out):
   return out
 
 
-def processes():
-  """Those that run parts."""
+def processes(out):
+  """Those that run parts of the suite in this folder."""
   found = []
   for process in psutil.process_iter(["cmdline"]):
-    if WORKER in (process.info["cmdline"] or []):
+    if {WORKER, str(out)} <= set(process.info["cmdline"] or []):
       found.append(process)
   return found
 
@@ -197,7 +197,7 @@ def processes():
 def test_a_cluster_gives_what_one_machine_gives(plan, machines):
   one, two = alone(plan("one")), plan("two")
   assert sorted(together(machines, two)) == PARTS
-  assert same(one, two) and not (two / cluster.HERE).exists() and not processes()
+  assert same(one, two) and not (two / cluster.HERE).exists() and not processes(two)
 
 
 @pytest.mark.parametrize("lost", ["process", "machine"])
@@ -209,12 +209,12 @@ def test_what_is_lost_begins_again(plan, whole, machines, lost):
       return
     gone.append(text)
     if lost == "process":
-      processes()[0].kill()
+      processes(two)[0].kill()
     else:
       threading.Thread(target=machines[0].remove_node, args=(machines[1][0],)).start()
 
   assert sorted(together(machines, two, tell)) == PARTS and gone
-  assert same(whole, two) and not processes()
+  assert same(whole, two) and not processes(two)
 
 
 def test_an_interrupt_leaves_nothing_running_and_the_same_command_goes_on(plan, whole, machines):
@@ -226,7 +226,7 @@ def test_an_interrupt_leaves_nothing_running_and_the_same_command_goes_on(plan, 
 
   with pytest.raises(KeyboardInterrupt):
     together(machines, two, tell)
-  assert not processes() and list(two.glob("grip/*/work/checkpoints/*"))
+  assert not processes(two) and list(two.glob("grip/*/work/checkpoints/*"))
   assert sorted(together(machines, two)) == PARTS and same(whole, two)
 
 
@@ -245,8 +245,8 @@ def test_a_driver_that_is_killed_leaves_nothing_running_and_the_next_goes_on(pla
   with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as driver:
     assert any("step " in line for line in driver.stdout)
     driver.kill()
-  psutil.wait_procs(processes(), timeout=600)
-  assert not processes() and list(two.glob("grip/*/config.json"))
+  psutil.wait_procs(processes(two), timeout=600)
+  assert not processes(two) and list(two.glob("grip/*/config.json"))
   assert sorted(together(machines, two)) == PARTS and same(whole, two)
   assert not (two / cluster.HERE).exists()
 
