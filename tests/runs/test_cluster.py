@@ -189,7 +189,7 @@ def processes(out):
   """Those that run parts of the suite in this folder."""
   found = []
   for process in psutil.process_iter(["cmdline"]):
-    if {WORKER, str(out)} <= set(process.info["cmdline"] or []):
+    if {WORKER, str(out.resolve())} <= set(process.info["cmdline"] or []):
       found.append(process)
   return found
 
