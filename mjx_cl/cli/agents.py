@@ -6,6 +6,7 @@ import pathlib
 from typing import Any
 
 from mjx_cl import envs
+from mjx_cl.cli import trainings
 from mjx_cl.cli.flags import Eval, Train
 from mjx_cl.cli.live import TrainDisplay
 from mjx_cl.cli.output import command_line, emit, say
@@ -28,6 +29,7 @@ MOST_EPISODES = 10_000  # all at once in one program
 
 def do_train(args: Train) -> None:
   """Trains agents."""
+  on = trainings.asked(args)
   dreamer, config = chosen(args)
   env = envs.make(args.env, args.physics)
   # whatever can be refused is refused before an earlier training is touched
@@ -36,6 +38,20 @@ def do_train(args: Train) -> None:
   premises.faults_of(env, config)
   files.shown(config, args.out, args.demonstrator)
   premises.check(env, dreamer, config, args.agent)
+  if on:
+    cards = trainings.spread(args, env, dreamer, config, command_line("train"), on)
+    if args.json:
+      emit(cards)
+    return
+  card = trained(args, env, dreamer, config, command_line("train"))
+  if args.json and card:
+    emit(card)
+
+
+def trained(
+  args: Train, env: Any, dreamer: DreamerConfig, config: TrainConfig, command: str
+) -> dict[str, Any] | None:
+  """Trains in one process; the agent's card, None where that training is finished."""
   state = folders.claim_folder(args.out, args.resume, args.overwrite, done_marker="agent/card.json")
   if state != "new":
     updates = files.check_same(
@@ -48,7 +64,7 @@ def do_train(args: Train) -> None:
       f"{pathlib.Path(args.out, 'agent')} and another --out",
     )
     say(f"{args.out}: this training is finished")
-    return
+    return None
   if state == "new" and args.overwrite:
     clear(args)
   training = files.build(
@@ -61,19 +77,18 @@ def do_train(args: Train) -> None:
     args.demonstrator,
     args.agent,
     args.preset,
-    command_line("train"),
+    command,
     state == "resume",
   )
   with TrainDisplay(config.updates) as display:
     trainer.run(training, display, args.save_every_s)
   card = files.export(training)
-  if args.json:
-    emit(card)
-  else:
+  if not args.json:
     say(
       f"agent in {args.out}/agent, return {card['eval']['return_mean']:.0f} over "
       f"{card['eval']['episodes']} episodes"
     )
+  return card
 
 
 def chosen(args: Train) -> tuple[DreamerConfig, TrainConfig]:

@@ -4,16 +4,19 @@ import math
 import os
 import pathlib
 import time
+from collections.abc import Callable
 from typing import Any
 
 from mjx_cl.cli.flags import Leaderboard, Record
+from mjx_cl.cli.machines import WORKER
 from mjx_cl.cli.output import clock, command_line, emit, say
 from mjx_cl.cli.tables import console, table
 from mjx_cl.config import settings
 from mjx_cl.detectors import python_class
 from mjx_cl.errors import require
 from mjx_cl.io import folders, runtime
-from mjx_cl.leaderboard import record, score, streams, submissions
+from mjx_cl.leaderboard import record, score, spread, streams, submissions
+from mjx_cl.runs import cluster
 
 
 class Paced:
@@ -33,19 +36,30 @@ class Paced:
       say(text)
 
 
+def steps_lived() -> Callable[[str, int, int, int], None]:
+  """Says now and then how far a part of a recording is."""
+  tell = Paced(10)
+
+  def progress(part: str, done: int, steps: int, lanes: int) -> None:
+    tell(f"{part}: {done:,}/{steps:,} steps of {lanes} robots", done >= steps)
+
+  return progress
+
+
 def do_record(args: Record) -> None:
   """Records a suite of streams."""
-  suite, out, tell = streams.suite(args.suite), args.out, Paced(10)
+  on = cluster.of(args.on, args.address)
+  suite, out = streams.suite(args.suite), args.out
   if args.overwrite:  # what is refused must not cost the set that is there
     record.prepare(suite, args.robot, args.physics, args.agent)
   record.claim(suite, out, args.overwrite, args.robot)
   folders.probe(out)
 
-  def progress(part: str, done: int, steps: int, lanes: int) -> None:
-    tell(f"{part}: {done:,}/{steps:,} steps of {lanes} robots", done >= steps)
-
   chosen = (args.robot, args.physics, args.agent)
-  result = record.record(suite, out, *chosen, command_line("record"), progress)
+  if on:
+    ready = record.prepare(suite, *chosen)
+    spread.record(suite, out, ready, args.physics, args.agent, WORKER, on, say)
+  result = record.record(suite, out, *chosen, command_line("record"), steps_lived())
   record.clear(out)
   if args.json:
     emit(result)
@@ -59,6 +73,7 @@ def do_record(args: Record) -> None:
 
 def do_leaderboard(args: Leaderboard) -> None:
   """Scores detectors on recorded streams, or exports the streams."""
+  on = cluster.of(args.on, args.address)
   check_own(args)
   held = streams.StreamSet(args.streams)
   robots = held.choose(args.robot)
@@ -85,7 +100,14 @@ def do_leaderboard(args: Leaderboard) -> None:
     tell(f"{done}/{total}  {robot}: {name}, {clock(seconds)} gone, {left} left", done == total)
 
   folders.probe(args.out)  # before minutes are spent
-  board = score.score(held, entries, robots, extra, progress)
+  begin = time.perf_counter()
+  found = None
+  if on and entries:
+    found = spread.examine_all(held, entries, robots, out, WORKER, on, say)
+  board = score.score(held, entries, robots, extra, progress, found)
+  board = board._replace(seconds=time.perf_counter() - begin)
+  if on:
+    spread.clear(out)
   with folders.together():
     files = score.write(board, args.out, about(held, board))
   if args.json:

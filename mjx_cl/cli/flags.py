@@ -5,11 +5,12 @@ help. Free of JAX.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 from tyro.conf import Positional
 
+from mjx_cl.cli.machines import GpuMachines, Machines
 from mjx_cl.config import FaultConfig, RunConfig
 
 
@@ -39,7 +40,7 @@ class Run(RunConfig):
 
 
 @dataclass(frozen=True)
-class Train:
+class Train(GpuMachines):
   """Pretrains an agent; ends with OUT/agent (weights, card), which every --agent takes.
 
   Example: mjx-cl train walker --preset tiny --out runs/train
@@ -53,7 +54,8 @@ class Train:
     agent: Start from this agent's weights, moments and counters; the replay is filled by
       acting.
     set: Settings of learner or schedule, name=value ... (updates=20000 lr=1e-4).
-    seeds: Agents trained side by side; their parameters share one program.
+    seeds: Agents trained side by side; their parameters share one program. On ray: a training of
+      its own each, in OUT/seed-N.
     save_every_s: Seconds between checkpoints.
     resume: Go on with a training that was cut off, with the settings it began with; `updates`
       may be others.
@@ -119,7 +121,7 @@ class Certify:
 
 
 @dataclass(frozen=True)
-class Record:
+class Record(Machines):
   """Records residual streams of a suite: frozen agents, healthy and faulty robots side by side, to
   Parquet that pandas alone reads.
 
@@ -147,7 +149,7 @@ class Record:
 
 
 @dataclass(frozen=True)
-class Leaderboard:
+class Leaderboard(Machines):
   """Scores every registered detector on recorded streams; writes leaderboard.parquet and
   leaderboard.html into --out.
 
@@ -194,7 +196,7 @@ class Leaderboard:
 
 
 @dataclass(frozen=True)
-class Bench:
+class Bench(GpuMachines):
   """Runs a suite: runs over robots, faults and settings, each in a folder of its own; prints its
   plan first.
 
@@ -214,8 +216,6 @@ class Bench:
     shard: K/N: this machine runs every N-th part from the K-th on.
     jobs: Parts side by side, each on its share of the cores; default: one per core as far as
       memory allows.
-    on: here, or ray: on the machines of a Ray cluster, a core a part.
-    address: Of the cluster; default: one is started on this machine.
     merge: Folders of the same suite from other machines; their finished parts are copied here
       and not run, seeds of a part that several hold are joined.
     publish: Copy finished parts' tables and figures, without the traces, to this folder.
@@ -232,8 +232,6 @@ class Bench:
   plan: bool = False
   shard: str = "0/1"
   jobs: int | None = None
-  on: Literal["here", "ray"] = "here"
-  address: str | None = None
   merge: tuple[str, ...] = ()
   publish: str | None = None
   json: bool = False

@@ -7,12 +7,13 @@ from collections.abc import Collection, Mapping, Sequence
 
 from mjx_cl.cli.flags import Bench, Run
 from mjx_cl.cli.live import RunDisplay
+from mjx_cl.cli.machines import WORKER
 from mjx_cl.cli.output import clock, emit, say
 from mjx_cl.cli.tables import show_summary
 from mjx_cl.config import RunConfig, quick
 from mjx_cl.errors import UserError, require
 from mjx_cl.io import folders, memory
-from mjx_cl.runs import bench, costs, run, workers
+from mjx_cl.runs import bench, cluster, costs, run, workers
 from mjx_cl.runs.suite import Part, Suite, finished, pick, standing, suite
 
 
@@ -33,6 +34,9 @@ def do_run(args: Run) -> None:
 
 def do_bench(args: Bench) -> None:
   """Runs, plans, merges or publishes a suite."""
+  require(not args.gpu or args.on == "ray", "--gpu is of a cluster; give --on ray")
+  require(args.jobs is None or args.on == "here", "--jobs is of this machine; leave out --on ray")
+  on = cluster.of(args.on, args.address, args.gpu)
   plan, parts = asked(args)
   out = folders.usable(f"runs/bench/{plan.name}" if args.out is None else args.out)
   check_merge(args.merge, parts)
@@ -60,14 +64,12 @@ def do_bench(args: Bench) -> None:
     say(f"{name}: taken over")
   needs = [estimates[p.name].bytes for p in parts if p.name not in done]
   most, space = max(needs, default=0), int(memory.MARGIN * memory.free())
-  require(args.address is None or args.on == "ray", "--address is of a cluster; give --on ray")
-  require(args.jobs is None or args.on == "here", "--jobs is of this machine; leave out --on ray")
   require(
-    most <= space or args.on == "ray",
+    most <= space or on is not None,
     f"a part needs {most / 2**30:.1f} GiB, {space / 2**30:.1f} GiB may be used; fewer "
     "--seeds would fit",
   )
-  jobs = 1 if args.on == "ray" else workers.number(args.jobs, needs, space)
+  jobs = workers.number(args.jobs, needs, space) if on is None else 1
   for line in lines:
     say(line)
   value = bench.execute(
@@ -78,9 +80,8 @@ def do_bench(args: Bench) -> None:
     say,
     RunDisplay,
     jobs=jobs,
-    worker="mjx_cl.cli.worker",
-    on=args.on,
-    address=args.address,
+    worker=WORKER,
+    on=on,
   )
   if args.publish:
     bench.publish(out, plan, args.publish)

@@ -10,23 +10,18 @@ import os
 import pathlib
 import shutil
 import time
-import zlib
 from collections.abc import Callable, Collection, Iterable
 from typing import Any
-
-import jax
-import jax.numpy as jnp
-import numpy as np
 
 from mjx_cl import envs
 from mjx_cl import faults as faults_lib
 from mjx_cl.errors import FileError, UserError
-from mjx_cl.io import arrays, folders, runtime, tables
-from mjx_cl.leaderboard import lives, room, set_tables
+from mjx_cl.io import folders, runtime, tables
+from mjx_cl.leaderboard import parts as parts_of
+from mjx_cl.leaderboard import room, set_tables
 from mjx_cl.leaderboard.streams import META, SCHEMA, VERSION
 from mjx_cl.leaderboard.suite import Suite
 from mjx_cl.rollout.monitor import watched
-from mjx_cl.rollout.scan import stream_keys
 from mjx_cl.training import agents
 
 MADE = ("command", "versions", "python", "git_commit", "machine")  # of config.json: how it was made
@@ -122,14 +117,17 @@ def _plain(suite: Suite, robots: Iterable[str]) -> dict:
 
 
 def _others(out: pathlib.Path) -> list[pathlib.Path]:
-  """What in the folder `work` is no part of a recording."""
+  """What in the folder `work` is no part of a recording; `parts` holds those that were lived
+  elsewhere, see apart.py.
+  """
   staged = lambda p: (
     p.name == "set"
     and p.is_dir()
     and all(f.suffix in (".parquet", ".json", ".tmp") for f in p.iterdir())
   )
   parts = (out / "work").iterdir() if (out / "work").is_dir() else ()
-  return [p for p in parts if not (p.name.removesuffix(".tmp").endswith(".npz") or staged(p))]
+  ours = lambda p: p.name.removesuffix(".tmp").endswith(".npz") or p.name == "parts" or staged(p)
+  return [p for p in parts if not ours(p)]
 
 
 def clear(out: pathlib.Path | str) -> None:
@@ -234,7 +232,7 @@ def record(
     )
     rows, free = rows + fresh, max(free, number + len(fresh))
     made["stream_steps"][robot] = int(sum(data["opr"].size for *_, data in parts.values()))
-    name, weights = pathlib.Path(trained.path).name, _digest(trained.train.params)
+    name, weights = pathlib.Path(trained.path).name, parts_of.digest(trained.train.params)
     made["agents"][robot] = {"name": name, "crc32": weights}
   set_tables.write_meta(staged, rows + set_tables.healthy_probes(rows))
   config = _config(suite, command, made, old, kept)
@@ -291,62 +289,15 @@ def _parts(
   """Parts of a robot by split and kind, lived or kept from before, and the stream-steps per second
   of those that were lived.
   """
-  simulator = runtime.default_physics() if physics == "auto" else physics
   parts, seconds, lived = {}, 0.0, 0
-  for split, kind in itertools.product(("score", "tune"), ("nominal", "fault")):
-    who, keys, onsets, steps, watch_from = _who(suite, robot, split, kind, env.spec.control_s)
+  for split, kind in parts_of.PARTS:
+    own = parts_of.part(suite, robot, split, kind, env, trained, physics)
     path = work / f"{robot}-{split}-{kind}.npz"
-    tag = json.dumps([who, steps, trained.card.get("updates"), VERSION])
-    of = json.dumps([onsets.tolist(), _digest(trained.train.params), simulator])
-    data = _part(path, tag, of)
+    data = parts_of.kept(path, own)
     if data is None:
       begin = time.monotonic()
       told = functools.partial(progress, f"{robot} {split} {kind}")
-      data = lives.live(env, trained, who, keys, onsets, steps, watch_from, told)
-      seconds, lived = seconds + time.monotonic() - begin, lived + steps * len(who)
-      arrays.write(path, {"tag": tag, "of": of, **data})
-    parts[split, kind] = who, onsets, data
+      data = parts_of.live(own, path, env, trained, told)
+      seconds, lived = seconds + time.monotonic() - begin, lived + own.steps * len(own.who)
+    parts[split, kind] = own.who, own.onsets, data
   return parts, lived / seconds if seconds else None
-
-
-def _who(
-  suite: Suite, robot: str, split: str, kind: str, control_s: float
-) -> tuple[list[lives.Lane], jax.Array, np.ndarray, int, int]:
-  """Lanes of a part, their keys and onsets, its control steps, and that from which the monitor
-  looks at faulty ones.
-  """
-  seeds = suite.numbers(split)
-  if kind == "fault":
-    who = lives.lanes(suite, robot, split)
-    keys = jnp.stack([jax.random.key(lane.seed) for lane in who])
-    onsets = np.asarray([suite.onset_of(lane.seed) for lane in who])
-    return who, keys, onsets, int(onsets.max()) + suite.after(control_s), int(onsets.min())
-  each = suite.nominal[split]
-  who = [lives.Lane(s) for s in seeds for _ in range(each)]
-  # the first key of a seed belongs to the faults
-  own = np.flatnonzero(np.arange(len(seeds) * (each + 1)) % (each + 1))
-  keys = stream_keys(seeds, each + 1)[own]
-  return who, keys, np.zeros(len(who), int), suite.nominal["steps"], 0
-
-
-def _digest(params: Any) -> int:
-  """CRC-32 of an agent's weights, which tells agents apart; config.json of a set holds it for each
-  robot's.
-  """
-  return zlib.crc32(b"".join(np.asarray(x).tobytes() for x in jax.tree.leaves(params)))
-
-
-def _part(path: pathlib.Path, tag: str, of: str) -> dict | None:
-  """What an earlier recording left, None where it is of something else or broken.
-
-  Args:
-    path: of the file.
-    tag: lanes and length that are wanted.
-    of: onsets, agent and physics that are wanted; a file may not tell its own.
-  """
-  try:
-    part = arrays.read(path)
-  except FileError:
-    return None
-  told = str(part.pop("tag", None)), str(part.pop("of", of))
-  return part if told == (tag, of) else None

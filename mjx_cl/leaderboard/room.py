@@ -26,17 +26,29 @@ def of(suite: Suite, robot: str, spec: Spec, learner: DreamerConfig) -> int:
     healthy, seeds = suite.nominal[split], last - first + 1
     rows += seeds * (healthy * suite.nominal["steps"] + faulty * end)
     most = max(most, seeds * max(healthy, faulty))
+  return grown(most, rows, spec, learner)
+
+
+def grown(lanes: int, rows: int, spec: Spec, learner: DreamerConfig) -> int:
+  """Bytes that a process grows to.
+
+  Args:
+    lanes: most robots side by side.
+    rows: control steps of all robots.
+    spec: of the robot.
+    learner: of its agent.
+  """
   record = needs.need(learner.size, len(spec.obs), len(spec.act), 0, learner.bins).record
-  return memory.resident(most * (LIFE + 2 * CHUNK * record)) + COPIES * ROW * rows
+  return memory.resident(lanes * (LIFE + 2 * CHUNK * record)) + COPIES * ROW * rows
 
 
 def check(suite: Suite, robot: str, spec: Spec, learner: DreamerConfig) -> None:
   """Refuses a recording that would not fit."""
-  grown = of(suite, robot, spec, learner)
+  need = of(suite, robot, spec, learner)
   space = int(memory.MARGIN * memory.free()) + memory.held()
   require(
-    grown <= space,
-    f"suite {suite.name!r}: streams of {robot} need {grown / 2**30:,.1f} GiB, "
+    need <= space,
+    f"suite {suite.name!r}: streams of {robot} need {need / 2**30:,.1f} GiB, "
     f"{space / 2**30:.1f} GiB may be used; fewer seeds, nominal streams or steps, or an earlier "
     "onset or horizon would fit",
   )

@@ -63,6 +63,7 @@ def score(
   robots: Collection[str] = (),
   extra: Sequence[tuple[str, Callable[[Data], Found]]] = (),
   progress: Callable[[str, str, int, int, float], Any] = lambda robot, name, k, n, seconds: None,
+  found: Callable[[str, Data], Found] | None = None,
 ) -> Board:
   """Scores detectors on a recorded set.
 
@@ -73,6 +74,7 @@ def score(
     extra: (name, Data -> Found) of detectors that are run by something else: a host class, a file
       of scores.
     progress: called as progress(robot, detector, done, of how many, seconds).
+    found: what the detector of that name did, where `entries` were examined before, see spread.py.
   """
   begin = time.perf_counter()
   robots = streams.choose(robots)
@@ -85,15 +87,12 @@ def score(
   took: dict[str, float] = {}  # seconds of each detector on the robot before
   for robot in robots:
     data = load(streams, robot)
-    nominal, fault = joined(data.tune.residual, data.score.residual), data.fault
-    known: Any = None
-    if entries:
-      known = programs.samples(
-        nominal, fault.residual, fault.onset, fault.seed, data.horizon, room.samples
-      )
-    jobs: list[Job] = [
-      (e.name, e.reference, functools.partial(_examine, e, runners, room, known)) for e in entries
-    ]
+    if found:
+      own_jobs = [functools.partial(found, e.name) for e in entries]
+    else:
+      known = samples_of(data, room) if entries else None
+      own_jobs = [functools.partial(examine, e, runners, room, known) for e in entries]
+    jobs: list[Job] = [(e.name, e.reference, job) for e, job in zip(entries, own_jobs)]
     jobs += [(name, False, get) for name, get in extra]
     told = lambda name, robot=robot: progress(
       robot, name, next(done), total, time.perf_counter() - begin
@@ -103,18 +102,36 @@ def score(
     for name, curve in points.items():
       curves.setdefault(name, {})[robot] = curve
     faults += [_fault(data, key, o, alarms) for key, o in oracle.items()]
-    lived += len(jobs) * (nominal.opr.size + fault.residual.opr.size)
+    sizes = (x.residual.opr.size for x in (data.tune, data.score, data.fault))
+    lived += len(jobs) * sum(sizes)
   drawn = {name: by for name, by in curves.items() if any(by.values())}
   return Board(rows, comparison.overall(rows), drawn, faults, time.perf_counter() - begin, lived)
 
 
-def _examine(
+def samples_of(data: Data, room: programs.Room) -> programs.Samples:
+  """The streams of one robot as detectors are run on them."""
+  nominal, fault = joined(data.tune.residual, data.score.residual), data.fault
+  return programs.samples(
+    nominal, fault.residual, fault.onset, fault.seed, data.horizon, room.samples
+  )
+
+
+def examine(
   one: Entry,
   runners: dict[str, sweep.Runner],
   room: programs.Room,
-  samples: programs.Samples,
+  samples: Any,
   data: Data,
 ) -> Found:
+  """What a detector does on one robot.
+
+  Args:
+    one: the detector.
+    runners: detector -> what runs it, of those without settings of a robot's own.
+    room: of the set.
+    samples: of `data`.
+    data: streams of the robot.
+  """
   runner = sweep.Runner(one.own(data.robot), room) if one.own else runners[one.name]
   return one_line(one.name, lambda: calibration.examine(one, data, runner, samples))
 

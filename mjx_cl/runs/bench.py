@@ -133,7 +133,7 @@ def _together(
   jobs: int,
   worker: str,
   needs: dict[str, int] | None = None,
-  address: str | None = None,
+  on: cluster.Cluster | None = None,
 ) -> dict[str, dict]:
   """Runs parts side by side; arguments as of `execute`, `guess` gives the seconds that parts take,
   0 where nobody knows, `needs` the bytes that each takes where they run on a cluster.
@@ -154,8 +154,8 @@ def _together(
       left = f"; at most about {round(rest / 60) or 1} min left"
     tell(f"{name} finished, {len(over)} of {len(names)}{left}")
 
-  if needs is not None:
-    cluster.together(worker, out, names, needs, end, tell, address)
+  if on is not None and needs is not None:
+    cluster.together(worker, out, names, needs, end, tell, on)
     return known
   robots = {part.name: part.config.env for part in plan.parts}
   workers.together(worker, out, names, min(jobs, len(names)), end, tell, robots.get)
@@ -178,8 +178,7 @@ def execute(
   save_every_s: float = 60.0,
   jobs: int = 1,
   worker: str = "",
-  on: str = "here",
-  address: str | None = None,
+  on: cluster.Cluster | None = None,
 ) -> dict:
   """Runs the parts that are not finished, in order; one that was cut off goes on from its last
   checkpoint.
@@ -194,8 +193,7 @@ def execute(
     save_every_s: most seconds of work that a kill loses.
     jobs: parts side by side, see workers.py, the longest first.
     worker: module that such a process runs.
-    on: here, or ray, see cluster.py.
-    address: of a Ray cluster.
+    on: a cluster, see cluster.py; None: here.
 
   Returns:
     bench.json's value.
@@ -205,10 +203,10 @@ def execute(
   todo = [p for p in parts if not finished(out, p)]
   guess = lambda names: sum(estimates[name].seconds for name in names) if estimates else 0.0
   names = [p.name for p in todo]
-  if on == "ray" and todo:
+  if on is not None and todo:
     names.sort(key=lambda name: -guess([name]))
     needs = {name: estimates[name].bytes if estimates else 0 for name in names}
-    done = _together(plan, out, names, guess, tell, 1, worker, needs, address)
+    done = _together(plan, out, names, guess, tell, 1, worker, needs, on)
     return collect(out, plan, done)
   if jobs > 1 and len(todo) > 1:
     names.sort(key=lambda name: -guess([name]))

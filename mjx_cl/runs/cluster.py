@@ -17,18 +17,38 @@ import sys
 import tempfile
 import time
 import uuid
+import zlib
 from collections.abc import Callable, Iterator
 from typing import Any, BinaryIO, NamedTuple
 
 from mjx_cl import __version__
-from mjx_cl.errors import FileError, UserError
+from mjx_cl.errors import FileError, UserError, require
 from mjx_cl.io import folders, runtime
 from mjx_cl.io.interrupt import Interruptible
 from mjx_cl.runs import merge, workers
 
 AGAIN = 3  # times that a part whose process was lost begins anew
 ANSWER_S = 10.0  # that a cluster may take to answer
+SAVE_S = 120.0  # that parts may take to save, where others were interrupted or have failed
 HERE = ".ray"  # file in OUT by which a machine knows that it sees the driver's
+
+
+class Cluster(NamedTuple):
+  """A cluster, and what it gives a part besides a core.
+
+  Attributes:
+    address: HOST:PORT; None: one is started here.
+    gpu: whether a part has a GPU to itself; without, it has none.
+  """
+
+  address: str | None = None
+  gpu: bool = False
+
+
+def of(on: str, address: str | None, gpu: bool = False) -> Cluster | None:
+  """The cluster that --on and --address mean, None where parts run here."""
+  require(address is None or on == "ray", "--address is of a cluster; give --on ray")
+  return Cluster(address, gpu) if on == "ray" else None
 
 
 class Given(NamedTuple):
@@ -40,6 +60,8 @@ class Given(NamedTuple):
     token: what OUT/.ray holds there.
     suite: text of OUT/suite.json.
     versions: that a machine must have.
+    begun: folder in which the driver was started, which relative paths begin at.
+    gpu: whether the part has one.
   """
 
   module: str
@@ -47,6 +69,8 @@ class Given(NamedTuple):
   token: str
   suite: str
   versions: dict[str, str]
+  begun: str = ""
+  gpu: bool = False
 
 
 class Told(NamedTuple):
@@ -83,13 +107,16 @@ def own_core() -> Iterator[list[int]]:
 
 
 def folder_of(given: Given) -> tuple[pathlib.Path, bool]:
-  """Where this machine writes the suite, and whether that is the driver's folder."""
+  """Where this machine writes the suite, and whether that is the driver's folder. A folder of its
+  own is named after this very suite, so that what other settings left is none of it.
+  """
   out = pathlib.Path(given.out)
   with contextlib.suppress(OSError):
     if (out / HERE).read_text() == given.token:
       return out, True
   user = os.getuid() if hasattr(os, "getuid") else "all"
   name = "".join(c if c.isalnum() else "_" for c in given.out)[-80:]
+  name += f"_{zlib.crc32(given.suite.encode()):08x}"
   return pathlib.Path(tempfile.gettempdir(), f"mjx_cl_ray_{user}", name), False
 
 
@@ -106,7 +133,7 @@ def run_part(name: str, given: Given, tell: Callable[[str], Any]) -> Told:
     folders.make(out)
     folders.atomic(out / "suite.json", lambda file: file.write(given.suite.encode()))
   with own_core() as cores:
-    told = _process(name, given.module, out, cores, tell)
+    told = _process(name, given, out, cores, tell)
   if told.code or shared:
     return told
   folder = out / name
@@ -115,9 +142,14 @@ def run_part(name: str, given: Given, tell: Callable[[str], Any]) -> Told:
 
 
 def _process(
-  name: str, module: str, out: pathlib.Path, cores: list[int], tell: Callable[[str], Any]
+  name: str, given: Given, out: pathlib.Path, cores: list[int], tell: Callable[[str], Any]
 ) -> Told:
-  worker = workers.Worker(module, out, 0, cores, tell)
+  # which of a machine's GPUs are the part's stands in a variable that Ray has set; JAX would take a
+  # GPU that Ray gave to another
+  platforms = (os.environ.get("JAX_PLATFORMS") or "cuda,cpu") if given.gpu else "cpu"
+  begun = given.begun if os.path.isdir(given.begun) else None
+  own = os.environ | {"JAX_PLATFORMS": platforms}
+  worker = workers.Worker(given.module, out, 0, cores, tell, cwd=begun, env=own)
   try:
     worker.give(name)
     while not worker.check():
@@ -173,7 +205,8 @@ def together(
   needs: dict[str, int],
   finished: Callable[[str], None],
   tell: Callable[[str], None] = lambda text: None,
-  address: str | None = None,
+  on: Cluster | None = None,
+  check: Callable[[pathlib.Path], None] = merge.whole,
 ) -> None:
   """Runs the parts `names` of OUT/suite.json on a cluster, in their order as machines are free.
 
@@ -184,7 +217,8 @@ def together(
     needs: bytes that each takes.
     finished: called with the name of each part as it ends.
     tell: called with each line that a part says.
-    address: of the cluster; None: one is started here.
+    on: the cluster; None: one that is started here.
+    check: raises FileError for a part's folder that is not whole.
 
   Raises:
     UserError: as soon as one fails over settings, a machine has other versions, or no machine is
@@ -192,51 +226,58 @@ def together(
     FileError: as soon as one fails otherwise.
     KeyboardInterrupt: on a signal.
   """
-  ray, out = _ray(), pathlib.Path(out).resolve()
-  if address:
-    _answers(address)
-  own = {} if address else {"num_cpus": len(runtime.cores()), "include_dashboard": False}
+  ray, out, on = _ray(), pathlib.Path(out).resolve(), on or Cluster()
+  if on.address:
+    _answers(on.address)
+  own = {} if on.address else {"num_cpus": len(runtime.cores()), "include_dashboard": False}
   paths = os.pathsep.join(filter(None, sys.path))
   try:
     ray.init(
-      address,
+      on.address,
       log_to_driver=False,
       logging_level="ERROR",
-      runtime_env={"env_vars": {} if address else {"PYTHONPATH": paths}},
+      runtime_env={"env_vars": {} if on.address else {"PYTHONPATH": paths}},
       **own,
     )
   except (ConnectionError, ValueError, RuntimeError) as e:
-    raise UserError(f"--address {address}: no Ray cluster answers ({e})") from None
+    raise UserError(f"--address {on.address}: no Ray cluster answers ({e})") from None
   token = uuid.uuid4().hex
   folders.atomic(out / HERE, lambda file: file.write(token.encode()))
-  given = Given(module, str(out), token, (out / "suite.json").read_text(), versions())
+  suite = (out / "suite.json").read_text()
+  given = Given(module, str(out), token, suite, versions(), os.getcwd(), on.gpu)
+
+  def ended(name: str, told: Told) -> None:
+    if told.files is not None:
+      place(out, name, told.files, check)
+    finished(name)
+
   try:
-    _drive(ray, out, given, names, needs, finished, tell)
+    _drive(ray, given, names, needs, ended, tell)
   finally:
     ray.shutdown()
     (out / HERE).unlink(missing_ok=True)
 
 
-def _check_room(ray: Any, names: list[str], needs: dict[str, int]) -> None:
+def _check_room(ray: Any, names: list[str], needs: dict[str, int], gpu: bool) -> None:
   nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
-  for name in names:
-    if not any(n.get("CPU", 0) >= 1 and n.get("memory", 0) >= needs[name] for n in nodes):
-      raise UserError(
-        f"no machine of the cluster has a core and {needs[name] / 2**30:.1f} GiB for part {name}; "
-        "fewer --seeds need less"
-      )
+  nodes = [n for n in nodes if n.get("CPU", 0) >= 1 and n.get("GPU", 0) >= gpu]
+  most, name = max((needs[name], name) for name in names)
+  if most > max((n.get("memory", 0) for n in nodes), default=-1):
+    raise UserError(
+      f"no machine of the cluster has a core{', a GPU' * gpu} and {most / 2**30:.1f} GiB for part "
+      f"{name}"
+    )
 
 
 def _drive(
   ray: Any,
-  out: pathlib.Path,
   given: Given,
   names: list[str],
   needs: dict[str, int],
-  finished: Callable[[str], None],
+  ended: Callable[[str, Told], None],
   tell: Callable[[str], None],
 ) -> None:
-  _check_room(ray, names, needs)
+  _check_room(ray, names, needs, given.gpu)
   # on the driver's machine, which no part can do without
   here = ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy(
     ray.get_runtime_context().get_node_id(), soft=False
@@ -247,7 +288,7 @@ def _drive(
     return run_part(name, given, lambda line: board.put.remote(name, line))
 
   def submit(name: str) -> Any:
-    how = {"num_cpus": 1, "memory": needs[name], "max_retries": -1}
+    how = {"num_cpus": 1, "num_gpus": int(given.gpu), "memory": needs[name], "max_retries": -1}
     return ray.remote(task).options(**how).remote(name, given)
 
   lost = dict.fromkeys(names, 0)
@@ -262,9 +303,7 @@ def _drive(
           name = running.pop(reference)
           told = ray.get(reference)
           if told.code == 0:
-            if told.files is not None:
-              place(out, name, told.files)
-            finished(name)
+            ended(name, told)
             continue
           again = told.code is not None and told.code < 0 and lost[name] < AGAIN
           if not again:
@@ -274,8 +313,12 @@ def _drive(
           running[submit(name)] = name
         stop.check()
   finally:
-    for reference in running:  # its process saves and ends as its standard input closes
-      ray.cancel(reference, force=True)
+    # a KeyboardInterrupt to each task, which closes its process's standard input and waits until
+    # that has saved; what Ray ends by force takes its processes along
+    for reference in running:
+      ray.cancel(reference)
+    if running:
+      ray.wait(list(running), num_returns=len(running), timeout=SAVE_S)
 
 
 def _failure(told: Told) -> UserError:
@@ -284,11 +327,16 @@ def _failure(told: Told) -> UserError:
   return (UserError if told.code == UserError.exit_code else FileError)(told.line)
 
 
-def place(out: pathlib.Path, name: str, files: dict[str, bytes]) -> None:
+def place(
+  out: pathlib.Path,
+  name: str,
+  files: dict[str, bytes],
+  check: Callable[[pathlib.Path], None] = merge.whole,
+) -> None:
   """Writes a part's files to OUT/NAME, whole or not at all.
 
   Raises:
-    FileError: a path leads out of the folder, or a file is broken.
+    FileError: a path leads out of the folder, or a file is broken, see `check`.
   """
   folder, tmp = out / name, out / (name + ".tmp")
   with contextlib.ExitStack() as stack:
@@ -299,7 +347,7 @@ def place(out: pathlib.Path, name: str, files: dict[str, bytes]) -> None:
         raise FileError(f"part {name}: {path} leads out of its folder")
       folders.make(target.parent)
       folders.atomic(target, functools.partial(_write, value))
-    merge.whole(tmp)
+    check(tmp)
     _remove(folder)
     os.replace(tmp, folder)
 

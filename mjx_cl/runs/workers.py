@@ -69,7 +69,9 @@ class Worker:
     share: int,
     own: list[int],
     tell: Callable[[str], None],
+    **how: Any,
   ) -> None:
+    # how: of subprocess.Popen
     self.share, self.name, self.last = share, "", ""
     self.kind: Hashable = None
     command = [sys.executable, "-m", module, str(out), ",".join(map(str, own))]
@@ -82,6 +84,7 @@ class Worker:
       text=True,
       errors="replace",
       start_new_session=True,
+      **how,
     )
     self._over = threading.Event()
 

@@ -20,7 +20,7 @@ from mjx_cl.io import tables
 from mjx_cl.io.plugins import Registry
 from mjx_cl.leaderboard import entries as entries_of
 from mjx_cl.leaderboard import oracle as oracles
-from mjx_cl.leaderboard import record, set_tables, streams, submissions
+from mjx_cl.leaderboard import parts, record, set_tables, streams, submissions
 from mjx_cl.leaderboard import score as leaderboard
 from mjx_cl.scoring import thresholds
 
@@ -175,19 +175,20 @@ def test_parts_of_another_agent_or_onset_are_recorded_again(tmp_path):
   data = {"opr": np.ones((3, 1), np.float32)}
   np.savez(tmp_path / "a.npz", tag=np.asarray("lanes"), of=np.asarray("agent 1"), **data)
   np.savez(tmp_path / "old.npz", tag=np.asarray("lanes"), **data)
-  assert set(record._part(tmp_path / "a.npz", "lanes", "agent 1")) == {"opr"}
+  part = lambda tag, of: parts.Part([], None, None, 0, 0, tag, of)
+  assert set(parts.kept(tmp_path / "a.npz", part("lanes", "agent 1"))) == {"opr"}
   assert (
-    record._part(tmp_path / "a.npz", "lanes", "agent 2") is None
-    and record._part(tmp_path / "a.npz", "others", "agent 1") is None
+    parts.kept(tmp_path / "a.npz", part("lanes", "agent 2")) is None
+    and parts.kept(tmp_path / "a.npz", part("others", "agent 1")) is None
   )
-  assert set(record._part(tmp_path / "old.npz", "lanes", "agent 2")) == {
+  assert set(parts.kept(tmp_path / "old.npz", part("lanes", "agent 2"))) == {
     "opr"
   }  # parts from before this mark
   params = {"w": jnp.arange(4.0)}
   assert (
-    record._digest(params)
-    == record._digest({"w": jnp.arange(4.0)})
-    != record._digest({"w": jnp.arange(4.0).at[2].set(0)})
+    parts.digest(params)
+    == parts.digest({"w": jnp.arange(4.0)})
+    != parts.digest({"w": jnp.arange(4.0).at[2].set(0)})
   )
 
 

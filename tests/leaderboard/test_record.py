@@ -17,7 +17,7 @@ from mjx_cl import envs
 from mjx_cl.cli import app
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.io import tables
-from mjx_cl.leaderboard import lives, room, streams
+from mjx_cl.leaderboard import lives, parts, room, streams
 from mjx_cl.leaderboard import record as recording
 from mjx_cl.training import agents
 
@@ -193,7 +193,7 @@ def test_the_memory_of_a_recording_follows_its_lanes_and_steps(tmp_path):
   learner, after = agents.of(env).agent.config, lambda s: s.after(env.spec.control_s)
   need = lambda s: room.of(s, "walker", env.spec, learner)
   lanes = lambda kind: sum(
-    len(recording._who(suite, "walker", split, kind, env.spec.control_s)[0]) for split in SPLITS
+    len(parts.who_lives(suite, "walker", split, kind, env.spec.control_s)[0]) for split in SPLITS
   )
   row = room.COPIES * room.ROW
   more = dataclasses.replace(suite, nominal=suite.nominal | {"steps": 1128})

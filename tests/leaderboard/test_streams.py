@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mjx_cl import envs
-from mjx_cl.leaderboard import lives, record, streams
+from mjx_cl.leaderboard import lives, parts, streams
 from mjx_cl.rollout.scan import stream_keys
 from mjx_cl.training import agents
 
@@ -22,7 +22,7 @@ def shipped():
 def test_the_agents_that_ship_are_those_that_acted(shipped):
   for robot in shipped.robots:
     trained = agents.of(envs.make(robot))
-    assert shipped.config["agents"][robot]["crc32"] == record._digest(trained.train.params), robot
+    assert shipped.config["agents"][robot]["crc32"] == parts.digest(trained.train.params), robot
 
 
 def test_what_the_docs_say_of_it(shipped):

@@ -8,14 +8,15 @@ import signal
 import subprocess
 import sys
 import threading
+import zlib
 
 import psutil
 import pytest
-from test_suite import mini  # noqa: F401  a fixture
+from test_suite import MINI, mini  # noqa: F401  a fixture
 from test_transfer import agent, saved  # noqa: F401  fixtures
 
 from mjx_cl.errors import FileError, UserError
-from mjx_cl.io import tables
+from mjx_cl.io import folders, tables
 from mjx_cl.runs import cluster, workers
 from mjx_cl.runs import suite as suites
 
@@ -76,6 +77,7 @@ def test_a_part_comes_back_as_bytes_where_no_disk_is_shared(plan, tmp_path, monk
   assert suites.finished(here, plan_) and not list(here.glob("*.tmp"))
   again = cluster.run_part("healthy", own, lambda line: None)
   assert {k for k in again.files} == {k for k in told.files}  # finished there: not run again
+  assert cluster.folder_of(own) != cluster.folder_of(own._replace(suite="{}"))
   broken = told.files | {"runs.parquet": told.files["runs.parquet"][:-9]}
   for files, words in ((broken, "run it again"), ({"../x": b""}, "leads out")):
     with pytest.raises(FileError, match=words):
@@ -128,26 +130,52 @@ def test_parts_of_a_machine_have_cores_of_their_own(tmp_path):
 
 
 @pytest.fixture
-def machines(monkeypatch):
-  """(address, nodes) of a cluster of two machines."""
+def build(monkeypatch, tmp_path):
+  """build(*own, **all): (cluster, nodes) of machines with a core each and what else is said of them,
+  whose processes find modules in tmp_path.
+  """
   pytest.importorskip("ray", reason="the extra [ray] is not installed")
   from ray.cluster_utils import Cluster
 
   monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
-  monkeypatch.setenv("PYTHONPATH", str(pathlib.Path(cluster.__file__).parents[2]))
+  paths = (pathlib.Path(cluster.__file__).parents[2], tmp_path)
+  monkeypatch.setenv("PYTHONPATH", os.pathsep.join(map(str, paths)))
   made = Cluster()
-  made.add_node(num_cpus=0, include_dashboard=False)  # the driver's, which runs no part
-  nodes = [made.add_node(num_cpus=1) for _ in range(2)]
-  made.wait_for_nodes()
-  yield made, nodes
+
+  def start(*own, **every):
+    # the driver's, which runs no part
+    made.add_node(num_cpus=0, include_dashboard=False, **every)
+    nodes = [made.add_node(num_cpus=1, **more, **every) for more in own]
+    made.wait_for_nodes()
+    return made, nodes
+
+  yield start
   made.shutdown()
+
+
+@pytest.fixture
+def machines(build):
+  """(cluster, nodes) of two machines."""
+  return build({}, {})
+
+
+@pytest.fixture(scope="module")
+def whole(saved, tmp_path_factory):  # noqa: F811
+  """PARTS of 50 chunks, lived here one after the other."""
+  folder = tmp_path_factory.mktemp("whole")
+  text = MINI.replace("AGENT", str(saved)).replace("steps = 192", "steps = 3200")
+  (folder / "mini.toml").write_text(text)
+  suites.write_plan(suites.suite(str(folder / "mini.toml")), folder)
+  return alone(folder)
 
 
 def together(machines, out, tell=lambda text: None):
   """Runs PARTS on the cluster: names of those that ended."""
   ended = []
   needs = dict.fromkeys(PARTS, 2**20)
-  cluster.together(WORKER, out, PARTS, needs, ended.append, tell, machines[0].address)
+  cluster.together(
+    WORKER, out, PARTS, needs, ended.append, tell, cluster.Cluster(machines[0].address)
+  )
   return ended
 
 
@@ -157,11 +185,11 @@ def alone(out):
   return out
 
 
-def processes():
-  """Those that run parts."""
+def processes(out):
+  """Those that run parts of the suite in this folder."""
   found = []
   for process in psutil.process_iter(["cmdline"]):
-    if WORKER in (process.info["cmdline"] or []):
+    if {WORKER, str(out.resolve())} <= set(process.info["cmdline"] or []):
       found.append(process)
   return found
 
@@ -169,29 +197,28 @@ def processes():
 def test_a_cluster_gives_what_one_machine_gives(plan, machines):
   one, two = alone(plan("one")), plan("two")
   assert sorted(together(machines, two)) == PARTS
-  assert same(one, two) and not (two / cluster.HERE).exists() and not processes()
+  assert same(one, two) and not (two / cluster.HERE).exists() and not processes(two)
 
 
 @pytest.mark.parametrize("lost", ["process", "machine"])
-def test_what_is_lost_begins_again(plan, machines, lost):
-  one, two = alone(plan("one", steps=3200)), plan("two", steps=3200)
-  gone = []
+def test_what_is_lost_begins_again(plan, whole, machines, lost):
+  two, gone = plan("two", steps=3200), []
 
   def tell(text):
     if gone or "step " not in text:
       return
     gone.append(text)
     if lost == "process":
-      processes()[0].kill()
+      processes(two)[0].kill()
     else:
       threading.Thread(target=machines[0].remove_node, args=(machines[1][0],)).start()
 
   assert sorted(together(machines, two, tell)) == PARTS and gone
-  assert same(one, two) and not processes()
+  assert same(whole, two) and not processes(two)
 
 
-def test_an_interrupt_leaves_nothing_running_and_the_same_command_goes_on(plan, machines):
-  one, two = alone(plan("one", steps=3200)), plan("two", steps=3200)
+def test_an_interrupt_leaves_nothing_running_and_the_same_command_goes_on(plan, whole, machines):
+  two = plan("two", steps=3200)
 
   def tell(text):
     if "step " in text:
@@ -199,15 +226,92 @@ def test_an_interrupt_leaves_nothing_running_and_the_same_command_goes_on(plan, 
 
   with pytest.raises(KeyboardInterrupt):
     together(machines, two, tell)
-  psutil.wait_procs(processes(), timeout=600)
-  assert not processes()
-  assert sorted(together(machines, two)) == PARTS and same(one, two)
+  assert not processes(two) and list(two.glob("grip/*/work/checkpoints/*"))
+  assert sorted(together(machines, two)) == PARTS and same(whole, two)
+
+
+DRIVER = """import sys
+from mjx_cl.runs import cluster
+out, address, *names = sys.argv[1:]
+tell = lambda text: print(text, flush=True)
+needs = dict.fromkeys(names, 2**20)
+on = cluster.Cluster(address)
+cluster.together("mjx_cl.cli.worker", out, names, needs, print, tell, on)"""
+
+
+def test_a_driver_that_is_killed_leaves_nothing_running_and_the_next_goes_on(plan, whole, machines):
+  two = plan("two", steps=3200)
+  command = [sys.executable, "-c", DRIVER, str(two), machines[0].address, *PARTS]
+  with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as driver:
+    assert any("step " in line for line in driver.stdout)
+    driver.kill()
+  psutil.wait_procs(processes(two), timeout=600)
+  assert not processes(two) and list(two.glob("grip/*/config.json"))
+  assert sorted(together(machines, two)) == PARTS and same(whole, two)
+  assert not (two / cluster.HERE).exists()
+
+
+def test_a_cluster_of_other_versions_is_refused(plan, machines, monkeypatch):
+  own = cluster.versions()
+  monkeypatch.setattr(cluster, "versions", lambda: own | {"jax": "0.0.1"})
+  with pytest.raises(UserError, match=r"has jax .* in place of 0\.0\.1; install the driver's"):
+    together(machines, plan("out"))
+
+
+STUB = """import json, os, pathlib, sys, zlib
+out = pathlib.Path(sys.argv[1])
+size = json.loads((out / "suite.json").read_text())["size"]
+for name in map(str.strip, iter(sys.stdin.readline, "")):
+  folder, block = out / name, os.urandom(size)
+  folder.mkdir(parents=True, exist_ok=True)
+  (folder / "block").write_bytes(block)
+  seen = {k: os.environ.get(k) for k in ("CUDA_VISIBLE_DEVICES", "JAX_PLATFORMS")}
+  (folder / "seen.json").write_text(json.dumps(seen | {"crc32": zlib.crc32(block)}))
+  print("finished", name, flush=True)"""
+
+
+@pytest.fixture
+def seen(tmp_path):
+  """seen(machines, gpu, size): what the processes of two parts have seen, which wrote `size` bytes
+  each.
+  """
+  (tmp_path / "stub.py").write_text(STUB)
+
+  def run(made, gpu=False, size=1):
+    out, names = tmp_path / "out", ["a", "b"]
+    folders.make(out)
+    tables.write_json(out / "suite.json", {"size": size})
+    on, none = cluster.Cluster(made.address, gpu), lambda *_: None
+    cluster.together("stub", out, names, dict.fromkeys(names, 1), none, none, on, none)
+    told = [tables.read_json(out / name / "seen.json") for name in names]
+    for name, one in zip(names, told):
+      assert zlib.crc32((out / name / "block").read_bytes()) == one.pop("crc32")
+    return [tuple(one.values()) for one in told]
+
+  return run
+
+
+def test_a_part_has_the_gpu_that_was_asked_for_and_no_other(build, seen, monkeypatch):
+  monkeypatch.delenv("JAX_PLATFORMS", raising=False)
+  made, nodes = build({"num_gpus": 1}, {})
+  assert seen(made, gpu=True) == [("0", "cuda,cpu")] * 2
+  assert [platforms for _, platforms in seen(made)] == ["cpu"] * 2
+  made.remove_node(nodes[0])
+  with pytest.raises(UserError, match="no machine of the cluster has a core, a GPU and"):
+    seen(made, gpu=True)
+
+
+def test_results_beyond_the_object_store_arrive(build, seen, monkeypatch):
+  """Parts of 160 MB each by way of the smallest store that Ray takes."""
+  monkeypatch.setattr(cluster, "HERE", ".elsewhere")
+  made, _ = build({}, {}, object_store_memory=75 * 2**20)
+  assert len(seen(made, size=160 * 10**6)) == 2
 
 
 def test_no_cluster_and_too_large_a_part_are_one_line(plan, machines):
   out = plan("out")
   run = lambda needs, address: cluster.together(
-    WORKER, out, PARTS, dict.fromkeys(PARTS, needs), print, address=address
+    WORKER, out, PARTS, dict.fromkeys(PARTS, needs), print, on=cluster.Cluster(address)
   )
   with pytest.raises(UserError, match="no machine of the cluster has a core and 1048576.0 GiB"):
     run(2**50, machines[0].address)

@@ -1,0 +1,112 @@
+"""A suite of four equal parts on a Ray cluster of two machines of a core each, against `--jobs 2`,
+by turns, programs cached: wall and processor seconds of the processes that run parts.
+
+  python benchmarks/cluster.py [--steps 3000] [--turns 2]
+
+A part of a cluster is a process of its own; of `--jobs`, a process runs part after part and shares
+programs and what healthy robots live. So parts that are short show the most of the difference. The
+processor seconds say more than the wall's beside other work.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import pathlib
+import tempfile
+import threading
+import time
+
+import psutil
+
+from mjx_cl.io import runtime
+
+WORKER = "mjx_cl.cli.worker"
+SUITE = """name = "equal"
+[entries.walker]
+env = "walker"
+fault = "gear"
+target = "right_hip"
+severity = [0.4, 0.5, 0.6, 0.7]
+seeds = 1
+arms = ["none"]
+onset = 1000
+steps = """
+
+
+class Processor(threading.Thread):
+  """Adds up the processor seconds of processes of parts, as they were last seen."""
+
+  def __init__(self) -> None:
+    super().__init__(daemon=True)
+    self.seen: dict[int, float] = {}
+    self.over = threading.Event()
+
+  def run(self) -> None:
+    """Looks five times a second."""
+    while not self.over.wait(0.2):
+      for process in psutil.process_iter(["cmdline", "cpu_times"]):
+        if WORKER in (process.info["cmdline"] or []):
+          self.seen[process.pid] = sum(process.info["cpu_times"][:2])
+
+
+def timed(run, plan):
+  """(wall, processor) seconds of `run(folder, names)` on a new folder."""
+  from mjx_cl.runs import suite as suites
+
+  with tempfile.TemporaryDirectory() as folder:
+    suites.write_plan(plan, folder)
+    watch, begin = Processor(), time.perf_counter()
+    watch.start()
+    run(folder, [part.name for part in plan.parts])
+    wall = time.perf_counter() - begin
+    watch.over.set()
+    watch.join()
+    return wall, sum(watch.seen.values())
+
+
+def main() -> None:
+  """Prints a JSON row for each turn."""
+  parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+  parser.add_argument("--steps", type=int, default=3000)
+  parser.add_argument("--turns", type=int, default=2)
+  args = parser.parse_args()
+  os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
+  # Ray's is 15: other work on this machine would weigh on its parts alone
+  os.environ["RAY_worker_niceness"] = "0"  # noqa: SIM112  Ray spells it so
+  root = str(pathlib.Path(__file__).parents[1])
+  os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (root, os.environ.get("PYTHONPATH"))))
+  runtime.setup()
+  from ray.cluster_utils import Cluster
+
+  from mjx_cl.runs import cluster, workers
+  from mjx_cl.runs import suite as suites
+
+  with tempfile.NamedTemporaryFile("w", suffix=".toml") as file:
+    file.write(f"{SUITE}{args.steps}\n")
+    file.flush()
+    plan = suites.suite(file.name)
+  made = Cluster()
+  made.add_node(num_cpus=0, include_dashboard=False)
+  for _ in range(2):
+    made.add_node(num_cpus=1)
+  made.wait_for_nodes()
+  nothing = lambda *_: None
+  on = cluster.Cluster(made.address)
+  ways = {
+    "jobs": lambda out, names: workers.together(WORKER, out, names, 2, nothing),
+    "ray": lambda out, names: cluster.together(
+      WORKER, out, names, dict.fromkeys(names, 2**20), nothing, on=on
+    ),
+  }
+  for turn in range(args.turns + 1):  # the first fills the cache and is not counted
+    for way, run in ways.items():
+      wall, processor = timed(run, plan)
+      row = {"turn": turn, "way": way, "wall_s": round(wall, 1), "cpu_s": round(processor, 1)}
+      print(json.dumps(row | {"steps": args.steps, "load": os.getloadavg()[0]}), flush=True)
+  made.shutdown()
+
+
+if __name__ == "__main__":
+  main()
