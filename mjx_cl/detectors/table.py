@@ -15,6 +15,7 @@ from mjx_cl.detectors.glr import glr
 from mjx_cl.detectors.hotelling import hotelling
 from mjx_cl.detectors.knn import knn
 from mjx_cl.detectors.kswin import kswin
+from mjx_cl.detectors.learnt import learnt
 from mjx_cl.detectors.max_variables import max_variables
 from mjx_cl.detectors.mewma import mewma
 from mjx_cl.detectors.multichart import multichart
@@ -51,6 +52,7 @@ DETECTORS = Registry(
     "knn": knn,
     "bfar": bfar,
     "multichart": multichart,
+    "learnt": learnt,
     # what every score is printed beside; the oracle, which must be told the onset, is in
     # baselines.REFERENCES alone
     "never": baselines.never,

@@ -1,0 +1,140 @@
+"""Averages of all channels against what healthy robots and robots with other faults looked like."""
+
+import functools
+import json
+import pathlib
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from mjx_cl.detectors.base import (
+  Alarm,
+  Detector,
+  Number,
+  Setting,
+  above,
+  demand,
+  judged,
+  keep,
+  whole,
+)
+from mjx_cl.detectors.multivariate import Rows, pick, split
+from mjx_cl.errors import UserError
+from mjx_cl.rollout.monitor import Residual
+from mjx_cl.types import Array
+
+CHANNELS = split("learnt", "opr+rpr+reward+surprise+groups")
+RATES = (1 / 8, 1 / 32, 1 / 128)
+MOST_Z, MOST_U = 6.0, 8.0  # deviations beyond which a sample, an average counts as so many
+LOOKS = ("distance", "ratio")
+
+Averages = Float[Array, "rates channels"]
+
+
+class Fit(NamedTuple):
+  """What was fitted on one robot; p channels, r rates.
+
+  Attributes:
+    mean: float32 (p,), of the channels, healthy.
+    std: float32 (p,), likewise.
+    level: float32 (r, p), mean of the averages, healthy.
+    spread: float32 (r, p), their deviation.
+    inverse: float32 (p, p), inverse covariance of the slowest averages, healthy.
+    weights: float32 (2, r, p), of an average and of its magnitude.
+    bias: float32 (), of the ratio.
+    units: float32 (2,), score of each of LOOKS that is 1.
+  """
+
+  mean: Any
+  std: Any
+  level: Any
+  spread: Any
+  inverse: Any
+  weights: Any
+  bias: Any
+  units: Any
+
+
+@functools.cache
+def fits() -> dict[str, Fit]:
+  """Fit of each robot; written by benchmarks/fit_learnt.py."""
+  robots = json.loads(pathlib.Path(__file__).with_suffix(".json").read_text())["robots"]
+  return {
+    robot: Fit(**{k: np.asarray(v, np.float32) for k, v in own.items()})
+    for robot, own in robots.items()
+  }
+
+
+def averaged(averages: Averages, x: Rows, fit: Fit) -> Averages:
+  """The averages one sample later."""
+  z = jnp.clip((x - fit.mean) / fit.std, -MOST_Z, MOST_Z)
+  rates = jnp.asarray(RATES)[:, None]
+  return averages + rates * (z - averages)
+
+
+def distance(averages: Averages, fit: Fit) -> Number:
+  """Mahalanobis distance of the slowest averages from the healthy robot's."""
+  off = averages[-1] - fit.level[-1]
+  return jnp.sqrt(off @ fit.inverse @ off)
+
+
+def standardised(averages: Averages, fit: Fit) -> Float[Array, "2 rates channels"]:
+  """The averages in their healthy deviations, and their magnitudes: what the ratio weighs."""
+  u = jnp.clip((averages - fit.level) / fit.spread, -MOST_U, MOST_U)
+  return jnp.stack([u, jnp.abs(u)])
+
+
+def ratio(averages: Averages, fit: Fit) -> Number:
+  """Logarithm of the odds that these are averages of a robot with a fault."""
+  return jnp.sum(fit.weights * standardised(averages, fit)) + fit.bias
+
+
+@whole
+def learnt(threshold: Setting = 1.0, looks: str = "both", robot: str | None = None) -> Detector:
+  """Exponentially weighted averages of all channels at three rates: how far they are from a healthy
+  robot's, and how much they look like faults that were seen before.
+
+    z = (x - mean) / std;  m_a <- m_a + a (z - m_a),  a = 1/8, 1/32, 1/128, from 0
+    distance = sqrt((m - level)' S^-1 (m - level)) of the slowest averages, S shrunk by a tenth
+    u = (m_a - level_a) / spread_a;  ratio = sum w u + v |u| + b, the log odds of a logistic
+      regression of u on "after an onset"
+    score = max(distance / unit, ratio / unit);  fired = score > threshold; then m_a = 0
+
+  x: logarithms of opr, rpr, surprise and the eight groups, and the reward. Everything else was
+  fitted on recordings of the shipped agent: mean, std, level, spread, S and the units on healthy
+  robots, w, v and b on those against the tuning faults of the suite `leaderboard`. The distance
+  knows of no fault; the ratio is sharper on faults that resemble those it has seen. A unit is a
+  score that healthy robots pass once in 20,000 control steps.
+
+  Args:
+    threshold: decision level [units].
+    looks: `distance`, `ratio` or `both`.
+    robot: whose fit is taken; default, and for a robot without any: the walker's.
+
+  Returns:
+    Detector over monitor.Residual.
+  Blind to: a change of fewer steps than the fastest average takes; whatever a healthy robot does
+  now and then; other agents than the shipped ones, whose healthy residuals differ, need a fit of
+  their own.
+  Reference: Lowry, Woodall, Champ, Rigdon 1992, Technometrics 34, 46-53 (averages of several
+  channels); Gong, Lee, Cheng, Xie 2022, arXiv 2210.17312 (a learnt likelihood ratio).
+  """
+  demand("learnt", threshold=(threshold, above(threshold, 0), "above 0"))
+  if looks not in ("both", *LOOKS):
+    raise UserError(f"detector 'learnt': looks is both, {' or '.join(LOOKS)}; got {looks!r}")
+  fit = fits().get(robot or "walker") or fits()["walker"]
+  use = np.array([looks in ("both", name) for name in LOOKS])
+
+  def init() -> Averages:
+    return jnp.zeros((len(RATES), len(CHANNELS)))
+
+  def update(state: Averages, residual: Residual) -> tuple[Averages, Alarm]:
+    x, known = pick(residual, CHANNELS, log=True)
+    new = keep(known, averaged(state, x, fit), state)
+    both = jnp.stack([distance(new, fit), ratio(new, fit)]) / fit.units
+    alarm = judged(jnp.max(both, where=use, initial=-jnp.inf), known, threshold)
+    return jnp.where(alarm.fired, 0.0, new), alarm
+
+  return Detector(init, update)
