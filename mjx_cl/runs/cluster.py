@@ -1,7 +1,7 @@
 """Parts of a suite on the machines of a Ray cluster.
 
-A part is a Ray task, which starts the process that runs parts on one machine too (runs/workers.py),
-on a core of its own. Where a machine sees the folder of the suite it writes there; elsewhere into a
+A part is a Ray task, which has it run by a process as on one machine (runs/workers.py), on a core
+of its own. Where a machine sees the folder of the suite it writes there; elsewhere into a
 folder of its own, which comes back as bytes. A part whose task, process or machine is lost begins
 again, from its newest checkpoint where that can be reached. A part is never divided.
 """
@@ -144,22 +144,48 @@ def run_part(name: str, given: Given, tell: Callable[[str], Any]) -> Told:
 def _process(
   name: str, given: Given, out: pathlib.Path, cores: list[int], tell: Callable[[str], Any]
 ) -> Told:
-  # which of a machine's GPUs are the part's stands in a variable that Ray has set; JAX would take a
-  # GPU that Ray gave to another
-  platforms = (os.environ.get("JAX_PLATFORMS") or "cuda,cpu") if given.gpu else "cpu"
-  begun = given.begun if os.path.isdir(given.begun) else None
-  own = os.environ | {"JAX_PLATFORMS": platforms}
-  worker = workers.Worker(given.module, out, 0, cores, tell, cwd=begun, env=own)
+  worker = _worker(given, out, cores)
+  worker.tell = tell
   try:
     worker.give(name)
     while not worker.check():
       time.sleep(0.1)
     return Told(0)
   except UserError as e:
+    release()
     return Told(worker.process.returncode or FileError.exit_code, str(e))
-  finally:
+  except BaseException:  # Ray cancels a task by an exception
+    release()
+    raise
+
+
+# the process of this task's parts, and what it was started for; a process of Ray runs a task at a
+# time, and the next of the same suite goes on with what was imported and compiled
+_HELD: list[tuple[tuple, workers.Worker]] = []
+
+
+def release() -> None:
+  """Has the process that is kept for the next part save and end."""
+  while _HELD:
+    _, worker = _HELD.pop()
     worker.close()
     worker.process.wait()
+
+
+def _worker(given: Given, out: pathlib.Path, cores: list[int]) -> workers.Worker:
+  """The process that is kept, where it fits and lives, else a new one."""
+  # which of a machine's GPUs are the part's stands in a variable that Ray has set; JAX would take a
+  # GPU that Ray gave to another
+  platforms = (os.environ.get("JAX_PLATFORMS") or "cuda,cpu") if given.gpu else "cpu"
+  begun = given.begun if os.path.isdir(given.begun) else None
+  of = (given, str(out), tuple(cores), platforms, os.environ.get("CUDA_VISIBLE_DEVICES"))
+  if _HELD and (_HELD[0][0] != of or _HELD[0][1].process.poll() is not None):
+    release()
+  if not _HELD:
+    own = os.environ | {"JAX_PLATFORMS": platforms}
+    made = workers.Worker(given.module, out, 0, cores, lambda line: None, cwd=begun, env=own)
+    _HELD.append((of, made))
+  return _HELD[0][1]
 
 
 class Board:

@@ -60,6 +60,7 @@ class Worker:
     name: of the part that it runs, "": none.
     kind: of the part that it has run last, see `together`.
     last: line that it said last.
+    tell: called with each line that it says.
   """
 
   def __init__(
@@ -72,7 +73,7 @@ class Worker:
     **how: Any,
   ) -> None:
     # how: of subprocess.Popen
-    self.share, self.name, self.last = share, "", ""
+    self.share, self.name, self.last, self.tell = share, "", "", tell
     self.kind: Hashable = None
     command = [sys.executable, "-m", module, str(out), ",".join(map(str, own))]
     # a session of its own: Ctrl-C reaches the parent alone, which then closes the input
@@ -94,7 +95,7 @@ class Worker:
           self.last = line.strip()
           # where nobody listens any more a full pipe would stop the worker
           with contextlib.suppress(OSError):
-            tell(f"{self.name}: {self.last}")
+            self.tell(f"{self.name}: {self.last}")
 
     def wait() -> None:
       for line in self.process.stdout:

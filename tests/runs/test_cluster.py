@@ -30,6 +30,13 @@ def given(folder, **other):
   return cluster.Given(**known, versions=cluster.versions())._replace(**other)
 
 
+@pytest.fixture(autouse=True)
+def released():
+  """No process outlives a test."""
+  yield
+  cluster.release()
+
+
 @pytest.fixture
 def plan(mini, tmp_path):  # noqa: F811
   """Folder of a suite that is to be run."""
@@ -94,6 +101,47 @@ def test_what_a_part_says_last_is_why_it_failed(plan):
   told = cluster.run_part("healthy", given(out, token="7"), lambda line: None)
   wrong = cluster._failure(told)
   assert type(wrong) is UserError and "part healthy: no agent" in str(wrong)
+
+
+STUB = """import json, os, pathlib, sys, zlib
+out = pathlib.Path(sys.argv[1])
+size = json.loads((out / "suite.json").read_text())["size"]
+for name in map(str.strip, iter(sys.stdin.readline, "")):
+  folder, block = out / name, os.urandom(size)
+  folder.mkdir(parents=True, exist_ok=True)
+  (folder / "block").write_bytes(block)
+  seen = {k: os.environ.get(k) for k in ("CUDA_VISIBLE_DEVICES", "JAX_PLATFORMS")}
+  print(name, "pid", os.getpid(), file=sys.stderr, flush=True)
+  (folder / "seen.json").write_text(json.dumps(seen | {"crc32": zlib.crc32(block)}))
+  print("finished", name, flush=True)"""
+
+
+def test_the_process_of_a_part_runs_the_next_of_its_suite(tmp_path):
+  """And one of another suite is another's; where it was killed there is a new one."""
+  (tmp_path / "stub.py").write_text(STUB)
+  pids = []
+
+  def run(name, out):
+    folders.make(out)
+    tables.write_json(out / "suite.json", {"size": 1})
+    own = given(out, module="stub", token="7", begun=str(tmp_path))
+    (out / cluster.HERE).write_text("7")
+    said = []
+    told = cluster.run_part(name, own, said.append)
+    assert told.code == 0 and said[-1].startswith(f"{name}: {name} pid ")
+    pids.append(int(said[-1].split()[-1]))
+
+  one, two = tmp_path / "one", tmp_path / "two"
+  try:
+    run("a", one)
+    run("b", one)
+    os.kill(pids[-1], signal.SIGKILL)
+    psutil.wait_procs([psutil.Process(pids[-1])], timeout=60)
+    run("c", one)
+    run("a", two)
+  finally:
+    cluster.release()
+  assert pids[0] == pids[1] and len(set(pids)) == 3
 
 
 TAKES = """import sys
@@ -194,10 +242,16 @@ def processes(out):
   return found
 
 
+def ended(out):
+  """Whether all of them end."""
+  psutil.wait_procs(processes(out), timeout=600)
+  return not processes(out)
+
+
 def test_a_cluster_gives_what_one_machine_gives(plan, machines):
   one, two = alone(plan("one")), plan("two")
   assert sorted(together(machines, two)) == PARTS
-  assert same(one, two) and not (two / cluster.HERE).exists() and not processes(two)
+  assert same(one, two) and not (two / cluster.HERE).exists() and ended(two)
 
 
 @pytest.mark.parametrize("lost", ["process", "machine"])
@@ -214,7 +268,7 @@ def test_what_is_lost_begins_again(plan, whole, machines, lost):
       threading.Thread(target=machines[0].remove_node, args=(machines[1][0],)).start()
 
   assert sorted(together(machines, two, tell)) == PARTS and gone
-  assert same(whole, two) and not processes(two)
+  assert same(whole, two) and ended(two)
 
 
 def test_an_interrupt_leaves_nothing_running_and_the_same_command_goes_on(plan, whole, machines):
@@ -245,8 +299,7 @@ def test_a_driver_that_is_killed_leaves_nothing_running_and_the_next_goes_on(pla
   with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as driver:
     assert any("step " in line for line in driver.stdout)
     driver.kill()
-  psutil.wait_procs(processes(two), timeout=600)
-  assert not processes(two) and list(two.glob("grip/*/config.json"))
+  assert ended(two) and list(two.glob("grip/*/config.json"))
   assert sorted(together(machines, two)) == PARTS and same(whole, two)
   assert not (two / cluster.HERE).exists()
 
@@ -256,18 +309,6 @@ def test_a_cluster_of_other_versions_is_refused(plan, machines, monkeypatch):
   monkeypatch.setattr(cluster, "versions", lambda: own | {"jax": "0.0.1"})
   with pytest.raises(UserError, match=r"has jax .* in place of 0\.0\.1; install the driver's"):
     together(machines, plan("out"))
-
-
-STUB = """import json, os, pathlib, sys, zlib
-out = pathlib.Path(sys.argv[1])
-size = json.loads((out / "suite.json").read_text())["size"]
-for name in map(str.strip, iter(sys.stdin.readline, "")):
-  folder, block = out / name, os.urandom(size)
-  folder.mkdir(parents=True, exist_ok=True)
-  (folder / "block").write_bytes(block)
-  seen = {k: os.environ.get(k) for k in ("CUDA_VISIBLE_DEVICES", "JAX_PLATFORMS")}
-  (folder / "seen.json").write_text(json.dumps(seen | {"crc32": zlib.crc32(block)}))
-  print("finished", name, flush=True)"""
 
 
 @pytest.fixture
