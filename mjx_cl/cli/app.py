@@ -42,7 +42,7 @@ from mjx_cl.cli.flags import (
   Run,
   Train,
 )
-from mjx_cl.cli.output import apart, say
+from mjx_cl.cli.output import apart, printable, say
 from mjx_cl.config import FaultConfig, quick
 from mjx_cl.errors import FileError, PluginError, UserError
 from mjx_cl.io import folders, interrupt, limits, plugins
@@ -166,10 +166,16 @@ def attempt(do: Callable[[], object], again: Callable[[], str] = lambda: "") -> 
       signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-def shortened(text: str, most: int = 1000) -> str:
-  """A text whose middle is left out where it is longer than `most`."""
-  end = most // 4
-  return text if len(text) <= most else f"{text[: most - end - 5]} ... {text[-end:]}"
+def shortened(text: str, most: int = 480, word: int = 160) -> str:
+  """A text as it is printed: the middle is left out of words longer than `word`, then of the whole
+  where it is longer than `most`.
+  """
+
+  def cut(part: str, most: int) -> str:
+    end = most // 4
+    return part if len(part) <= most else f"{part[: most - end - 5]} ... {part[-end:]}"
+
+  return cut(" ".join(cut(part, word) for part in printable(text).split(" ")), most)
 
 
 def _attempt(do: Callable[[], object], again: Callable[[], str]) -> int:
@@ -207,7 +213,7 @@ def _known(error: Exception) -> tuple[str, int] | None:
     return shortened(text), error.exit_code
   if isinstance(error, OSError):
     where = f": {error.filename}" if error.filename else ""
-    return f"{error.strerror or error}{where}", FileError.exit_code
+    return shortened(f"{error.strerror or error}{where}"), FileError.exit_code
   return None
 
 
