@@ -1,0 +1,155 @@
+"""Kills: a command is ended by a signal at a moment drawn from its undisturbed time, goes on as the
+manual says, and must end with the results of the undisturbed one, bit for bit.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import pathlib
+import shutil
+import signal
+import subprocess
+import time
+from typing import NamedTuple
+
+import numpy as np
+
+from benchmarks import reference
+from benchmarks.hostile import judge, processes, room
+
+PROGRAM = ("-m", "benchmarks.hostile.saving")
+LIMIT_S = 240.0  # of a command that is not disturbed
+ADAPT = ["--adapt.warmup", "64", "--adapt.start-windows", "32", "--adapt.ratio", "4", "--adapt.patience", "4",
+         "--adapt.least", "64", "--adapt.refit", "64"]  # fmt: skip
+
+
+class Target(NamedTuple):
+  """A command that is killed.
+
+  Attributes:
+    words: of its command line.
+    again: words that let it go on.
+  """
+
+  words: list[str]
+  again: tuple[str, ...] = ()
+
+
+TARGETS = {
+  "run": Target(["run", "robot.py:Reach", "--agent", "point", "--fault", "noise", "--steps", "1024", "--onset", "192",
+                 "--seeds", "1", "--arm", "oracle", "--detector", "page_hinkley", "--set", "threshold=2",
+                 "warmup=40", *ADAPT, "--out", "out"], ("--resume",)),
+  "train": Target(["train", "robot.py:Reach", "--preset", "tiny", "--set", "updates=256", "ratio=4", "--save-every-s",
+                   "0.5", "--out", "out"], ("--resume",)),
+  "bench": Target(["bench", "kill.toml", "--jobs", "1", "--out", "out"]),
+  "record": Target(["record", *room.STREAMS_OF, "--out", "out"]),
+  "leaderboard": Target(["leaderboard", "set", "--detector", "z_score", "--out", "out"], ("--overwrite",)),
+}  # fmt: skip
+SIGNALS = ("KILL", "TERM", "INT", "KILL KILL", "INT INT", "TERM TERM", "TERM INT")
+
+
+def program(words: list[str]) -> int:
+  """`mjx-cl` that saves often, in a fork."""
+  import sys
+
+  from benchmarks.hostile import saving
+
+  sys.argv = ["mjx-cl", *words]
+  return saving.main()
+
+
+def whole(target: str, home: pathlib.Path, folder: pathlib.Path) -> tuple[float, dict]:
+  """(seconds, digests) of an undisturbed run; made once, the second of two, whose programs are cached."""
+  known = home.parent / "undisturbed" / f"{target}.json"
+  if not known.exists():
+    known.parent.mkdir(exist_ok=True)
+    for _ in range(2):
+      shutil.rmtree(folder, ignore_errors=True)
+      room.copy(home, folder)
+      done = processes.alone(TARGETS[target].words, folder, 10 * LIMIT_S, program=PROGRAM)
+      if done.status:
+        raise OSError(f"{target} undisturbed: status {done.status}, {done.err[-500:]}")
+    value = {"seconds": done.seconds, "digests": reference.of_folder(folder / "out")}
+    known.write_text(json.dumps(value))
+    shutil.rmtree(folder)
+    room.copy(home, folder)
+  value = json.loads(known.read_text())
+  return value["seconds"], value["digests"]
+
+
+def ended_well(name: str, status: int, err: str) -> str:
+  """What is wrong with how a signal ended a command; "" where nothing is."""
+  if name == "KILL":
+    return ""  # it had no say
+  lines = judge.lines_of(processes.Done(status, "", err, 0.0))
+  if status != 130:
+    return f"SIG{name}: status {status}, {(lines or [''])[-1][:200]}"
+  if noise := next((x for x in lines if judge.NOISE.search(x)), None):
+    return f"SIG{name}: noise: {noise.strip()[:200]}"
+  said = [x for x in lines if x.startswith("mjx-cl: interrupted")]
+  return (
+    ""
+    if len(said) == 1 and lines[-1] == said[0]
+    else f"SIG{name}: not one line that it is interrupted at the end"
+  )
+
+
+def cut(
+  process: subprocess.Popen, names: list[str], at_s: float, group: bool, rng: np.random.Generator
+) -> tuple[bool, float]:
+  """Sends the signals; (whether it was at work still, seconds that it took to end)."""
+  begin = time.monotonic()
+  while process.poll() is None and time.monotonic() < begin + at_s:
+    time.sleep(0.002)
+  if process.poll() is not None:
+    return False, 0.0
+  begin = time.monotonic()
+  for k, name in enumerate(names):
+    if k:
+      time.sleep(float(rng.choice([0.0, 0.02, 0.3, 1.0])))
+    try:
+      (os.killpg if group else os.kill)(process.pid, getattr(signal, f"SIG{name}"))
+    except ProcessLookupError:
+      break
+  try:
+    process.wait(60)
+  except subprocess.TimeoutExpired:
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    return True, float("inf")
+  return True, time.monotonic() - begin
+
+
+def kill(target: str, names: list[str], rng: np.random.Generator, home: pathlib.Path, folder: pathlib.Path
+         ) -> tuple[str, int, str]:  # fmt: skip
+  """Kills once or twice and lets the command end: (what is wrong, status, where it was cut off)."""
+  seconds, digests = whole(target, home, folder)
+  one = TARGETS[target]
+  words, places = list(one.words), []
+  twice_killed = names == ["KILL", "KILL"]  # the second falls upon what goes on
+  for signals in [["KILL"], ["KILL"]] if twice_killed else [names]:
+    at = float(rng.uniform(0, seconds))
+    process = processes.started(words, folder, program=PROGRAM)
+    working, late = cut(process, signals, at, bool(rng.random() < 0.5), rng)
+    err = processes.said(folder)[1]
+    places.append(f"{at:.2f} of {seconds:.2f} s" if working else "not at all, it had ended")
+    if late == float("inf"):
+      return "does not end within a minute", process.returncode, "; ".join(places)
+    if (
+      working and process.returncode and (wrong := ended_well(signals[-1], process.returncode, err))
+    ):
+      if process.returncode not in (-15, -2) or at > 1.0:  # Python had hardly begun
+        return wrong, process.returncode, "; ".join(places)
+    words = [*one.words, *one.again]
+  done = processes.forked(words, folder, LIMIT_S, work=program)
+  if done.status:
+    return (
+      f"does not go on: {(judge.lines_of(done) or [''])[-1][:300]}",
+      done.status,
+      "; ".join(places),
+    )
+  if noise := next((x for x in judge.lines_of(done) if judge.NOISE.search(x)), None):
+    return f"goes on with noise: {noise[:200]}", 0, "; ".join(places)
+  differing = reference.differences(digests, reference.of_folder(folder / "out"))
+  return f"differs: {' | '.join(differing[:3])}" if differing else "", 0, "; ".join(places)

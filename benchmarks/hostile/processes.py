@@ -1,0 +1,185 @@
+"""Processes of cases: `mjx-cl` of its own, or a fork of this process, which has imported all of it
+once.
+
+A fork ends with status BEGUN where the input was taken and the long work would begin (WORK).
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import pathlib
+import resource
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from typing import NamedTuple
+
+from benchmarks.hostile import room
+
+BEGUN = 250  # exit status of a fork whose work has begun
+GRACE_S = 10.0  # from Ctrl-C to the end of a process
+# where long work begins: module -> its functions
+WORK = {
+  "mjx_cl.runs.run": ("live",),
+  "mjx_cl.runs.bench": ("execute",),
+  "mjx_cl.training.trainer": ("run",),
+  "mjx_cl.training.demonstrator": ("train",),
+  "mjx_cl.training.evaluate": ("evaluate",),
+  "mjx_cl.leaderboard.record": ("_parts",),
+  "mjx_cl.leaderboard.score": ("_run",),
+  "mjx_cl.faults.certificate": ("certify",),
+  "mjx_cl.render.pictures": ("painter",),
+  "mjx_cl.io.cache_check": ("check",),
+}
+LIMITS = {
+  "AS": resource.RLIMIT_AS,
+  "NOFILE": resource.RLIMIT_NOFILE,
+  "FSIZE": resource.RLIMIT_FSIZE,
+}
+
+
+class Done(NamedTuple):
+  """How a process ended.
+
+  Attributes:
+    status: exit status, negative: the signal that ended it.
+    out: standard output.
+    err: standard error.
+    seconds: until it ended, or was interrupted.
+    interrupted: it was at work still when its time was over.
+    late: seconds that it took to end after Ctrl-C; None: it had to be killed.
+  """
+
+  status: int
+  out: str
+  err: str
+  seconds: float
+  interrupted: bool = False
+  late: float | None = 0.0
+
+
+def warm() -> None:
+  """Imports what commands import; no backend of JAX starts, which a fork would not survive."""
+  app = importlib.import_module("mjx_cl.cli.app")
+  for name in {*app.COMMANDS.values()}:
+    importlib.import_module(f"mjx_cl.cli.{name}")
+  for name in ("mjx_cl.render.figures", "benchmarks.report.report", "matplotlib.pyplot"):
+    importlib.import_module(name)
+
+
+def _wait(
+  ended: Callable[[], int | None], pid: int, limit_s: float
+) -> tuple[int, float, bool, float | None]:
+  """(status, seconds, interrupted, late) of a process that is given Ctrl-C at its limit."""
+  begin = time.monotonic()
+  while (status := ended()) is None and time.monotonic() < begin + limit_s:
+    time.sleep(0.005)
+  seconds = time.monotonic() - begin
+  if status is not None:
+    return status, seconds, False, 0.0
+  os.kill(pid, signal.SIGINT)
+  while (status := ended()) is None and time.monotonic() < begin + seconds + GRACE_S:
+    time.sleep(0.01)
+  if status is not None:
+    return status, seconds, True, time.monotonic() - begin - seconds
+  os.killpg(pid, signal.SIGKILL)
+  while (status := ended()) is None:
+    time.sleep(0.01)
+  return status, seconds, True, None
+
+
+def _limited(limits: dict[str, int]) -> None:
+  for name, value in limits.items():
+    hard = resource.getrlimit(LIMITS[name])[1]
+    resource.setrlimit(LIMITS[name], (value, hard))
+
+
+def started(words: list[str], folder: pathlib.Path, limits: dict[str, int] | None = None,
+            program: tuple[str, ...] = ("-m", "mjx_cl")) -> subprocess.Popen:  # fmt: skip
+  """A process of its own, its output in files of the folder above."""
+  with open(folder.with_suffix(".out"), "wb") as out, open(folder.with_suffix(".err"), "wb") as err:
+    return subprocess.Popen([sys.executable, *program, *map(os.fsencode, words)], cwd=folder, stdin=subprocess.DEVNULL,
+                            stdout=out, stderr=err, env=room.environment(folder), start_new_session=True,
+                            preexec_fn=lambda: _limited(limits or {}))  # fmt: skip
+
+
+def said(folder: pathlib.Path) -> tuple[str, str]:
+  """Standard output and error of the last process of a folder; removes them."""
+  texts = []
+  for suffix in (".out", ".err"):
+    file = folder.with_suffix(suffix)
+    texts.append(file.read_bytes()[:2_000_000].decode(errors="backslashreplace"))
+    file.unlink()
+  return texts[0], texts[1]
+
+
+def alone(words: list[str], folder: pathlib.Path, limit_s: float, limits: dict[str, int] | None = None,
+          program: tuple[str, ...] = ("-m", "mjx_cl")) -> Done:  # fmt: skip
+  """Runs a process of its own to its end, or the limit."""
+  process = started(words, folder, limits, program)
+  how = _wait(process.poll, process.pid, limit_s)
+  return Done(how[0], *said(folder), *how[1:])
+
+
+def _begun(*_: object, **__: object) -> None:
+  for stream in (sys.stdout, sys.stderr):
+    stream.flush()
+  os._exit(BEGUN)
+
+
+def _command(words: list[str]) -> int:
+  """What `mjx-cl WORDS` does, in a fork."""
+  for module, names in WORK.items():
+    for name in names:
+      setattr(sys.modules[module], name, _begun)
+  from mjx_cl.cli import app
+
+  # as a shell hands them over: what is no UTF-8 is a surrogate, no NUL
+  sys.argv = ["mjx-cl", *words]
+  return app.main()
+
+
+def forked(words: list[str], folder: pathlib.Path, limit_s: float, limits: dict[str, int] | None = None,
+           work: Callable[[list[str]], int] = _command) -> Done:  # fmt: skip
+  """Runs a command in a fork of this process."""
+  sys.stdout.flush()
+  pid = os.fork()
+  if not pid:
+    status = 1
+    try:
+      os.setsid()
+      for number, suffix in ((1, ".out"), (2, ".err")):
+        os.dup2(
+          os.open(folder.with_suffix(suffix), os.O_CREAT | os.O_TRUNC | os.O_WRONLY, 0o600), number
+        )
+      os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+      os.chdir(folder)
+      os.environ.clear()
+      os.environ.update(ENVIRONMENT | room.environment(folder))
+      signal.signal(signal.SIGINT, signal.default_int_handler)
+      _limited(limits or {})
+      sys.stdout = open(1, "w", encoding="utf-8", closefd=False)
+      sys.stderr = open(2, "w", encoding="utf-8", errors="backslashreplace", closefd=False)
+      try:
+        status = work(words)
+      except SystemExit as e:
+        status = e.code if isinstance(e.code, int) else 1
+      except BaseException:
+        sys.excepthook(*sys.exc_info())  # type: ignore[arg-type]
+      sys.stdout.flush()
+      sys.stderr.flush()
+    finally:
+      os._exit(status)
+
+  def ended() -> int | None:
+    got, how = os.waitpid(pid, os.WNOHANG)
+    return os.waitstatus_to_exitcode(how) if got else None
+
+  how = _wait(ended, pid, limit_s)
+  return Done(how[0], *said(folder), *how[1:])
+
+
+ENVIRONMENT = dict(os.environ)
