@@ -18,7 +18,7 @@ import sys
 
 from benchmarks.hostile import campaign, processes, room
 
-CUT = {"input": 60}  # cases of a kind with --cut
+CUT = {"input": 60, "kill": 5, "poor": 6, "foreign": 8}  # cases of a kind with --cut
 CUT_MINUTES = 5.0
 
 
@@ -41,7 +41,7 @@ def run(args: argparse.Namespace) -> int:
   processes.warm()
   wanted = names(args.kinds, args.shard, args.cut, args.count)
   minutes = CUT_MINUTES if args.cut and args.minutes is None else args.minutes
-  campaign.run(wanted, args.seed, out, minutes)
+  campaign.run(wanted, args.seed, out, minutes, args.again)
   found = [one for name, one in campaign.read(out).items() if name in set(wanted)]
   print(campaign.table(found))
   return int(any(one["how"] == "failed" for one in found))
@@ -80,6 +80,7 @@ def main(argv: list[str] | None = None) -> int:
       command.add_argument(
         "--cut", action="store_true", help="a few of each kind, five minutes at most"
       )
+      command.add_argument("--again", action="store_true", help="those that failed, once more")
       command.add_argument("--shard", default="0/1", help="K/N: every N-th case from the K-th on")
     if do is case:
       command.add_argument("name", help="KIND-NUMBER")

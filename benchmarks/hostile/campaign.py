@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import collections
+import functools
 import json
 import os
 import pathlib
@@ -14,10 +15,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from benchmarks.hostile import inputs, judge, processes, room
+from benchmarks.hostile import foreign, inputs, judge, kills, processes, room, surroundings
 
 APART = 0.05  # share of the cases of bad input that run in a process of their own
 FORK_S, APART_S = 20.0, 40.0  # that a case of bad input may take until Ctrl-C
+LIVE_S, STRANGE_S = 120.0, 40.0  # that one of poor surroundings, and of foreign code, may take
 
 
 class Found(NamedTuple):
@@ -57,9 +59,55 @@ def bad_input(seed: int, number: int, home: pathlib.Path, folder: pathlib.Path) 
   )
 
 
+def killed(seed: int, number: int, home: pathlib.Path, folder: pathlib.Path) -> Found:
+  """A case of a kill; commands and signals meet by turns."""
+  rng = np.random.default_rng((seed, number, 3))
+  target = list(kills.TARGETS)[number % len(kills.TARGETS)]
+  names = kills.SIGNALS[(number // len(kills.TARGETS)) % len(kills.SIGNALS)]
+  room.copy(home, folder)
+  begin = time.monotonic()
+  wrong, status, places = kills.kill(target, names.split(), rng, home, folder)
+  verdict = judge.Verdict("failed" if wrong else "held", wrong)
+  about = f"{target}: {names} at {places}"
+  return Found(f"{target} {names}", about, kills.TARGETS[target].words, verdict, status, round(time.monotonic() - begin, 1))
+
+
+def poor(seed: int, number: int, home: pathlib.Path, folder: pathlib.Path) -> Found:
+  """A case of poor surroundings."""
+  kind, command, rng = surroundings.draw(seed, number)
+  words, limits = surroundings.COMMANDS[command], surroundings.limits(kind, rng)
+  room.copy(home, folder)
+  with surroundings.disk(kind, folder, rng) as able:
+    if not able:
+      return Found(kind, "no mount is permitted", words, judge.Verdict("skipped"), 0, 0.0)
+    before = judge.contents(folder)
+    output = "/dev/full" if kind == "output" else None
+    done = processes.alone(words, folder, LIVE_S, limits, output=output)
+    tops = ("out/o", "out/o.gif", "out/run/figure.png")
+    verdict = judge.judge(done, surroundings.NAMES[kind], before, judge.contents(folder), tops)
+  about = f"{kind}: {command} {limits or ''}"
+  return Found(kind, about, words, verdict, done.status, round(done.seconds, 2))
+
+
+def strange(seed: int, number: int, home: pathlib.Path, folder: pathlib.Path) -> Found:
+  """A case of foreign code."""
+  place, field, deed = foreign.draw(seed, number)
+  room.copy(home, folder)
+  words = foreign.write(place, field, deed, folder)
+  before = judge.contents(folder)
+  done = processes.forked(words, folder, STRANGE_S, work=processes.command)
+  verdict = judge.judge(done, ("hostile", "Own"), before, judge.contents(folder), ("out", "__pycache__"))
+  if verdict.how == "valid" and done.interrupted:  # it hung, and Ctrl-C ended it
+    verdict = verdict._replace(how="held")
+  return Found(place, f"{place}, {field}: {deed}", words, verdict, done.status, round(done.seconds, 2))
+
+
 # kind -> (what does a case, how many there are)
 KINDS: dict[str, tuple[Callable[[int, int, pathlib.Path, pathlib.Path], Found], int]] = {
   "input": (bad_input, 2000),
+  "kill": (killed, 200),
+  "poor": (poor, 120),
+  "foreign": (strange, len(foreign.EVERY)),
 }
 
 
@@ -86,6 +134,7 @@ def case(name: str, seed: int, out: pathlib.Path) -> Found:
     kept = out / "failed" / name
     shutil.rmtree(kept, ignore_errors=True)
     kept.parent.mkdir(exist_ok=True)
+    folder.mkdir(exist_ok=True)
     shutil.copytree(folder, kept, symlinks=True, ignore_dangling_symlinks=True)
     command = f"cd {shlex.quote(str(kept))} && mjx-cl {shlex.join(found.words)}\n"
     (kept / "command.sh").write_text(command, errors="surrogateescape")
@@ -108,12 +157,14 @@ def read(out: pathlib.Path) -> dict[str, dict]:
 
 
 def run(names: Iterable[str], seed: int, out: pathlib.Path, minutes: float | None,
-        tell: Callable[[str], object] = print) -> None:  # fmt: skip
-  """Does those of the cases that are not finished, until the time is over."""
+        again: bool = False, tell: Callable[[str], object] = functools.partial(print, flush=True)) -> None:  # fmt: skip
+  """Does those of the cases that are not finished, until the time is over; with `again` those that
+  failed, once more.
+  """
   out.mkdir(parents=True, exist_ok=True)
   begin, finished = time.monotonic(), read(out)
   for name in names:
-    if name in finished:
+    if (name in finished) != again or (again and finished[name]["how"] != "failed"):
       continue
     if minutes is not None and time.monotonic() - begin > 60 * minutes:
       break

@@ -200,7 +200,7 @@ def shown(given: list[str]) -> list[str]:
     for piece in (text, text.partition("=")[0], text.rpartition("/")[2]):
       plain = "".join(c if c.isprintable() else " " for c in piece).split()
       found += [word[:12] for word in plain[:1]]
-  return found or ["empty", "blank", "''"]
+  return found or ["empty", "blank", "''", "unrecognized"]
 
 
 def file_case(name: str, base: Base, rng: np.random.Generator) -> Case:

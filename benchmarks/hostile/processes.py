@@ -80,11 +80,12 @@ def _wait(
   seconds = time.monotonic() - begin
   if status is not None:
     return status, seconds, False, 0.0
-  os.kill(pid, signal.SIGINT)
-  while (status := ended()) is None and time.monotonic() < begin + seconds + GRACE_S:
-    time.sleep(0.01)
-  if status is not None:
-    return status, seconds, True, time.monotonic() - begin - seconds
+  for wait_s in (GRACE_S, 2 * GRACE_S):  # a second Ctrl-C does not wait for what is under way
+    os.kill(pid, signal.SIGINT)
+    while (status := ended()) is None and time.monotonic() < begin + seconds + wait_s:
+      time.sleep(0.01)
+    if status is not None:
+      return status, seconds, True, time.monotonic() - begin - seconds
   os.killpg(pid, signal.SIGKILL)
   while (status := ended()) is None:
     time.sleep(0.01)
@@ -98,9 +99,12 @@ def _limited(limits: dict[str, int]) -> None:
 
 
 def started(words: list[str], folder: pathlib.Path, limits: dict[str, int] | None = None,
-            program: tuple[str, ...] = ("-m", "mjx_cl")) -> subprocess.Popen:  # fmt: skip
-  """A process of its own, its output in files of the folder above."""
-  with open(folder.with_suffix(".out"), "wb") as out, open(folder.with_suffix(".err"), "wb") as err:
+            program: tuple[str, ...] = ("-m", "mjx_cl"), output: str | None = None) -> subprocess.Popen:  # fmt: skip
+  """A process of its own, its output in files of the folder above, standard output in `output` where
+  that is given.
+  """
+  folder.with_suffix(".out").touch()
+  with open(output or folder.with_suffix(".out"), "wb") as out, open(folder.with_suffix(".err"), "wb") as err:
     return subprocess.Popen([sys.executable, *program, *map(os.fsencode, words)], cwd=folder, stdin=subprocess.DEVNULL,
                             stdout=out, stderr=err, env=room.environment(folder), start_new_session=True,
                             preexec_fn=lambda: _limited(limits or {}))  # fmt: skip
@@ -117,9 +121,9 @@ def said(folder: pathlib.Path) -> tuple[str, str]:
 
 
 def alone(words: list[str], folder: pathlib.Path, limit_s: float, limits: dict[str, int] | None = None,
-          program: tuple[str, ...] = ("-m", "mjx_cl")) -> Done:  # fmt: skip
+          program: tuple[str, ...] = ("-m", "mjx_cl"), output: str | None = None) -> Done:  # fmt: skip
   """Runs a process of its own to its end, or the limit."""
-  process = started(words, folder, limits, program)
+  process = started(words, folder, limits, program, output)
   how = _wait(process.poll, process.pid, limit_s)
   return Done(how[0], *said(folder), *how[1:])
 
@@ -130,11 +134,16 @@ def _begun(*_: object, **__: object) -> None:
   os._exit(BEGUN)
 
 
-def _command(words: list[str]) -> int:
-  """What `mjx-cl WORDS` does, in a fork."""
+def until_work(words: list[str]) -> int:
+  """What `mjx-cl WORDS` does, in a fork, until its work begins."""
   for module, names in WORK.items():
     for name in names:
       setattr(sys.modules[module], name, _begun)
+  return command(words)
+
+
+def command(words: list[str]) -> int:
+  """What `mjx-cl WORDS` does, in a fork."""
   from mjx_cl.cli import app
 
   # as a shell hands them over: what is no UTF-8 is a surrogate, no NUL
@@ -143,7 +152,7 @@ def _command(words: list[str]) -> int:
 
 
 def forked(words: list[str], folder: pathlib.Path, limit_s: float, limits: dict[str, int] | None = None,
-           work: Callable[[list[str]], int] = _command) -> Done:  # fmt: skip
+           work: Callable[[list[str]], int] = until_work) -> Done:  # fmt: skip
   """Runs a command in a fork of this process."""
   sys.stdout.flush()
   pid = os.fork()

@@ -169,6 +169,7 @@ def make(folder: pathlib.Path) -> None:
   (folder / "results").mkdir()
   for name in ("arl0.json",):
     shutil.copy(CHECKOUT / "results" / name, folder / "results" / name)
+  command(["report", "--results", "results", "--page", "page.md"], folder)
   for name, to in (
     ("loop", "loop"), ("dangling", "nowhere"), ("linked_run", "run"), ("linked_agent", "agent"),
     ("linked.csv", "log.csv"),

@@ -227,11 +227,18 @@ def check_filled(command: Any) -> None:
 
 @contextlib.contextmanager
 def ours() -> Iterator[None]:
-  """Whoever wants to end the program but the user is named, and so is the place."""
+  """What a plug-in raises, and whoever wants to end the program but the user, is named, and so is
+  the place.
+  """
   try:
     yield
-  except Exception:
+  except UserError:
     raise
+  except Exception as e:
+    where = None if plugins.of_user(e) else plugins.place(e)
+    if where is None:
+      raise
+    raise PluginError(f"{where}: {plugins.line(e)}") from None
   except BaseException as e:
     if plugins.of_user(e):
       raise
