@@ -65,7 +65,7 @@ def written(
   A refusal changes nothing that was there; new files lie below `tops`, whatever the status.
   """
   for path, digest in before.items():
-    if after.get(path) != digest and not (status in (0, BEGUN) and below(path, tops)):
+    if after.get(path) != digest and not (status in (0, BEGUN, 130) and below(path, tops)):
       return f"{path} was {'changed' if path in after else 'removed'}"
   for path in after:
     begun = status == BEGUN and ".tmp" in path  # the fork ended before it could rename it

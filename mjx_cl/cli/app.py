@@ -221,7 +221,8 @@ def check_filled(command: Any) -> None:
   """Refuses an empty text, as of a shell's variable that is not set, where a flag was given."""
   for field in dataclasses.fields(command):
     value = getattr(command, field.name)
-    if field.default != "" and (value == "" or (isinstance(value, tuple) and "" in value)):
+    texts = [x for x in (value if isinstance(value, tuple) else (value,)) if isinstance(x, str)]
+    if field.default != "" and not all(text.strip() for text in texts):
       raise UserError(f"--{field.name.replace('_', '-')} got an empty name or text")
 
 

@@ -66,7 +66,7 @@ class Registry(collections.UserDict):
             f"{self.kind} {entry.name!r} of {entry.value} is there already; a plug-in must "
             "have a name of its own"
           )
-        note(entry.module)
+        note(entry.value.partition(":")[0])
         try:
           found[entry.name] = entry.load()
         except BaseException as e:  # whatever a foreign module raises
