@@ -169,8 +169,10 @@ def run(names: Iterable[str], seed: int, out: pathlib.Path, minutes: float | Non
     if minutes is not None and time.monotonic() - begin > 60 * minutes:
       break
     found = case(name, seed, out)
-    with (out / "results.jsonl").open("a") as file:
-      file.write(line(name, found))
+    with (out / "results.jsonl").open("ab+") as file:
+      file.seek(max(0, file.tell() - 1))
+      whole = file.read(1) in (b"", b"\n")  # else the last line was cut off
+      file.write(b"\n" * (not whole) + line(name, found).encode())
       file.flush()
       os.fsync(file.fileno())
     if found.verdict.how == "failed":

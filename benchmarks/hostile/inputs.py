@@ -174,6 +174,7 @@ def flag_case(name: str, base: Base, rng: np.random.Generator) -> Case:
       [f"--{flag}={given[0]}"] if rng.random() < 0.3 and len(given) == 1 else [f"--{flag}", *given]
     )
   if flag in FOLDERS and given:
+    tops = (*tops, *(to for link, to in room.LINKS.items() if given[0].rstrip("/") == link))
     tops = (*tops, given[0].strip("/"), str(pathlib.Path(given[0])) if "\0" not in given[0] else "")
   if base.words[0] == "render" and flag in ("out", "env") and given:
     tops = (*tops, given[0], f"{given[0]}.gif", *(f"{given[0].rpartition(':')[2]}.gif",))

@@ -98,6 +98,13 @@ fault = "noise"
 severity = [0.9]
 """
 PAGE = "# Page\n\n<!-- report:arl0 -->\nold\n<!-- /report -->\n\nkept\n"
+LINKS = {
+  "loop": "loop",
+  "dangling": "nowhere",
+  "linked_run": "run",
+  "linked_agent": "agent",
+  "linked.csv": "log.csv",
+}
 RUN = ["run", "walker", "--agent", "agent", "--steps", "192", "--onset", "128", "--seeds", "1", "--arm", "none",
        "--detector", "page_hinkley", "--set", "threshold=2", "warmup=40", "--adapt.warmup", "64",
        "--adapt.start-windows", "32"]  # fmt: skip
@@ -170,10 +177,7 @@ def make(folder: pathlib.Path) -> None:
   for name in ("arl0.json",):
     shutil.copy(CHECKOUT / "results" / name, folder / "results" / name)
   command(["report", "--results", "results", "--page", "page.md"], folder)
-  for name, to in (
-    ("loop", "loop"), ("dangling", "nowhere"), ("linked_run", "run"), ("linked_agent", "agent"),
-    ("linked.csv", "log.csv"),
-  ):  # fmt: skip
+  for name, to in LINKS.items():
     (folder / name).symlink_to(to)
   shutil.rmtree(folder / "tmp")
   (folder / "tmp").mkdir()

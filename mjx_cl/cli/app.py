@@ -98,6 +98,11 @@ def parse(argv: list[str] | None) -> Any:
   if argv == ["--version"]:
     print(f"mjx-cl {__version__}")
     raise SystemExit(0)
+  for word in argv:
+    try:
+      word.encode()
+    except UnicodeEncodeError:  # result files say how they were made, as UTF-8
+      raise UserError(f"an argument is no UTF-8 text: {word}") from None
   about = "Robots that notice a fault, adapt to it and know when they are done."
   command = read(Command, argv, prog="mjx-cl", args=argv or ["--help"], description=about)
   return quickly(command, argv[1:]) if isinstance(command, Run) and command.quick else command

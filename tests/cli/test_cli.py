@@ -359,6 +359,15 @@ def test_a_line_holds_no_control_character_and_no_more_than_500(refused):
       assert text.rstrip("\n").isprintable() and len(text) <= 500, text
 
 
+@pytest.mark.parametrize(
+  "argv", [("detect", "x", "--nominal", "y", "--out"), ("run", "walker", "--out"), ("plot",)]
+)
+def test_a_name_that_is_no_utf_8_is_refused(refused, tmp_path, monkeypatch, argv):
+  monkeypatch.chdir(tmp_path)
+  text = refused(2, *argv, "caf\udce9")
+  assert "UTF-8" in text and "caf\\udce9" in text and not list(tmp_path.iterdir())
+
+
 def test_report_elsewhere_than_in_a_checkout_is_one_line(refused, tmp_path, monkeypatch):
   monkeypatch.setattr(results, "__file__", str(tmp_path / "mjx_cl" / "cli" / "results.py"))
   assert "checkout" in refused(2, "report", "--check")
