@@ -18,7 +18,7 @@ import sys
 
 from benchmarks.hostile import campaign, processes, room
 
-CUT = {"input": 60, "kill": 5, "poor": 6, "foreign": 8}  # cases of a kind with --cut
+CUT = {"input": 60, "kill": 2, "poor": 6, "foreign": 8}  # cases of a kind with --cut
 CUT_MINUTES = 5.0
 
 

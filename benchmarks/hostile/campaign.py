@@ -47,6 +47,7 @@ def bad_input(seed: int, number: int, home: pathlib.Path, folder: pathlib.Path) 
   case = inputs.draw(seed, number)
   room.copy(home, folder)
   names = (*case.names, *case.spoil(folder))
+  names = () if inputs.ANY in names else names
   apart = np.random.default_rng((seed, number, 1)).random() < APART
   before = judge.contents(folder)
   done = (processes.alone(case.words, folder, APART_S) if apart
@@ -69,7 +70,14 @@ def killed(seed: int, number: int, home: pathlib.Path, folder: pathlib.Path) -> 
   wrong, status, places = kills.kill(target, names.split(), rng, home, folder)
   verdict = judge.Verdict("failed" if wrong else "held", wrong)
   about = f"{target}: {names} at {places}"
-  return Found(f"{target} {names}", about, kills.TARGETS[target].words, verdict, status, round(time.monotonic() - begin, 1))
+  return Found(
+    f"{target} {names}",
+    about,
+    kills.TARGETS[target].words,
+    verdict,
+    status,
+    round(time.monotonic() - begin, 1),
+  )
 
 
 def poor(seed: int, number: int, home: pathlib.Path, folder: pathlib.Path) -> Found:
@@ -96,10 +104,14 @@ def strange(seed: int, number: int, home: pathlib.Path, folder: pathlib.Path) ->
   words = foreign.write(place, field, deed, folder)
   before = judge.contents(folder)
   done = processes.forked(words, folder, STRANGE_S, work=processes.command)
-  verdict = judge.judge(done, ("hostile", "Own"), before, judge.contents(folder), ("out", "__pycache__"))
+  verdict = judge.judge(
+    done, ("hostile", "Own"), before, judge.contents(folder), ("out", "__pycache__")
+  )
   if verdict.how == "valid" and done.interrupted:  # it hung, and Ctrl-C ended it
     verdict = verdict._replace(how="held")
-  return Found(place, f"{place}, {field}: {deed}", words, verdict, done.status, round(done.seconds, 2))
+  return Found(
+    place, f"{place}, {field}: {deed}", words, verdict, done.status, round(done.seconds, 2)
+  )
 
 
 # kind -> (what does a case, how many there are)

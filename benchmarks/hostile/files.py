@@ -19,6 +19,8 @@ FOREIGN = (b"", b"\x00" * 64, b"\x89PNG\r\n\x1a\n" + b"\x07" * 40, b"PK\x03\x04b
            b"\xff\xfe\x00a", b"\x1f\x8b\x08\x00broken", b"null", b"[]", b"{}", b"[" * 4000, b'{"a":' * 4000, b"a = " + b"[" * 3000,
            b"<html>", b"\xef\xbb\xbf{}", b"\n\n\n", b"a" * 100_000, b"\x80\x04\x95\x10\x00")  # fmt: skip
 
+TURNED = "bytes turned over"
+
 
 def cut(path: pathlib.Path, rng: np.random.Generator) -> str:
   data = path.read_bytes()
@@ -31,7 +33,7 @@ def flip(path: pathlib.Path, rng: np.random.Generator) -> str:
   at = rng.integers(len(data), size=rng.integers(1, 9))
   data[at] ^= rng.integers(1, 256, len(at)).astype(np.uint8)
   path.write_bytes(data.tobytes())
-  return "bytes turned over"
+  return TURNED
 
 
 def foreign(path: pathlib.Path, rng: np.random.Generator) -> str:

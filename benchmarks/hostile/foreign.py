@@ -104,7 +104,18 @@ class Place(NamedTuple):
   places: tuple[str, ...] = ("imported", "made", "called")
 
 
-DETECT = ["detect", "log.csv", "--nominal", "nominal.csv", "--arl0", "200", "--out", "out", "--detector", "hostile.py:Own"]
+DETECT = [
+  "detect",
+  "log.csv",
+  "--nominal",
+  "nominal.csv",
+  "--arl0",
+  "200",
+  "--out",
+  "out",
+  "--detector",
+  "hostile.py:Own",
+]
 PLACES = {
   "host detector, detect": Place(HOST, DETECT),
   "host detector, leaderboard": Place(HOST, ["leaderboard", "set", "--detector", "none", "--add", "hostile.py:Own",

@@ -11,8 +11,10 @@ from typing import NamedTuple
 from benchmarks.hostile.processes import BEGUN, Done
 
 MOST = 500  # characters of an error's line
-# what XLA says of a program from another machine's cache is not of this package
-NOT_OURS = re.compile(r"cpu_aot|^WARNING: All log messages before absl::InitializeLog")
+# what XLA notes of programs from its cache is not of this package
+NOT_OURS = re.compile(
+  r"cpu_aot|^[WI]\d{4} .*\.cc:|^WARNING: All log messages before absl::InitializeLog"
+)
 NOISE = re.compile(
   r"Traceback|Warning\b|Exception\b|^\s+File \"|^[EF]\d{4} |Fatal Python|core dumped|Exception ignored"
 )

@@ -6,6 +6,7 @@ A fork ends with status BEGUN where the input was taken and the long work would 
 
 from __future__ import annotations
 
+import ctypes
 import importlib
 import os
 import pathlib
@@ -93,6 +94,9 @@ def _wait(
 
 
 def _limited(limits: dict[str, int]) -> None:
+  """Within a new process: its limits; it ends with the campaign."""
+  if sys.platform == "linux":
+    ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG, prctl(2)
   for name, value in limits.items():
     hard = resource.getrlimit(LIMITS[name])[1]
     resource.setrlimit(LIMITS[name], (value, hard))
@@ -104,19 +108,22 @@ def started(words: list[str], folder: pathlib.Path, limits: dict[str, int] | Non
   that is given.
   """
   folder.with_suffix(".out").touch()
-  with open(output or folder.with_suffix(".out"), "wb") as out, open(folder.with_suffix(".err"), "wb") as err:
+  with (
+    open(output or folder.with_suffix(".out"), "wb") as out,
+    open(folder.with_suffix(".err"), "wb") as err,
+  ):
     return subprocess.Popen([sys.executable, *program, *map(os.fsencode, words)], cwd=folder, stdin=subprocess.DEVNULL,
                             stdout=out, stderr=err, env=room.environment(folder), start_new_session=True,
                             preexec_fn=lambda: _limited(limits or {}))  # fmt: skip
 
 
 def said(folder: pathlib.Path) -> tuple[str, str]:
-  """Standard output and error of the last process of a folder; removes them."""
+  """Standard output and error of the last process of a folder, which keeps them in its tmp."""
   texts = []
   for suffix in (".out", ".err"):
     file = folder.with_suffix(suffix)
     texts.append(file.read_bytes()[:2_000_000].decode(errors="backslashreplace"))
-    file.unlink()
+    file.replace(folder / "tmp" / f"said{suffix}") if (folder / "tmp").is_dir() else file.unlink()
   return texts[0], texts[1]
 
 
@@ -151,43 +158,86 @@ def command(words: list[str]) -> int:
   return app.main()
 
 
-def forked(words: list[str], folder: pathlib.Path, limit_s: float, limits: dict[str, int] | None = None,
-           work: Callable[[list[str]], int] = until_work) -> Done:  # fmt: skip
-  """Runs a command in a fork of this process."""
-  sys.stdout.flush()
-  pid = os.fork()
-  if not pid:
-    status = 1
-    try:
-      os.setsid()
-      for number, suffix in ((1, ".out"), (2, ".err")):
-        os.dup2(
-          os.open(folder.with_suffix(suffix), os.O_CREAT | os.O_TRUNC | os.O_WRONLY, 0o600), number
-        )
-      os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
-      os.chdir(folder)
-      os.environ.clear()
-      os.environ.update(ENVIRONMENT | room.environment(folder))
-      signal.signal(signal.SIGINT, signal.default_int_handler)
-      _limited(limits or {})
-      sys.stdout = open(1, "w", encoding="utf-8", closefd=False)
-      sys.stderr = open(2, "w", encoding="utf-8", errors="backslashreplace", closefd=False)
+class Fork:
+  """A command in a fork of this process, as subprocess.Popen has it.
+
+  Attributes:
+    pid: of the process, and of its group.
+    returncode: None until it has ended; negative: the signal that ended it.
+  """
+
+  def __init__(
+    self,
+    words: list[str],
+    folder: pathlib.Path,
+    limits: dict[str, int] | None = None,
+    work: Callable[[list[str]], int] = until_work,
+  ) -> None:
+    sys.stdout.flush()
+    self.returncode: int | None = None
+    self.pid = os.fork()
+    if not self.pid:
+      status = 1
       try:
-        status = work(words)
-      except SystemExit as e:
-        status = e.code if isinstance(e.code, int) else 1
-      except BaseException:
-        sys.excepthook(*sys.exc_info())  # type: ignore[arg-type]
-      sys.stdout.flush()
-      sys.stderr.flush()
-    finally:
-      os._exit(status)
+        status = _within(words, folder, limits or {}, work)
+      finally:
+        os._exit(status)
 
-  def ended() -> int | None:
-    got, how = os.waitpid(pid, os.WNOHANG)
-    return os.waitstatus_to_exitcode(how) if got else None
+  def poll(self) -> int | None:
+    """The exit status, None until it has ended."""
+    if self.returncode is None:
+      got, how = os.waitpid(self.pid, os.WNOHANG)
+      self.returncode = os.waitstatus_to_exitcode(how) if got else None
+    return self.returncode
 
-  how = _wait(ended, pid, limit_s)
+  def wait(self, timeout: float = 1e9) -> int:
+    """The exit status; subprocess.TimeoutExpired where that takes longer."""
+    end = time.monotonic() + timeout
+    while (status := self.poll()) is None:
+      if time.monotonic() > end:
+        raise subprocess.TimeoutExpired("a fork", timeout)
+      time.sleep(0.005)
+    return status
+
+
+def _within(
+  words: list[str], folder: pathlib.Path, limits: dict[str, int], work: Callable[[list[str]], int]
+) -> int:
+  """A fork's life: output in files, an environment of its own."""
+  os.setsid()
+  for number, suffix in ((1, ".out"), (2, ".err")):
+    file = os.open(folder.with_suffix(suffix), os.O_CREAT | os.O_TRUNC | os.O_WRONLY, 0o600)
+    os.dup2(file, number)
+  os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+  os.chdir(folder)
+  os.environ.clear()
+  os.environ.update(ENVIRONMENT | room.environment(folder))
+  signal.signal(signal.SIGINT, signal.default_int_handler)
+  _limited(limits)
+  sys.stdout = open(1, "w", encoding="utf-8", closefd=False)
+  sys.stderr = open(2, "w", encoding="utf-8", errors="backslashreplace", closefd=False)
+  status = 1
+  try:
+    status = work(words)
+  except SystemExit as e:
+    status = e.code if isinstance(e.code, int) else 1
+  except BaseException:
+    sys.excepthook(*sys.exc_info())  # type: ignore[arg-type]
+  sys.stdout.flush()
+  sys.stderr.flush()
+  return status
+
+
+def forked(
+  words: list[str],
+  folder: pathlib.Path,
+  limit_s: float,
+  limits: dict[str, int] | None = None,
+  work: Callable[[list[str]], int] = until_work,
+) -> Done:
+  """Runs a command in a fork of this process to its end, or the limit."""
+  process = Fork(words, folder, limits, work)
+  how = _wait(process.poll, process.pid, limit_s)
   return Done(how[0], *said(folder), *how[1:])
 
 

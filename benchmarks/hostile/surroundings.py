@@ -67,7 +67,9 @@ def disk(kind: str, folder: pathlib.Path, rng: np.random.Generator) -> Iterator[
     yield True
     return
   size = int(2 ** rng.uniform(17, 21))
-  if subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size + 400_000}", "tmpfs", out], capture_output=True).returncode:
+  if subprocess.run(
+    ["mount", "-t", "tmpfs", "-o", f"size={size + 400_000}", "tmpfs", out], capture_output=True
+  ).returncode:
     yield False
     return
   try:

@@ -10,7 +10,16 @@ import numpy as np
 import pytest
 
 from benchmarks.hostile import __main__ as program
-from benchmarks.hostile import campaign, files, foreign, inputs, judge, kills, processes, surroundings
+from benchmarks.hostile import (
+  campaign,
+  files,
+  foreign,
+  inputs,
+  judge,
+  kills,
+  processes,
+  surroundings,
+)
 from mjx_cl.cli.app import COMMANDS
 
 
@@ -27,7 +36,9 @@ def test_a_case_follows_from_seed_and_number():
   for number in range(300):
     one, two = inputs.draw(5, number), inputs.draw(5, number)
     assert one[:-1] == two[:-1]
-  assert [inputs.draw(5, n).words for n in range(20)] != [inputs.draw(6, n).words for n in range(20)]
+  assert [inputs.draw(5, n).words for n in range(20)] != [
+    inputs.draw(6, n).words for n in range(20)
+  ]
   for draw in (surroundings.draw, foreign.draw):
     assert [draw(1, n)[:2] for n in range(50)] == [draw(1, n)[:2] for n in range(50)]
 
@@ -37,7 +48,9 @@ def test_every_command_is_tried_and_every_kind():
   groups = {inputs.draw(0, n).group for n in range(400)}
   assert {"flag", "words", "file.json", "file.toml", "file.npz", "file.parquet"} <= groups
   assert len({foreign.draw(0, n) for n in range(len(foreign.EVERY))}) == len(foreign.EVERY)
-  targets = {(n % len(kills.TARGETS), n // len(kills.TARGETS) % len(kills.SIGNALS)) for n in range(200)}
+  targets = {
+    (n % len(kills.TARGETS), n // len(kills.TARGETS) % len(kills.SIGNALS)) for n in range(200)
+  }
   assert len(targets) == len(kills.TARGETS) * len(kills.SIGNALS)
 
 
@@ -91,11 +104,18 @@ def test_what_hangs_fails_and_what_ctrl_c_ends_does_not():
 def test_signals_end_a_command_with_130_and_one_line():
   assert kills.ended_well("KILL", -9, "") == ""
   assert kills.ended_well("INT", 130, "step 1\nmjx-cl: interrupted; what was saved\n") == ""
-  for status, err in ((-15, ""), (130, ""), (130, "Traceback\nmjx-cl: interrupted\n"), (1, "mjx-cl: interrupted\n")):
+  for status, err in (
+    (-15, ""),
+    (130, ""),
+    (130, "Traceback\nmjx-cl: interrupted\n"),
+    (1, "mjx-cl: interrupted\n"),
+  ):
     assert kills.ended_well("TERM", status, err)
 
 
-@pytest.mark.parametrize("how", [files.cut, files.flip, files.foreign, files.kind, files.json_field])
+@pytest.mark.parametrize(
+  "how", [files.cut, files.flip, files.foreign, files.kind, files.json_field]
+)
 def test_a_spoilt_file_is_another_each_time(tmp_path, how):
   said = []
   for seed in range(8):
