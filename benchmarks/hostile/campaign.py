@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import collections
-import functools
 import json
 import os
 import pathlib
@@ -123,6 +122,11 @@ KINDS: dict[str, tuple[Callable[[int, int, pathlib.Path, pathlib.Path], Found], 
 }
 
 
+def tell_now(text: str) -> None:
+  """Prints a line at once."""
+  print(text, flush=True)
+
+
 def line(name: str, found: Found) -> str:
   """A case as a line of JSON."""
   value = found._asdict() | found.verdict._asdict() | {"case": name}
@@ -169,7 +173,7 @@ def read(out: pathlib.Path) -> dict[str, dict]:
 
 
 def run(names: Iterable[str], seed: int, out: pathlib.Path, minutes: float | None,
-        again: bool = False, tell: Callable[[str], object] = functools.partial(print, flush=True)) -> None:  # fmt: skip
+        again: bool = False, tell: Callable[[str], object] = tell_now) -> None:  # fmt: skip
   """Does those of the cases that are not finished, until the time is over; with `again` those that
   failed, once more.
   """

@@ -96,7 +96,7 @@ def spoken(done: Done, names: tuple[str, ...]) -> str:
     return f"a line of {len(line)} characters"
   if not line.isprintable():
     return f"a line with {[c for c in line if not c.isprintable()][0]!r} in it"
-  plain = line.lower().replace("-", "_")
+  plain = line.lower().replace("-", "_").replace("\\\\", "\\")
   if names and not any(x.lower().replace("-", "_") in plain for x in names if x):
     return "the line names nothing that was given"
   return ""
@@ -111,6 +111,8 @@ def judge(done: Done, names: tuple[str, ...], before: dict[str, str], after: dic
   if done.interrupted:
     if done.late is None:
       return Verdict("failed", "hangs: not ended by Ctrl-C", last)
+    if done.status == BEGUN:  # in the same moment
+      return Verdict("valid", "", last)
     if done.status != 130 or (wrong := spoken(done, ())):
       return Verdict("failed", f"Ctrl-C: status {done.status}, {wrong}", last)
     return Verdict("valid", "", last)
@@ -123,5 +125,7 @@ def judge(done: Done, names: tuple[str, ...], before: dict[str, str], after: dic
     )
   if done.status not in (1, 2):
     return Verdict("failed", f"status {done.status}", last)
+  if not done.err and done.out.startswith("usage: mjx-cl"):  # without a command: the help
+    return Verdict("held", "", "the help")
   wrong = spoken(done, names)
   return Verdict("failed" if wrong else "held", wrong, last)

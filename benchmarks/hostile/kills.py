@@ -24,6 +24,7 @@ LIMIT_S = 900.0  # of a command that is not disturbed
 APART = (
   0.25  # share of the kills of a process of its own; the others are forks that have imported all
 )
+IMPORT_S = 3.0  # processor time of what a process imports and a fork has
 ADAPT = ["--adapt.warmup", "64", "--adapt.start-windows", "32", "--adapt.ratio", "4", "--adapt.patience", "4",
          "--adapt.least", "64", "--adapt.refit", "64"]  # fmt: skip
 
@@ -71,18 +72,18 @@ def spent(pid: int) -> float:
     return 0.0
 
 
-def whole(target: str, home: pathlib.Path, folder: pathlib.Path) -> tuple[float, float, dict]:
-  """(processor time of a fork, of a process, digests) of an undisturbed run; made once, after one
+def whole(target: str, home: pathlib.Path, folder: pathlib.Path) -> tuple[float, dict]:
+  """(processor time of a fork, digests) of an undisturbed run; made once, after one
   that compiles.
   """
   known = home.parent / "undisturbed" / f"{target}.json"
   if not known.exists():
     known.parent.mkdir(exist_ok=True)
     times, digests = [], []
-    for start in (_fork, _fork, _process):
+    for _ in range(2):
       shutil.rmtree(folder, ignore_errors=True)
       room.copy(home, folder)
-      process, most = start(TARGETS[target].words, folder), 0.0
+      process, most = _fork(TARGETS[target].words, folder), 0.0
       while process.poll() is None:
         most = max(most, spent(process.pid))
         time.sleep(0.05)
@@ -91,13 +92,13 @@ def whole(target: str, home: pathlib.Path, folder: pathlib.Path) -> tuple[float,
         raise OSError(f"{target} undisturbed: status {process.returncode}, {err[-500:]}")
       times.append(most)
       digests.append(reference.of_folder(folder / "out"))
-    if differing := reference.differences(digests[1], digests[2]):
+    if differing := reference.differences(*digests):
       raise OSError(f"{target} undisturbed differs from itself: {differing[:3]}")
-    known.write_text(json.dumps({"seconds": times[1:], "digests": digests[1]}))
+    known.write_text(json.dumps({"seconds": times[1], "digests": digests[1]}))
     shutil.rmtree(folder)
     room.copy(home, folder)
   value = json.loads(known.read_text())
-  return (*value["seconds"], value["digests"])
+  return value["seconds"], value["digests"]
 
 
 def _fork(words: list[str], folder: pathlib.Path) -> processes.Fork:
@@ -159,10 +160,10 @@ def cut(
 def kill(target: str, names: list[str], rng: np.random.Generator, home: pathlib.Path, folder: pathlib.Path
          ) -> tuple[str, int, str]:  # fmt: skip
   """Kills once or twice and lets the command end: (what is wrong, status, where it was cut off)."""
-  seconds, of_process, digests = whole(target, home, folder)
+  seconds, digests = whole(target, home, folder)
   start = _fork
   if rng.random() < APART:
-    start, seconds = _process, of_process
+    start, seconds = _process, seconds + IMPORT_S
   one = TARGETS[target]
   words, places = list(one.words), []
   twice_killed = names == ["KILL", "KILL"]  # the second falls upon what goes on
@@ -174,11 +175,10 @@ def kill(target: str, names: list[str], rng: np.random.Generator, home: pathlib.
     places.append(f"{at:.2f} of {seconds:.2f} s" if working else "not at all, it had ended")
     if late == float("inf"):
       return "does not end within a minute", process.returncode, "; ".join(places)
-    if (
-      working and process.returncode and (wrong := ended_well(signals[-1], process.returncode, err))
-    ):
-      if process.returncode not in (-15, -2) or at > 1.0:  # Python had hardly begun
-        return wrong, process.returncode, "; ".join(places)
+    code = process.returncode
+    early = start is _process and code in (-15, -2) and at < 1.0  # Python had hardly begun
+    if working and code and not early and (wrong := ended_well(signals[-1], code, err)):
+      return wrong, code, "; ".join(places)
     words = [*one.words, *one.again]
   done = processes.forked(words, folder, LIMIT_S, work=program)
   if done.status:

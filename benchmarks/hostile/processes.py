@@ -214,8 +214,8 @@ def _within(
   os.environ.update(ENVIRONMENT | room.environment(folder))
   signal.signal(signal.SIGINT, signal.default_int_handler)
   _limited(limits)
-  sys.stdout = open(1, "w", encoding="utf-8", closefd=False)
-  sys.stderr = open(2, "w", encoding="utf-8", errors="backslashreplace", closefd=False)
+  sys.stdout = open(1, "w", encoding="utf-8", closefd=False)  # noqa: SIM115
+  sys.stderr = open(2, "w", encoding="utf-8", errors="backslashreplace", closefd=False)  # noqa: SIM115
   status = 1
   try:
     status = work(words)

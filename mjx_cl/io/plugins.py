@@ -112,7 +112,7 @@ def note(module: str) -> None:
 
 
 def place(e: BaseException) -> str | None:
-  """Where in a plug-in an exception was raised, or passed: "FILE, line N"; None where no plug-in had
+  """Where in a plug-in an exception was raised or passed, "FILE, line N"; None where no plug-in had
   a part in it.
   """
   found = None

@@ -469,6 +469,10 @@ OTHER = {
     ["run", "walker", "--adapt.patience", "999999999"],
     ["patience", "100,000"],
   ),
+  "seeds without end": (
+    ["run", "walker", "--seeds", "9223372036854775808"],
+    ["seeds at most", "9223372036854775808"],
+  ),
   "adapt: too large a batch": (["run", "walker", "--adapt.batch", "1000000"], ["batch", "4,096"]),
   "adapt: more than 31 bits": (
     ["run", "walker", "--adapt.budget", "99999999999"],
