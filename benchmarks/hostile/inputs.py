@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import pathlib
+import re
 import typing
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -199,7 +200,12 @@ def shown(given: list[str]) -> list[str]:
   """Pieces of given texts by which an error may name them."""
   found = []
   for text in given:
-    for piece in (text, text.partition("=")[0], text.rpartition("/")[2]):
+    for piece in (
+      re.sub(r"\x1b\[[0-9;]*m", "", text),
+      text,
+      text.partition("=")[0],
+      text.rpartition("/")[2],
+    ):
       plain = "".join(c if c.isprintable() else " " for c in piece).split()
       found += [word[:12] for word in plain[:1]] or [ascii(piece)[1:-1][:8]]
   return found or ["empty", "blank", "''", "unrecognized"]

@@ -579,6 +579,9 @@ def test_settings_without_a_detector_are_refused(refused, small, tmp_path):  # n
   assert "--threshold belongs to a detector of one's own; give --add" in refused(
     2, "leaderboard", folder, "--threshold", "x"
   )
+  assert "--channel belongs to a detector of one's own; give --add" in refused(
+    2, "leaderboard", folder, "--channel", "nope"
+  )
   assert "--log belongs to a detector of one's own; give --add" in refused(
     2, "leaderboard", folder, "--log"
   )
