@@ -50,7 +50,7 @@ import jax.numpy as jnp
 from mjx_cl.detectors.base import Alarm, Detector, scalar
 {imported}
 @scalar
-def Own(threshold=3.0):
+def Own(threshold=3.0, warmup=0):
   {made}
   def init():
     {begun}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import pathlib
 import re
 import typing
@@ -177,7 +178,7 @@ def flag_case(name: str, base: Base, rng: np.random.Generator) -> Case:
     )
   if flag in FOLDERS and given:
     tops = (*tops, *(to for link, to in room.LINKS.items() if given[0].rstrip("/") == link))
-    tops = (*tops, given[0].strip("/"), str(pathlib.Path(given[0])) if "\0" not in given[0] else "")
+    tops = (*tops, given[0].strip("/"), os.path.normpath(given[0]) if "\0" not in given[0] else "")
   if base.words[0] == "render" and flag in ("out", "env") and given:
     tops = (*tops, given[0], f"{given[0]}.gif", *(f"{given[0].rpartition(':')[2]}.gif",))
   names = (
