@@ -208,7 +208,11 @@ def shown(given: list[str]) -> list[str]:
       text.rpartition("/")[2],
     ):
       plain = "".join(c if c.isprintable() else " " for c in piece).split()
-      found += [word[:12] for word in plain[:1]] or [ascii(piece)[1:-1][:8], "unrecognized"]
+      found += [word[:12] for word in plain[:1]] or [
+        ascii(piece)[1:-1][:8],
+        "unrecognized",
+        "empty",
+      ]
   return found or ["empty", "blank", "''", "unrecognized"]
 
 
