@@ -189,8 +189,9 @@ def _attempt(do: Callable[[], object], again: Callable[[], str]) -> int:
     return 0
   except KeyboardInterrupt:
     say(f"mjx-cl: interrupted{again()}")
-    # a second Ctrl-C finds an interpreter that is clearing up
-    atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)
+    # a second signal finds an interpreter that is clearing up
+    for number in (signal.SIGINT, signal.SIGTERM):
+      atexit.register(signal.signal, number, signal.SIG_IGN)
     return 130
   except BrokenPipeError:
     return (
