@@ -42,7 +42,7 @@ from mjx_cl.cli.flags import (
   Run,
   Train,
 )
-from mjx_cl.cli.output import apart, say
+from mjx_cl.cli.output import apart, printable, say
 from mjx_cl.config import FaultConfig, quick
 from mjx_cl.errors import FileError, PluginError, UserError
 from mjx_cl.io import folders, interrupt, limits, plugins
@@ -98,6 +98,11 @@ def parse(argv: list[str] | None) -> Any:
   if argv == ["--version"]:
     print(f"mjx-cl {__version__}")
     raise SystemExit(0)
+  for word in argv:
+    try:
+      word.encode()
+    except UnicodeEncodeError:  # result files say how they were made, as UTF-8
+      raise UserError(f"an argument is no UTF-8 text: {word}") from None
   about = "Robots that notice a fault, adapt to it and know when they are done."
   command = read(Command, argv, prog="mjx-cl", args=argv or ["--help"], description=about)
   return quickly(command, argv[1:]) if isinstance(command, Run) and command.quick else command
@@ -166,10 +171,16 @@ def attempt(do: Callable[[], object], again: Callable[[], str] = lambda: "") -> 
       signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-def shortened(text: str, most: int = 1000) -> str:
-  """A text whose middle is left out where it is longer than `most`."""
-  end = most // 4
-  return text if len(text) <= most else f"{text[: most - end - 5]} ... {text[-end:]}"
+def shortened(text: str, most: int = 480, word: int = 160) -> str:
+  """A text as it is printed: the middle is left out of words longer than `word`, then of the whole
+  where it is longer than `most`.
+  """
+
+  def cut(part: str, most: int) -> str:
+    end = most // 4
+    return part if len(part) <= most else f"{part[: most - end - 5]} ... {part[-end:]}"
+
+  return cut(" ".join(cut(part, word) for part in printable(text).split(" ")), most)
 
 
 def _attempt(do: Callable[[], object], again: Callable[[], str]) -> int:
@@ -178,8 +189,9 @@ def _attempt(do: Callable[[], object], again: Callable[[], str]) -> int:
     return 0
   except KeyboardInterrupt:
     say(f"mjx-cl: interrupted{again()}")
-    # a second Ctrl-C finds an interpreter that is clearing up
-    atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)
+    # a second signal finds an interpreter that is clearing up
+    for number in (signal.SIGINT, signal.SIGTERM):
+      atexit.register(signal.signal, number, signal.SIG_IGN)
     return 130
   except BrokenPipeError:
     return (
@@ -207,7 +219,7 @@ def _known(error: Exception) -> tuple[str, int] | None:
     return shortened(text), error.exit_code
   if isinstance(error, OSError):
     where = f": {error.filename}" if error.filename else ""
-    return f"{error.strerror or error}{where}", FileError.exit_code
+    return shortened(f"{error.strerror or error}{where}"), FileError.exit_code
   return None
 
 
@@ -215,17 +227,25 @@ def check_filled(command: Any) -> None:
   """Refuses an empty text, as of a shell's variable that is not set, where a flag was given."""
   for field in dataclasses.fields(command):
     value = getattr(command, field.name)
-    if field.default != "" and (value == "" or (isinstance(value, tuple) and "" in value)):
+    texts = [x for x in (value if isinstance(value, tuple) else (value,)) if isinstance(x, str)]
+    if field.default != "" and not all(text.strip() for text in texts):
       raise UserError(f"--{field.name.replace('_', '-')} got an empty name or text")
 
 
 @contextlib.contextmanager
 def ours() -> Iterator[None]:
-  """Whoever wants to end the program but the user is named, and so is the place."""
+  """What a plug-in raises, and whoever wants to end the program but the user, is named, and so is
+  the place.
+  """
   try:
     yield
-  except Exception:
+  except UserError:
     raise
+  except Exception as e:
+    where = None if plugins.of_user(e) else plugins.place(e)
+    if where is None:
+      raise
+    raise PluginError(f"{where}: {plugins.line(e)}") from None
   except BaseException as e:
     if plugins.of_user(e):
       raise

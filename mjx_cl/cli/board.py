@@ -126,6 +126,7 @@ def check_own(args: Leaderboard) -> None:
     ("--set", args.set, args.add),
     ("--threshold", args.threshold, args.add),
     ("--log", args.log, args.add),
+    ("--channel", args.channel != Leaderboard.channel, args.add),
     ("--name", args.name, args.add or args.submit),
   ):
     more = " or --submit" if flag == "--name" else ""

@@ -7,9 +7,14 @@ from collections.abc import Iterator
 from typing import Any, TextIO
 
 
+def printable(text: str) -> str:
+  """A text in which what a terminal would obey, and what is no character, stands escaped."""
+  return "".join(c if c.isprintable() or c == "\n" else ascii(c)[1:-1] for c in text)
+
+
 def say(text: str) -> None:
   """One line on standard error."""
-  print(text, file=sys.stderr, flush=True)
+  print(printable(text), file=sys.stderr, flush=True)
 
 
 def clock(seconds: float) -> str:

@@ -90,6 +90,7 @@ def check_seeds(first: int, count: int = 1, name: str = "seed") -> None:
   """Raises unless `count` seeds from `first` on are whole numbers from 0 to 2,147,483,647, as files
   hold them.
   """
+  require(count <= 2**31, f"there are 2,147,483,648 seeds at most; got {count}")
   require(0 <= first <= 2**31 - count, f"{name} must lie in 0..{2**31 - count:,}; got {first}")
 
 

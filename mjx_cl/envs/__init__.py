@@ -5,6 +5,9 @@
 import inspect
 from typing import Any
 
+import jax
+import jax.numpy as jnp
+
 from mjx_cl.envs.car import Car
 from mjx_cl.envs.car_real import CarReal
 from mjx_cl.envs.quadruped import Quadruped
@@ -12,7 +15,7 @@ from mjx_cl.envs.walker import Walker
 from mjx_cl.errors import PluginError, UserError, choose
 from mjx_cl.io.plugins import Registry, line, of_user
 from mjx_cl.physics import PURE_JAX
-from mjx_cl.types import Spec
+from mjx_cl.types import Spec, Step
 
 ENVS = Registry(
   "mjx_cl.envs",
@@ -53,6 +56,7 @@ def make(name: str, physics: str = "auto") -> Any:
         f"environment {name!r} gives {type(robot).__name__}, which has no "
         f"{' and no '.join(lacking or ['mjx_cl.types.Spec'])}"
       )
+    _try(name, robot)
     return robot
   except UserError:
     raise
@@ -60,3 +64,24 @@ def make(name: str, physics: str = "auto") -> Any:
     if of_user(e):
       raise
     raise PluginError(f"environment {name!r} cannot be built: {line(e)}") from e
+
+
+def _try(name: str, robot: Any) -> None:
+  """Traces a step of a robot of another package; PluginError where that gives something else than
+  its spec says.
+  """
+
+  def one() -> tuple[Any, Any]:
+    state, obs = robot.init(robot.model, jax.random.key(0))
+    state, out = robot.step(robot.model, state, jnp.zeros(len(robot.spec.act)))
+    if not isinstance(out, Step):
+      gave = type(out).__name__
+      raise PluginError(f"environment {name!r}: step gives {gave} in place of a Step")
+    return obs, out.obs
+
+  for what, value in zip(("init", "step"), jax.eval_shape(one)):
+    if getattr(value, "shape", None) != (len(robot.spec.obs),):
+      raise PluginError(
+        f"environment {name!r}: {what} gives an observation that is not of its spec's "
+        f"{len(robot.spec.obs)} variables"
+      )

@@ -5,7 +5,7 @@ the severity is above 0. So severity 0 is nominal bit for bit, and a leaf that i
 be touched, whatever the fault's author wrote.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -14,7 +14,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Bool, Float, Int, PRNGKeyArray
 
-from mjx_cl.errors import UserError
+from mjx_cl.errors import PluginError, UserError
 from mjx_cl.faults import schedule
 from mjx_cl.keys import OfFaults
 from mjx_cl.types import Array, Model
@@ -172,17 +172,40 @@ def fault(
   def apply(
     state: State, severity: Severity, key: PRNGKeyArray, ports: Ports
   ) -> tuple[State, Ports]:
-    kept, values = act(state.row, state.memory, severity, key, ports)
-    if set(values) != set(owns):
-      raise ValueError(
-        f"fault {name!r} owns {', '.join(owns)} but gave {', '.join(sorted(values))}"
-      )
+    kept, values = _answer(name, owns, act(state.row, state.memory, severity, key, ports))
     for leaf, value in values.items():
       old = read(ports, leaf)
-      ports = write(ports, leaf, jnp.where(severity > 0, value.astype(old.dtype), old))
+      ports = write(ports, leaf, jnp.where(severity > 0, _fitting(name, leaf, value, old), old))
     return state._replace(memory=kept), ports
 
   return Fault(name, tuple(owns), targets, count, init, apply, "obs" in owns, not_monotone)
+
+
+def _answer(name: str, owns: tuple[str, ...], answer: Any) -> tuple[Any, dict[str, Any]]:
+  """What `act` gave; PluginError where that is not (memory', {owned leaf: new value})."""
+  pair = isinstance(answer, tuple) and len(answer) == 2 and isinstance(answer[1], Mapping)
+  if not pair:
+    raise PluginError(
+      f"fault {name!r} gives {type(answer).__name__} in place of (memory, {{leaf: value}})"
+    )
+  kept, values = answer
+  if set(values) != set(owns):
+    raise PluginError(
+      f"fault {name!r} owns {', '.join(owns)} but gave {', '.join(sorted(map(str, values)))}"
+    )
+  return kept, dict(values)
+
+
+def _fitting(name: str, leaf: str, value: Any, old: Array) -> Array:
+  """A leaf's new value in its type and shape; PluginError where it has none such."""
+  try:
+    return jnp.broadcast_to(jnp.asarray(value).astype(old.dtype), old.shape)
+  except (TypeError, ValueError):
+    shape = getattr(value, "shape", None)
+    gave = f"{type(value).__name__}" + (f" of shape {shape}" if shape is not None else "")
+    raise PluginError(
+      f"fault {name!r} gives {gave} for {leaf}, which has shape {old.shape}"
+    ) from None
 
 
 def _check_leaves(name: str, env: Any, owns: tuple[str, ...]) -> None:

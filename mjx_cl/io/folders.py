@@ -109,7 +109,9 @@ def alone(out: str | os.PathLike) -> Iterator[None]:
   folder = pathlib.Path(tempfile.gettempdir(), name)
   try:
     folder.mkdir(mode=0o700, exist_ok=True)
-    fd = os.open(folder / hashlib.sha256(path.encode()).hexdigest(), os.O_RDWR | os.O_CREAT, 0o600)
+    fd = os.open(
+      folder / hashlib.sha256(os.fsencode(path)).hexdigest(), os.O_RDWR | os.O_CREAT, 0o600
+    )
   except OSError:  # a full disk, another user's folder of that name
     yield
     return

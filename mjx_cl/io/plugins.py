@@ -11,6 +11,7 @@ import importlib.util
 import os
 import pathlib
 import sys
+import traceback
 import types
 from collections.abc import Callable
 from typing import Any
@@ -65,6 +66,7 @@ class Registry(collections.UserDict):
             f"{self.kind} {entry.name!r} of {entry.value} is there already; a plug-in must "
             "have a name of its own"
           )
+        note(entry.value.partition(":")[0])
         try:
           found[entry.name] = entry.load()
         except BaseException as e:  # whatever a foreign module raises
@@ -100,6 +102,27 @@ def line(e: BaseException, lines: int | None = None) -> str:
   return f"{type(e).__name__}: {said or 'without a message'}"
 
 
+_FILE = "mjx_cl_file_"  # what the names of modules out of a user's file begin with
+_OTHERS: set[str] = set()  # packages that plug-ins were taken from
+
+
+def note(module: str) -> None:
+  """Notes the package of a module that a plug-in was taken from."""
+  _OTHERS.add(module.partition(".")[0])
+
+
+def place(e: BaseException) -> str | None:
+  """Where in a plug-in an exception was raised or passed, "FILE, line N"; None where no plug-in had
+  a part in it.
+  """
+  found = None
+  for frame, number in traceback.walk_tb(e.__traceback__):
+    module = str(frame.f_globals.get("__name__"))
+    if module.startswith(_FILE) or module.partition(".")[0] in _OTHERS - {"mjx_cl"}:
+      found = f"{frame.f_code.co_filename}, line {number}"
+  return found
+
+
 def of_user(e: BaseException) -> bool:
   """Whether an exception is none of a plug-in's making: an interrupt that the user has sent, or the
   end of the memory.
@@ -124,6 +147,7 @@ def find(source: str, kind: str) -> Callable:
     raise UserError(f"{kind} {source!r}: give module:Name or path/to/file.py:Name")
   path = file_of(source)
   if path is None:
+    note(where)
     load = lambda: importlib.import_module(where)
   elif not path.is_file():
     raise FileError(f"{kind} {source}: no file {where}")
@@ -154,7 +178,7 @@ def find(source: str, kind: str) -> Callable:
 def _file(path: pathlib.Path, changed: int) -> types.ModuleType:
   """The module in a file, loaded once for each time that it was written (`changed` [ns])."""
   # under a name of its own: two files of one name must not be taken for each other
-  inner = f"mjx_cl_file_{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:12]}"
+  inner = f"{_FILE}{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:12]}"
   spec: Any = importlib.util.spec_from_file_location(inner, path)
   module = importlib.util.module_from_spec(spec)
   sys.modules[inner] = module  # dataclasses look their module up there

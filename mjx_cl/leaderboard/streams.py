@@ -43,6 +43,9 @@ SCHEMA = {
     for name, what in CHANNELS.items()
   },
 }
+LATENTS = {name: SCHEMA[name] for name in ("stream", "step")} | {
+  name: "float32" for name in PROJECTION
+}
 META = {
   "stream": "int32",
   "robot": "string",
@@ -61,6 +64,24 @@ META = {
   "control_s": "float64, control period",
   "groups": "string, names of the eight parts, comma-separated",
 }
+
+
+def _holds(values: np.ndarray, said: str) -> bool:
+  """Whether a column holds what its line in SCHEMA or META says."""
+  kind, known = said.partition(",")[0], values
+  if "null" in said:
+    known = values[np.array([x is not None and x == x for x in values.tolist()], bool)]
+    if not len(known):
+      return True
+  if kind == "bool":
+    return known.dtype.kind == "b"
+  if kind.startswith("float"):
+    return known.dtype.kind in "fiu"
+  if kind.startswith("int"):
+    low, high = np.iinfo(kind).min, np.iinfo(kind).max
+    numbers = known.dtype.kind in "fiu" and np.isfinite(known).all()
+    return bool(numbers and (known >= low).all() and (known <= high).all())
+  return all(isinstance(x, str) for x in known.tolist())
 
 
 class Streams(NamedTuple):
@@ -92,8 +113,8 @@ class Streams(NamedTuple):
 class Rows:
   """A table whose rows lie stream by stream."""
 
-  def __init__(self, path: pathlib.Path) -> None:
-    self.columns = tables.read_table(path)
+  def __init__(self, columns: dict[str, np.ndarray]) -> None:
+    self.columns = columns
     numbers = np.unique(self.columns["stream"], return_index=True, return_counts=True)
     self.at = {n: slice(first, first + count) for n, first, count in zip(*numbers)}
 
@@ -144,9 +165,22 @@ class StreamSet:
     self._demand("streams.parquet", self.meta, META)
     self._held: dict[str, tuple[Rows, Rows]] = {}
 
+  def _rows(self, file: str, schema: dict[str, str]) -> Rows:
+    columns = tables.read_table(self.folder / file)
+    self._demand(file, columns, schema)
+    if min(columns["step"], default=0) < 0:
+      raise FileError(f"{self.folder / file}: a step below 0")
+    return Rows(columns)
+
   def _demand(self, file: str, table: dict[str, np.ndarray], schema: dict[str, str]) -> None:
+    path = self.folder / file
     if set(table) != set(schema):
-      raise FileError(f"{self.folder / file} is not of this schema: it has {', '.join(table)}")
+      raise FileError(f"{path} is not of this schema: it has {', '.join(table)}")
+    for name, said in schema.items():
+      if not _holds(table[name], said):
+        raise FileError(f"{path} is not of this schema: column {name} holds something else")
+    if schema is META and not len(table["stream"]):
+      raise FileError(f"{path} has no rows")
 
   @property
   def robots(self) -> list[str]:
@@ -203,9 +237,10 @@ class StreamSet:
     """Rows and latents of a robot."""
     if robot not in self._held:
       self._held.clear()  # one robot at a time: a set may be larger than the memory
-      rows = Rows(self.folder / f"{robot}.parquet")
-      self._demand(f"{robot}.parquet", rows.columns, SCHEMA)
-      self._held[robot] = rows, Rows(self.folder / f"{robot}_latents.parquet")
+      self._held[robot] = (
+        self._rows(f"{robot}.parquet", SCHEMA),
+        self._rows(f"{robot}_latents.parquet", LATENTS),
+      )
     return self._held[robot]
 
   def _fill(
@@ -240,6 +275,8 @@ class StreamSet:
         f"no such stream of robot {robot!r}; robots of this set: {', '.join(self.robots)}"
       )
     m = {k: v[at] for k, v in self.meta.items()}
+    if min(m["steps"]) < 1:
+      raise FileError(f"{self.folder / 'streams.parquet'}: steps must be above 0")
     shape = int(max(m["steps"])), len(at)
     known: dict[str, Any] = {c: np.full(shape, np.nan, np.float32) for c in COLUMNS}
     known |= {"episode": np.zeros(shape, np.int16), "terminated": np.zeros(shape, bool)}

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from mjx_cl import envs, faults
-from mjx_cl.errors import UserError
+from mjx_cl.errors import PluginError, UserError
 from mjx_cl.faults import FAULTS, schedule
 from mjx_cl.rollout.scan import Rollout, start
 
@@ -290,6 +290,27 @@ def test_a_fault_without_anything_to_act_on_is_refused(short_walker):
   assert set(faults.available(short_walker)) == set(ON_WALKER)
 
 
+@pytest.mark.parametrize(
+  "gave, said",
+  [
+    (None, "gives NoneType in place of"),
+    ((1, 2, 3), "gives tuple in place of"),
+    (((), "ctrl"), "gives tuple in place of"),
+    (((), {"ctrl": None}), "gives NoneType for ctrl"),
+    (((), {"ctrl": "text"}), "gives str for ctrl"),
+    (
+      ((), {"ctrl": np.zeros(3)}),
+      r"gives ndarray of shape \(3,\) for ctrl, which has shape \(6,\)",
+    ),
+  ],
+)
+def test_a_map_that_answers_wrongly_is_one_line(short_walker, gave, said):
+  bad = faults.fault("bad", short_walker, ("ctrl",), ("all",), lambda *_: gave)
+  ports = faults.Ports(short_walker.model, jnp.zeros(6), None, jnp.bool_(True), jnp.int32(0))
+  with pytest.raises(PluginError, match=f"'bad' {said}"):
+    bad.apply(bad.init(jax.random.key(0)), jnp.float32(1), jax.random.key(0), ports)
+
+
 def test_what_a_map_returns_beside_its_own_leaves_is_refused(short_walker):
   """Whatever a third party's fault returns, leaves it does not own cannot be reached."""
   bad = faults.fault(
@@ -299,7 +320,7 @@ def test_what_a_map_returns_beside_its_own_leaves_is_refused(short_walker):
     ("all",),
     lambda target, m, s, key, ports: (m, {"mj.body_mass": ports.model.mj["body_mass"] * 2}),
   )
-  with pytest.raises(ValueError, match="owns ctrl but gave mj.body_mass"):
+  with pytest.raises(PluginError, match="owns ctrl but gave mj.body_mass"):
     bad.apply(
       bad.init(jax.random.key(0)),
       jnp.float32(1),

@@ -19,6 +19,7 @@ import pytest
 from mjx_cl import detectors, envs, faults
 from mjx_cl.cli import app
 from mjx_cl.errors import PluginError, UserError
+from mjx_cl.io import plugins
 from mjx_cl.io.plugins import Registry
 from mjx_cl.rollout.monitor import unknown
 
@@ -715,3 +716,33 @@ def test_foreign_code_ends_no_command_but_in_a_line(tmp_path, capfd, command, na
   assert status == (2 if name == "number" else 1) and len(lines) == 1, lines
   assert "hostile.py" in lines[0] and words in lines[0]
   assert not list(out.rglob("summary.json")) and not list(out.rglob("leaderboard.json"))
+
+
+@pytest.mark.parametrize(
+  "step, said",
+  [
+    ("return None", "cannot be built: TypeError: cannot unpack"),
+    ("return state, 7", "step gives int in place of a Step"),
+    ("raise SystemExit(3)", "cannot be built: SystemExit: 3"),
+    ("return state, Step(obs[:1], obs[0], obs[0] > 0, obs[0] > 0, obs[:1])", "spec's 2 variables"),
+  ],
+)
+def test_a_robot_that_answers_wrongly_is_one_line(tmp_path, step, said):
+  head = "import jax, jax.numpy as jnp\nfrom mjx_cl.types import EnvState, Model, Spec, Step, Var\n"
+  robot = re.sub(r"reward, late = .*", step, REACH)
+  (tmp_path / "mine.py").write_text(head + robot)
+  with pytest.raises(PluginError, match=said) as e:
+    envs.make(f"{tmp_path / 'mine.py'}:Reach")
+  assert "\n" not in str(e.value)
+
+
+def test_what_a_users_file_raises_later_names_file_and_line(tmp_path):
+  file = tmp_path / "mine.py"
+  file.write_text("def late():\n  return [].pop()\n\n\ndef deep():\n  return deep()\n")
+  late, deep = (plugins.find(f"{file}:{name}", "fault") for name in ("late", "deep"))
+  with pytest.raises(PluginError, match=r"mine.py, line 2: IndexError: pop from empty"), app.ours():
+    late()
+  with pytest.raises(PluginError, match=r"mine.py, line 6: RecursionError"), app.ours():
+    deep()
+  with pytest.raises(IndexError), app.ours():  # of this package: a bug
+    [].pop()

@@ -246,6 +246,27 @@ def test_a_broken_set_gets_one_line(tmp_path):
   tables.write_table(tmp_path / "streams.parquet", meta | {"seed": swapped})
   with pytest.raises(FileError, match="walker, gear 0.5: its streams must be those of the seeds"):
     streams.load(streams.StreamSet(tmp_path), "walker")
+  tables.write_table(tmp_path / "streams.parquet", meta)
+  rows = tables.read_arrow(tmp_path / "walker.parquet")
+  for name, values in (
+    ("group_0", ["a"] * len(rows)),
+    ("step", [-1] * len(rows)),
+    ("step", [None] * len(rows)),
+    ("terminated", [0.5] * len(rows)),
+  ):
+    at = rows.column_names.index(name)
+    tables.write_arrow(tmp_path / "walker.parquet", rows.set_column(at, name, [values]))
+    with pytest.raises(FileError, match=f"walker.parquet.*{name}"):
+      streams.load(streams.StreamSet(tmp_path), "walker")
+  for name, values in (("full", [[1, 2]]), ("steps", [2**62]), ("robot", [7]), ("stream", [None])):
+    changed = meta | {name: values * len(meta["stream"])}
+    tables.write_table(tmp_path / "streams.parquet", changed)
+    with pytest.raises(FileError, match=f"streams.parquet.*{name}"):
+      streams.StreamSet(tmp_path)
+  tables.write_table(tmp_path / "streams.parquet", {k: v[:0] for k, v in meta.items()})
+  with pytest.raises(FileError, match="no rows|not of this schema"):
+    streams.StreamSet(tmp_path)
+  tables.write_table(tmp_path / "streams.parquet", meta)
   tables.write_table(tmp_path / "walker.parquet", {"stream": np.arange(3)})
   with pytest.raises(FileError, match="is not of this schema"):
     streams.load(streams.StreamSet(tmp_path), "walker")
@@ -558,6 +579,9 @@ def test_settings_without_a_detector_are_refused(refused, small, tmp_path):  # n
   folder = small[2]
   assert "--threshold belongs to a detector of one's own; give --add" in refused(
     2, "leaderboard", folder, "--threshold", "x"
+  )
+  assert "--channel belongs to a detector of one's own; give --add" in refused(
+    2, "leaderboard", folder, "--channel", "nope"
   )
   assert "--log belongs to a detector of one's own; give --add" in refused(
     2, "leaderboard", folder, "--log"
