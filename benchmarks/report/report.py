@@ -321,7 +321,7 @@ def leaderboard(results: pathlib.Path) -> str:
   alarms = statistics.mode(r["arl0_alarms"] for r in rows if not r["reference"])
   (low, high), minutes = meta["seeds"]["score"], meta["wall_s"] / 60
   asked = {r["robot"]: 3600 / r["control_s"] / meta["arl0_target"] for r in rows}
-  silent = mute(rows)
+  silent, fitted = mute(rows), meta.get("fitted", {})
   text = fill(f"""
       `mjx-cl leaderboard`: {len(overall)} detectors on the same recordings of frozen agents: {joined(robots)}, {faults} fault settings (fault x severity),
       {high - low + 1} scoring seeds each. Thresholds are set to ARL0 = {number(meta["arl0_target"])} control steps on other seeds' healthy streams, that is
@@ -345,7 +345,7 @@ def leaderboard(results: pathlib.Path) -> str:
   whole = lambda x: f"{percent(x)}%"
   shown = [
     (
-      r["detector"] + " §" * (r["detector"] in silent),
+      r["detector"] + " §" * (r["detector"] in silent) + " ¶" * (r["detector"] in fitted),
       f"{number(r['cost_standard'])} {span((r['cost_standard_low'], r['cost_standard_high']))}",
       whole(r["detected_within_1s"]),
       whole(r["detected_within_5s"]),
@@ -366,6 +366,8 @@ def leaderboard(results: pathlib.Path) -> str:
   marked = {name: own for name, own in silent.items() if kind(name) == "shown"}
   if marked:
     rest = " " + never_note(marked) + rest
+  for name, on in fitted.items():
+    rest = f" ¶ {name}: fitted beforehand on {on}." + rest
   board = grid(
     (
       "detector",

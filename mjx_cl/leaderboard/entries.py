@@ -68,6 +68,14 @@ def entry(name: str, settings: dict) -> Entry:
   return Entry(name, build, calibrated, bool(getattr(factory, "reference", False)), own)
 
 
+def fitted(names: Collection[str]) -> dict[str, str]:
+  """{name on the board: what it was fitted on beforehand}, of those that were."""
+  known = variants()
+  uses = {name: known[name]["use"] for name in names if name in known}
+  told = {name: getattr(detectors_lib.factory(use), "fitted", None) for name, use in uses.items()}
+  return {name: words for name, words in told.items() if words}
+
+
 def chosen(names: Collection[str], robot: str) -> list[Entry]:
   """Entries of these names on the board, in its order, all where there is none; behind them those
   that `detectors.make` takes beside: name@channel, path/to/file.py:factory, module:factory. The

@@ -23,7 +23,7 @@ from mjx_cl.leaderboard import calibration, page, sweep
 from mjx_cl.leaderboard import oracle as oracles
 from mjx_cl.leaderboard import program as programs
 from mjx_cl.leaderboard.calibration import Found
-from mjx_cl.leaderboard.entries import Entry, one_line
+from mjx_cl.leaderboard.entries import Entry, fitted, one_line
 from mjx_cl.leaderboard.entries import chosen as chosen
 from mjx_cl.leaderboard.entries import variants as variants
 from mjx_cl.leaderboard.streams import Data, StreamSet, joined, load
@@ -328,6 +328,10 @@ def write(board: Board, out: pathlib.Path | str, meta: dict) -> list[str]:
   _, *overall = board.overall
   meta = meta | {"references": sorted({r["detector"] for r in board.rows if r["reference"]})}
   meta |= dict(zip(comparison.Overall._fields[1:], overall))
+  beforehand = fitted({r["detector"] for r in board.rows})
+  if beforehand:
+    words = [f"{name} was fitted beforehand on {on}." for name, on in beforehand.items()]
+    meta |= {"fitted": beforehand, "notes": words}
   paths = [out / f"leaderboard{end}" for end in (".parquet", "_overall.parquet", ".html", ".json")]
   for path, rows in zip(paths, (board.rows, board.overall.rows)):
     flat = [_flat(r) for r in rows]

@@ -9,6 +9,7 @@ from benchmarks import fit_learnt
 from mjx_cl import detectors, envs
 from mjx_cl.detectors import learnt
 from mjx_cl.errors import UserError
+from mjx_cl.leaderboard import entries
 from mjx_cl.leaderboard.streams import StreamSet
 
 
@@ -99,6 +100,11 @@ def test_every_robot_that_ships_with_an_agent_has_a_fit():
 def test_other_looks_are_refused():
   with pytest.raises(UserError, match="looks is both, distance or ratio"):
     detectors.make("learnt", looks="up")
+
+
+def test_a_board_says_what_it_was_fitted_on():
+  said = entries.fitted(["cusum", "cusum@opr", "never", "learnt", "mine"])
+  assert list(said) == ["learnt"] and "tuning faults" in said["learnt"]
 
 
 # ---- the fit -------------------------------------------------------------------------------------
