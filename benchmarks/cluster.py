@@ -3,9 +3,8 @@ by turns, programs cached: wall and processor seconds of the processes that run 
 
   python benchmarks/cluster.py [--steps 3000] [--turns 2]
 
-A part of a cluster is a process of its own; of `--jobs`, a process runs part after part and shares
-programs and what healthy robots live. So parts that are short show the most of the difference. The
-processor seconds say more than the wall's beside other work.
+Both ways a process runs part after part; the start of each is in what is measured. The processor
+seconds say more than the wall's beside other work.
 """
 
 from __future__ import annotations
