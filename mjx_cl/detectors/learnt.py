@@ -141,4 +141,4 @@ def learnt(threshold: Setting = 1.0, looks: str = "both", robot: str | None = No
 
 
 # what a board says beside its name
-learnt.fitted = "healthy streams and tuning faults, seeds 100 to 109"  # type: ignore[attr-defined]
+learnt.fitted = "healthy streams and tuning faults of the seeds that tune"  # type: ignore[attr-defined]
