@@ -108,6 +108,8 @@ def learnt(threshold: Setting = 1.0, looks: str = "both", robot: str | None = No
   knows of no fault; the ratio is sharper on faults that resemble those it has seen. A unit is a
   score that healthy robots pass once in 20,000 control steps.
 
+  The distance is two-sided; the ratio has the direction of the faults that it was fitted on.
+
   Args:
     threshold: decision level [units].
     looks: `distance`, `ratio` or `both`.
