@@ -159,7 +159,7 @@ def found(score: np.ndarray, threshold: float, streams: Streams, horizon_s: floa
 
 
 def left_out(fit: learnt.Fit, healthy: Set, faulty: Set, horizon_s: float) -> dict[str, list]:
-  """{tuning fault: [score of the distance, of the ratio, of both] by fits that have not seen it}."""
+  """{tuning fault: scores of the distance, the ratio and both, by fits that have not seen it}."""
   names, out = np.array(faulty.of.fault), {}
   for name in dict.fromkeys(names):
     own = weighed(fit, healthy, faulty, names != name)

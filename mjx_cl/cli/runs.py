@@ -34,7 +34,6 @@ def do_run(args: Run) -> None:
 
 def do_bench(args: Bench) -> None:
   """Runs, plans, merges or publishes a suite."""
-  require(not args.gpu or args.on == "ray", "--gpu is of a cluster; give --on ray")
   require(args.jobs is None or args.on == "here", "--jobs is of this machine; leave out --on ray")
   on = cluster.of(args.on, args.address, args.gpu)
   plan, parts = asked(args)

@@ -24,7 +24,6 @@ DRIVERS = ("out", "seed", "seeds", "on", "address", "gpu", "json", "resume", "ov
 
 def asked(args: Train) -> cluster.Cluster | None:
   """The cluster that is asked for, None where agents are trained here."""
-  require(not args.gpu or args.on == "ray", "--gpu is of a cluster; give --on ray")
   on = cluster.of(args.on, args.address, args.gpu)
   require(
     on is None or not args.overwrite,

@@ -29,6 +29,7 @@ CHANNELS = split("learnt", "opr+rpr+reward+surprise+groups")
 RATES = (1 / 8, 1 / 32, 1 / 128)
 MOST_Z, MOST_U = 6.0, 8.0  # deviations beyond which a sample, an average counts as so many
 LOOKS = ("distance", "ratio")
+ON = "healthy streams and tuning faults of the seeds that tune"
 
 Averages = Float[Array, "rates channels"]
 
@@ -143,4 +144,4 @@ def learnt(threshold: Setting = 1.0, looks: str = "both", robot: str | None = No
 
 
 # what a board says beside its name
-learnt.fitted = "healthy streams and tuning faults of the seeds that tune"  # type: ignore[attr-defined]
+learnt.fitted = ON  # type: ignore[attr-defined]

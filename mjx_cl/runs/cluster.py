@@ -46,7 +46,8 @@ class Cluster(NamedTuple):
 
 
 def of(on: str, address: str | None, gpu: bool = False) -> Cluster | None:
-  """The cluster that --on and --address mean, None where parts run here."""
+  """The cluster that --on, --address and --gpu mean, None where parts run here."""
+  require(not gpu or on == "ray", "--gpu is of a cluster; give --on ray")
   require(address is None or on == "ray", "--address is of a cluster; give --on ray")
   return Cluster(address, gpu) if on == "ray" else None
 

@@ -280,7 +280,7 @@ def test_an_interrupt_leaves_nothing_running_and_the_same_command_goes_on(plan, 
 
   with pytest.raises(KeyboardInterrupt):
     together(machines, two, tell)
-  assert not processes(two) and list(two.glob("grip/*/work/checkpoints/*"))
+  assert not processes(two) and list(two.rglob("checkpoints/*"))
   assert sorted(together(machines, two)) == PARTS and same(whole, two)
 
 
