@@ -18,7 +18,7 @@ from benchmarks.hostile import foreign, inputs, judge, kills, processes, room, s
 
 APART = 0.05  # share of the cases of bad input that run in a process of their own
 FORK_S, APART_S = 20.0, 40.0  # that a case of bad input may take until Ctrl-C
-LIVE_S, STRANGE_S = 120.0, 40.0  # that one of poor surroundings, and of foreign code, may take
+LIVE_S, STRANGE_S = 120.0, 20.0  # that one of poor surroundings, and of foreign code, may take
 
 
 class Found(NamedTuple):

@@ -16,7 +16,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import IO, NamedTuple
 
 from benchmarks.hostile import room
 
@@ -131,6 +131,8 @@ def alone(words: list[str], folder: pathlib.Path, limit_s: float, limits: dict[s
   """Runs a process of its own to its end, or the limit."""
   process = started(words, folder, limits, program, output)
   how = _wait(process.poll, process.pid, limit_s)
+  for pipe in PIPES.pop(process.pid, []):
+    pipe.wait()
   return Done(how[0], *said(folder), *how[1:])
 
 
