@@ -105,15 +105,33 @@ def started(words: list[str], folder: pathlib.Path, limits: dict[str, int] | Non
             program: tuple[str, ...] = ("-m", "mjx_cl"), output: str | None = None) -> subprocess.Popen:  # fmt: skip
   """A process of its own, its output in files of the folder above, standard output in `output` where
   that is given.
+
+  Under a limit on the size of files both are pipes into processes without it, since the limit would
+  cut off what is said.
   """
   folder.with_suffix(".out").touch()
   with (
     open(output or folder.with_suffix(".out"), "wb") as out,
     open(folder.with_suffix(".err"), "wb") as err,
   ):
-    return subprocess.Popen([sys.executable, *program, *map(os.fsencode, words)], cwd=folder, stdin=subprocess.DEVNULL,
-                            stdout=out, stderr=err, env=room.environment(folder), start_new_session=True,
-                            preexec_fn=lambda: _limited(limits or {}))  # fmt: skip
+    pipes = [_pipe(file) for file in (out, err)] if "FSIZE" in (limits or {}) else []
+    ends: list = [pipe.stdin for pipe in pipes] or [out, err]
+    process = subprocess.Popen([sys.executable, *program, *map(os.fsencode, words)], cwd=folder,
+                               stdin=subprocess.DEVNULL, stdout=ends[0], stderr=ends[1],
+                               env=room.environment(folder), start_new_session=True,
+                               preexec_fn=lambda: _limited(limits or {}))  # fmt: skip
+  for end in ends if pipes else ():
+    end.close()
+  PIPES[process.pid] = pipes
+  return process
+
+
+PIPES: dict[int, list[subprocess.Popen]] = {}  # of a process that is not finished yet
+
+
+def _pipe(file: IO[bytes]) -> subprocess.Popen:
+  """A process that writes what it is given into a file."""
+  return subprocess.Popen(["cat"], stdin=subprocess.PIPE, stdout=file, start_new_session=True)
 
 
 def said(folder: pathlib.Path) -> tuple[str, str]:
