@@ -2,6 +2,11 @@
 by turns, programs cached: wall and processor seconds of the processes that run parts.
 
   python benchmarks/cluster.py [--steps 3000] [--turns 2]
+  python benchmarks/cluster.py --plan full [--seeds 40] [--agents 3] [--cores 1 16 256]
+
+With --plan nothing is run: `bench --plan` for one core of this machine, every part once for each
+agent, given to so many cores longest first; whole, or with its seeds in shares of eight, which
+`bench --merge` joins.
 
 Both ways a process runs part after part; the start of each is in what is measured. The processor
 seconds say more than the wall's beside other work.
@@ -10,6 +15,8 @@ seconds say more than the wall's beside other work.
 from __future__ import annotations
 
 import argparse
+import dataclasses
+import heapq
 import json
 import os
 import pathlib
@@ -65,12 +72,54 @@ def timed(run, plan):
     return wall, sum(watch.seen.values())
 
 
+def makespan(seconds: list[float], cores: int) -> float:
+  """Until the last of the parts has ended, the longest begun first on the first core that is free."""
+  free = [0.0] * cores
+  for one in sorted(seconds, reverse=True):
+    heapq.heappush(free, heapq.heappop(free) + one)
+  return max(free)
+
+
+def planned(name: str, seeds: int, agents: int, cores: list[int]) -> None:
+  """Prints a JSON row for each number of cores."""
+  os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+  runtime.setup()
+  from mjx_cl.runs import costs
+  from mjx_cl.runs import suite as suites
+
+  robots, rate = costs.Robots(), costs.matmul_rate()
+  cost = lambda part, n: (
+    costs.estimate(
+      part._replace(config=dataclasses.replace(part.config, seeds=n)), rate, robots
+    ).seconds
+  )
+  parts = suites.suite(name).parts
+  shares = [8] * (seeds // 8) + [seeds % 8] * (seeds % 8 > 0)
+  ways = {
+    "whole": [cost(part, seeds) for part in parts] * agents,
+    "shares": [cost(part, n) for part in parts for n in shares] * agents,
+  }
+  for way, seconds in ways.items():
+    for n in cores:
+      took = makespan(seconds, n)
+      row = {"suite": name, "parts": way, "number": len(seconds), "cores": n}
+      row |= {"hours": took / 3600, "of_ideal": sum(seconds) / n / took}
+      row |= {"longest_h": max(seconds) / 3600, "stops_at": int(sum(seconds) / max(seconds))}
+      print(json.dumps(row | {"gflops": rate / 1e9}), flush=True)
+
+
 def main() -> None:
   """Prints a JSON row for each turn."""
   parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
   parser.add_argument("--steps", type=int, default=3000)
   parser.add_argument("--turns", type=int, default=2)
+  parser.add_argument("--plan", metavar="SUITE")
+  parser.add_argument("--seeds", type=int, default=40)
+  parser.add_argument("--agents", type=int, default=3)
+  parser.add_argument("--cores", type=int, nargs="+", default=[1, 16, 256])
   args = parser.parse_args()
+  if args.plan:
+    return planned(args.plan, args.seeds, args.agents, args.cores)
   os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
   # Ray's is 15: other work on this machine would weigh on its parts alone
   os.environ["RAY_worker_niceness"] = "0"  # noqa: SIM112  Ray spells it so

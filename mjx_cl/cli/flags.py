@@ -283,33 +283,39 @@ class Render(FaultConfig):
 
 @dataclass(frozen=True)
 class Detect:
-  """Watches a CSV log of one's own: thresholds from a nominal log, alarms in another.
+  """Says whether a log has changed against a healthy one, when, and in which columns.
 
-  Read are CSV files, also .csv.gz, with a header row (a row of units may follow) and cells between
-  commas, semicolons (then with a decimal comma too) or tabulators; an empty cell or nan is a
-  missing sample, `time` [s] or `step` tell when samples were taken. Not watched are clocks and
-  counters, columns that are constant in the nominal log, that hold text or that one log lacks; all
-  of it is printed, --column watches even a clock.
+  Read are Parquet files and CSV files, also .csv.gz, with a header row (a row of units may follow)
+  and cells between commas, semicolons (then with a decimal comma too) or tabulators; an empty cell
+  or nan is a missing sample. `time` [s], `step` or time stamps tell when samples were taken. Not
+  watched are clocks and counters, columns that are constant in the nominal log, that hold text or
+  that one log lacks; all of it is printed, --column watches even a clock.
 
-  The nominal log counts as the past of the other: detectors warm up on its first third (1,000
-  samples at most) and are calibrated on the rest. Every column has a detector of its own, the alarm
-  of any counts. Writes detect.json, alarms.csv and detect.png into --out.
+  The nominal log is modelled: each column from the others and from the recent past, drifting ones
+  relative to their slow average. Three charts watch what deviates. --detector runs detectors of the
+  leaderboard instead, which take the nominal log as the past of the other. Writes detect.json,
+  alarms.csv, detect.png and with --inject inject.csv and inject.png into --out.
 
-  Example: mjx-cl detect today.csv --nominal healthy.csv --out runs/detect
+  Example: mjx-cl detect today.csv --nominal healthy.csv --inject 2 --out runs/detect
 
   Attributes:
-    file: Log to judge, .csv or .csv.gz.
-    nominal: Log of the healthy system, same columns; three times --arl0 samples or more.
+    file: Log to judge, .csv, .csv.gz or .parquet.
+    nominal: Log of the healthy system, same columns.
     column: Columns to watch; default: all columns of numbers that both files have, less clocks
       and constant ones.
-    detector: Detectors of one number per sample, one for each column, or of several channels,
-      one for all columns together; default: all; or module:Class, file.py:Class, a Python class
-      with update(x) and a threshold of its own.
+    detector: In place of the charts: detectors of one number per sample, one for each column, or of
+      several channels, one for all columns together; `all`; or module:Class, file.py:Class, a
+      Python class with update(x) and a threshold of its own.
     set: Settings of such a class, name=value ...
-    arl0: Wanted mean number of samples between false alarms of one detector, all columns
+    arl0: Wanted mean number of samples between false alarms of one detector or chart, all columns
       together.
     rate: Samples (or steps of the column `step`) per second; default: from the column `time`,
-      or one of seconds (`time_s`).
+      one of seconds (`time_s`) or time stamps.
+    model: Of the nominal log: ar, or none (the columns themselves).
+    refractory: Alarms of the charts that are closer than this are one event [s], in samples where
+      the log has no clock; default: 10 s, 500 samples.
+    inject: Also put faults into the nominal log: the smallest severity of each that is seen within
+      so many seconds, or samples where the log has no clock.
     logarithm: Watch the logarithm; for residuals, which are positive and skewed. A sample of 0
       or less is refused.
     out: Folder for the results; default: only the table.
@@ -323,6 +329,9 @@ class Detect:
   set: tuple[str, ...] = ()
   arl0: float = 10_000
   rate: float | None = None
+  model: str = "ar"
+  refractory: float | None = None
+  inject: float | None = None
   logarithm: bool = False
   out: str | None = None
   json: bool = False

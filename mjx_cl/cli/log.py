@@ -4,7 +4,7 @@ import sys
 
 from mjx_cl.cli.flags import Detect
 from mjx_cl.cli.output import emit, say
-from mjx_cl.cli.tables import show_detections
+from mjx_cl.cli.tables import show_detections, show_verdict
 from mjx_cl.config import settings
 from mjx_cl.logs import detect, results
 
@@ -22,6 +22,9 @@ def do_detect(args: Detect) -> None:
     args.logarithm,
     settings(args.set),
     say if sys.stderr.isatty() else lambda text: None,
+    args.model,
+    args.refractory,
+    args.inject,
   )
   if out:
     results.write(result, out)
@@ -30,4 +33,7 @@ def do_detect(args: Detect) -> None:
   if args.json:
     emit(result.summary)
   else:
-    show_detections(result.summary["detectors"])
+    if "verdict" in result.summary:
+      show_verdict(result.summary)
+    else:
+      show_detections(result.summary["detectors"])

@@ -163,3 +163,57 @@ def detect_table(rows: list[dict], columns: bool) -> Table:
     "columns",
   )
   return table(names[: 6 + columns], shown, left=("detector", "columns"))
+
+
+def _columns(event: dict) -> str:
+  """Columns of an event, with what happened to them."""
+  how = lambda c: f"mean {c['by']:+.3g}" if c["how"] == "mean" else f"spread x{c['by']:.2f}"
+  return ", ".join(f"{c['column']} ({how(c)})" for c in event["columns"]) or "all a little"
+
+
+def _at(event: dict) -> str:
+  seconds = event["begin_s"]
+  return f"sample {event['begin']:,}" + ("" if seconds is None else f" ({seconds:,.2f} s)")
+
+
+def show_verdict(summary: dict) -> None:
+  """Prints what a detection without named detectors concludes."""
+  verdict = summary["verdict"]
+  believed = [event for event in summary["events"] if event["believed"]]
+  doubted = len(summary["events"]) - len(believed)
+  for k, event in enumerate(believed):
+    print(f"{'changed' if not k else 'and again'} from {_at(event)} on: {_columns(event)}")
+    chance = f"{event['expected']:.1g}" if event["expected"] > 1e-9 else "less than 1e-09"
+    print(
+      f"  {len(event['charts'])} of {verdict['of']} charts agree; events as clear expected in a "
+      f"healthy log of this length: {chance}"
+    )
+  if not believed:
+    print("no change that a healthy log of this length would not show as well")
+  if doubted:
+    print(f"{doubted} more alarm{'s' * (doubted > 1)} of a kind that a healthy log shows as well")
+  alarms = summary["false_alarms"]
+  print(
+    f"false alarms: {alarms['counted']:,} in the nominal log by cross-validation, "
+    f"{alarms['expected']:.3g} are asked for"
+  )
+  if faults := summary.get("inject", {}).get("faults"):
+    _show_faults(faults, summary["inject"]["within"], summary["rate_hz"])
+
+
+def _show_faults(faults: list[dict], within: int, rate: float | None) -> None:
+  """Prints the smallest severities that are seen."""
+  kinds = list(dict.fromkeys(fault["kind"] for fault in faults))
+  rows: dict[str, list[str]] = {}
+  for fault in faults:
+    value = fault["by"] if fault["by"] is not None else fault["severity"]
+    seen = fault["kind"] == "freeze" and value is not None
+    text = "-" if value is None else "yes" if seen else f"{value:.2g}"
+    rows.setdefault(fault["column"], []).append(text)
+  time = f"{within:,} samples" + ("" if rate is None else f" ({within / rate:g} s)")
+  print(f"put into the nominal log, the smallest that is seen within {time}:")
+  console().print(table(("column", *kinds), [(k, *v) for k, v in rows.items()], left=("column",)))
+  print(
+    "bias, drift and noise in the column's unit, scale and dropout as shares, delay in samples; -: "
+    "not seen"
+  )

@@ -18,10 +18,13 @@ import numpy as np
 from mjx_cl.detectors import python_class
 from mjx_cl.errors import FileError, PluginError, UserError, choose
 from mjx_cl.io import plugins
+from mjx_cl.logs import charts, healthy, verdict
+from mjx_cl.logs import inject as injection
 from mjx_cl.logs.columns import choose_columns
 from mjx_cl.logs.programs import LEVELS, Program, joint, table
 from mjx_cl.logs.read import Log, read
-from mjx_cl.logs.results import Detection, watched
+from mjx_cl.logs.results import ALL, Detection, watched
+from mjx_cl.logs.verdict import Times, Watch
 from mjx_cl.scoring import thresholds
 
 EXPECTED = 3  # nominal alarms below which the wanted ARL0 cannot be read off the nominal log
@@ -87,14 +90,20 @@ def detect(
   logarithm: bool = False,
   settings: dict | None = None,
   tell: Callable[[str], None] = lambda text: None,
+  model: str = "ar",
+  refractory: float | None = None,
+  inject: float | None = None,
 ) -> Detection:
   """Calibrates detectors on one CSV file and runs them on another.
+
+  Without `detectors` it is the three charts of `charts` on what deviates from a model of the
+  nominal log, and a verdict on what they say.
 
   Args:
     path: of the log that is judged.
     nominal_path: of the nominal log.
     columns: default: all of numbers that both files have, less clocks and nominal constants.
-    detectors: of `table()`, default all; or host detectors, module:Class or file.py:Class, which
+    detectors: of `table()`, "all" of them; or host detectors, module:Class or file.py:Class, which
       bring a threshold of their own and see samples in the file's own units.
     arl0: wanted mean number of samples between false alarms, all columns of a detector together.
     rate: samples per second, for times; default: from the column `time` or one of seconds,
@@ -102,8 +111,14 @@ def detect(
     logarithm: watch ln max(x, 1e-9), for positive and skewed residuals; x <= 0 is refused.
     settings: of the host detectors.
     tell: is told which detector comes next.
+    model: of the nominal log, see `healthy.fit`; of the charts.
+    refractory: alarms of the charts closer than this are one event [s], in samples where there is
+      no clock; default 10 s or 500 samples.
+    inject: put faults into the nominal log, and say which are seen within so long, as refractory.
   """
-  names = list(dict.fromkeys(detectors)) or list(table())
+  names = list(dict.fromkeys(detectors))
+  names = [*table(), *(n for n in names if n != "all")] if "all" in names else names
+  names = list(dict.fromkeys(names))
   hosts = _hosts(arl0, rate, names, settings)
   log, nominal = read(path), read(nominal_path)
   found, left = choose_columns(log, nominal, columns, path, nominal_path)
@@ -111,15 +126,23 @@ def detect(
     _samples(log, found, path, logarithm),
     _samples(nominal, found, nominal_path, logarithm),
   )
-  now, healthy = _standardised(xs, past, found, nominal_path, logarithm)
+  now, before_it = _standardised(xs, past, found, nominal_path, logarithm)
   warmup = min(1000, len(past) // 3)
-  names = _able(names, len(found), len(past), warmup, bool(detectors))
+  names = _able(names, len(found), len(past), warmup, "all" not in detectors)
   seconds, rate = _clock(log, rate, len(xs))
+  if not names:
+    judged = _judged(xs, past, found, Times(seconds, rate), arl0, model, refractory, inject, tell)
+    notes = [*dict.fromkeys(nominal.notes + log.notes), *left, *judged.summary["notes"]]
+    judged.summary.update(
+      log=str(path), nominal=str(nominal_path), columns=found, logarithm=logarithm, notes=notes,
+      ignored=sorted({*log.ignored, *nominal.ignored}),
+    )  # fmt: skip
+    return judged
   rows, fired, scores, before = [], {}, {}, {}
   for k, name in enumerate(names):
     tell(f"{k + 1}/{len(names)} {name}")
     run = _host(hosts[name], xs, past) if name in hosts else None
-    run = run or _registered(name, now, healthy, warmup, arl0)
+    run = run or _registered(name, now, before_it, warmup, arl0)
     *_, before[name], fired[name], scores[name] = run
     rows.append(_row(run, name, warmup, found, seconds))
   sizes = _sizes(xs, past, warmup)
@@ -137,6 +160,72 @@ def detect(
     "notes": [*dict.fromkeys(nominal.notes + log.notes), *left, *notes],
   }
   return Detection(summary, xs, past, fired, scores, before, seconds)
+
+
+def _judged(
+  xs: np.ndarray,
+  past: np.ndarray,
+  names: list[str],
+  times: Times,
+  arl0: float,
+  model: str,
+  refractory: float | None,
+  inject: float | None,
+  tell: Callable[[str], None],
+) -> Detection:
+  """What the charts say of a log."""
+  for what, value in (("refractory", refractory), ("inject", inject)):
+    if value is not None and not 0 < value <= 1e9:
+      raise UserError(f"{what} must lie in 0..1e9 seconds (or samples); got {value}")
+  choose("model", model, dict.fromkeys(healthy.MODELS))
+  tell("model of the nominal log")
+  own = verdict.calibrated(past, arl0, model)
+  found = verdict.watch(own, xs)
+  default = times.samples(10.0, 500) if times.rate else 500
+  pause = times.samples(refractory, default)
+  scores = charts.scores(own.unseen, own.scales)
+  before = {k: np.any(charts.alarms(x, own.thresholds[k]), 1) for k, x in scores.items()}
+  rows = []
+  for name in charts.CHARTS:
+    run: Run = None, True, before[name], found.fired[name], found.scores[name]
+    row = _row(run, name, 0, names, times.seconds)
+    labels = names if found.scores[name].shape[1] == len(names) else [ALL]
+    rows.append(row | {"thresholds": dict(zip(labels, own.thresholds[name].tolist()))})
+  said = verdict.summary(own, found, names, times, arl0, pause)
+  said |= {"arl0": arl0, "rate_hz": times.rate, "detectors": rows}
+  said |= {**_sizes(xs, past, 0), "notes": _said_of(own, names, xs, len(past), arl0)}
+  if inject is not None:
+    within = times.samples(inject, 1)
+    tell("faults put into the nominal log")
+    found_faults, places = injection.smallest(own, healthy.held(past), names, within)
+    said["inject"] = {"within": within, "places": places, "faults": found_faults}
+    if not places:
+      said["notes"].append(
+        f"no fault could be put into the nominal log: {healthy.FOLDS} stretches of "
+        f"{injection.BEFORE + within} samples without an alarm are needed"
+      )
+  return Detection(said, xs, past, found.fired, found.scores, before, times.seconds)
+
+
+def _said_of(own: Watch, names: list[str], xs: np.ndarray, rows: int, arl0: float) -> list[str]:
+  """What a reader must know of the model, one line each."""
+  notes = []
+  if drifts := [name for name, yes in zip(names, own.model.drifts) if yes]:
+    notes.append(
+      f"{', '.join(drifts)}: drifting while healthy, so only changes quicker than "
+      f"{own.model.slow} samples are seen there"
+    )
+  if blind := int((~healthy.known(xs)).sum()):
+    notes.append(
+      f"{blind:,} of {len(xs):,} samples are not judged: columns are missing there for more than "
+      f"{healthy.HELD} samples"
+    )
+  if rows < arl0 * len(names):
+    notes.append(
+      f"thresholds lie above what {rows:,} nominal samples can show: they follow from the tail of "
+      "their highest scores"
+    )
+  return notes
 
 
 def _sizes(xs: np.ndarray, past: np.ndarray, warmup: int) -> dict[str, int]:
@@ -222,7 +311,9 @@ def _samples(log: Log, names: list[str], path: pathlib.Path | str, logarithm: bo
 def _clock(log: Log, rate: float | None, samples: int) -> tuple[np.ndarray | None, float | None]:
   """Seconds since the first sample, and samples per second."""
   if log.time is not None and rate is None and samples > 1:
-    return log.time - log.time[0], float(1 / np.median(np.diff(log.time)))
+    seconds = log.time - log.time[0]
+    usual = float(np.median(np.diff(seconds))) or float(seconds[-1] / (samples - 1))
+    return seconds, 1 / usual
   at = np.arange(samples, dtype=float) if log.step is None else log.step - log.step[0]
   return (None if rate is None else at / rate), rate
 

@@ -1,4 +1,4 @@
-"""Logs of one's own as CSV files: what is read of them."""
+"""Logs of one's own as CSV and Parquet files: what is read of them."""
 
 import csv
 import gzip
@@ -10,9 +10,20 @@ import zlib
 from typing import Any, NamedTuple
 
 import numpy as np
+import pyarrow
+import pyarrow.parquet
 
 from mjx_cl.errors import FileError
-from mjx_cl.logs.clocks import of_seconds, throughout, told_by_name
+from mjx_cl.logs.clocks import (
+  called_clock,
+  epoch_seconds,
+  irregular,
+  iso_seconds,
+  never_falls,
+  of_seconds,
+  throughout,
+  told_by_name,
+)
 
 
 class Log(NamedTuple):
@@ -39,8 +50,8 @@ class Log(NamedTuple):
 
 
 def read(path: pathlib.Path | str) -> Log:
-  """Reads a CSV file, also one compressed by gzip: a header row, then numbers; an empty cell, `nan`
-  or anything infinite is a missing sample.
+  """Reads a Parquet file, by its ending, or a CSV file, also one compressed by gzip: a header row,
+  then numbers; an empty cell, `nan` or anything infinite is a missing sample.
 
   The separator is the comma, or where the header has none the semicolon or the tabulator; then
   numbers may have a decimal comma, if most that have a fraction do: one sign for the whole file, a
@@ -48,8 +59,11 @@ def read(path: pathlib.Path | str) -> Log:
   for units. A column `time` [s] or `step` tells when samples were taken and is not watched; a
   column of seconds by another name (`time_s`, `seconds`) is taken as `time` if there is none and it
   rises throughout. A first column without a name, among others, is called `index`. A column with a
-  cell that is no number is left out.
+  cell that is no number is left out. Where nothing else tells times, a column of time stamps does:
+  ISO 8601, or seconds, ms, us or ns since 1970; gaps and repeated ones are noted.
   """
+  if str(path).endswith(".parquet"):
+    return _parquet(path)
   text, notes = _text(path)
   head = _first_line(text)
   sign = next((s for s in ",;\t" if s in head), ",")
@@ -82,7 +96,29 @@ def read(path: pathlib.Path | str) -> Log:
     else:
       values = np.array(values, np.float64)
       columns[name] = np.where(np.isfinite(values), values, np.nan)
+  stamps = {}
+  for k, name in enumerate(names):
+    if name in ignored:
+      found = iso_seconds([row[k] for _, row in cells])
+      if found is not None:
+        stamps[name] = found
+        del ignored[name]
+  return _timed(path, columns, ignored, labels, stamps, notes)
+
+
+def _timed(
+  path: pathlib.Path | str,
+  columns: dict[str, np.ndarray],
+  ignored: dict[str, tuple[int, str]],
+  labels: dict[str, str],
+  stamps: dict[str, np.ndarray],
+  notes: list[str],
+) -> Log:
+  """The log of columns of numbers, with what tells its times; `stamps`: seconds of columns that
+  hold time stamps.
+  """
   clocks, told = tuple(name for name in columns if told_by_name(name, labels[name])), {}
+  rows = len(next(iter([*columns.values(), *stamps.values()]), ()))
   for name in clocks:
     told[told_by_name(name, labels[name])] = at = columns.pop(name)
     if len(at) and not throughout(at):
@@ -93,11 +129,54 @@ def read(path: pathlib.Path | str) -> Log:
     else {}
   )
   told |= dict(zip(["time"], filter(throughout, seconds.values())))
-  if seconds and "time" not in told and cells:
+  if seconds and "time" not in told and rows:
     notes.append(
       f"{path}: column {next(iter(seconds))} tells no times, as it does not rise at every row"
     )
+  if "time" not in told:
+    for name in [n for n in columns if called_clock(labels[n])]:
+      found = epoch_seconds(columns[name])
+      if found is not None:
+        stamps[name] = found
+        del columns[name]
+    for name, at in stamps.items():
+      told.setdefault("time", at) if never_falls(at) else notes.append(
+        f"{path}: column {name} tells no times, as it has gaps or falls"
+      )
+  clocks += tuple(stamps)
+  if "time" in told:
+    notes.extend(f"{path}: {text}" for text in irregular(told["time"]))
   return Log(columns, told.get("time"), told.get("step"), ignored, clocks, labels, tuple(notes))
+
+
+def _parquet(path: pathlib.Path | str) -> Log:
+  """Columns of a Parquet file: numbers, booleans and time stamps."""
+  try:
+    table = pyarrow.parquet.read_table(path)
+  except (OSError, pyarrow.ArrowException) as e:
+    raise FileError(f"cannot read {path}: {str(e).splitlines()[0][:200]}") from None
+  columns: dict[str, np.ndarray] = {}
+  ignored: dict[str, tuple[int, str]] = {}
+  stamps = {}
+  for name, column in zip(table.column_names, table.columns):
+    kind = column.type
+    if pyarrow.types.is_timestamp(kind):
+      whole = column.cast(pyarrow.timestamp("ns", kind.tz)).cast(pyarrow.int64())
+      x = whole.to_numpy().astype(np.float64) if not whole.null_count else np.array([])
+      if len(x):
+        stamps[name] = (whole.to_numpy() - whole[0].as_py()) / 1e9
+        continue
+    numeric = (
+      pyarrow.types.is_integer(kind) or pyarrow.types.is_floating(kind)
+      or pyarrow.types.is_decimal(kind) or pyarrow.types.is_boolean(kind)
+    )  # fmt: skip
+    if not numeric:
+      ignored[name] = 1, f"{kind}"
+      continue
+    values = column.cast(pyarrow.float64()).to_numpy().astype(np.float64)
+    columns[name] = np.where(np.isfinite(values), values, np.nan)
+  labels = {name: name for name in table.column_names}
+  return _timed(path, columns, ignored, labels, stamps, [])
 
 
 def _text(path: pathlib.Path | str) -> tuple[str, list[str]]:

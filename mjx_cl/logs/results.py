@@ -17,13 +17,15 @@ if TYPE_CHECKING:
 
 ALL = "(all)"  # in the place of a column: one detector watches all
 FILES = ("detect.json", "alarms.csv", "detect.png")
+INJECTED = ("inject.csv", "inject.png")  # where faults were put into the nominal log
 
 
 class Detection(NamedTuple):
   """What was found; C is 1 in what a detector gives that watches all columns together.
 
   Attributes:
-    summary: what detect.json holds.
+    summary: what detect.json holds; of the charts also verdict, events, false_alarms, model and,
+      where faults were put into the nominal log, inject.
     xs: float64 (T, C), the log as read.
     past: float64 (N, C), the nominal log as read.
     fired: detector -> bool (T, C).
@@ -51,7 +53,7 @@ def claim(out: pathlib.Path | str, overwrite: bool) -> pathlib.Path:
   out = pathlib.Path(out)
   if out.exists() and not out.is_dir():
     raise UserError(f"--out {out} is a file")
-  there = [name for name in FILES if (out / name).exists()]
+  there = [name for name in (*FILES, *INJECTED) if (out / name).exists()]
   if there and not overwrite:
     raise UserError(
       f"{out} holds {', '.join(there)} of an earlier detection; give --overwrite to replace "
@@ -66,7 +68,7 @@ def claim(out: pathlib.Path | str, overwrite: bool) -> pathlib.Path:
 
 def write(result: Detection, out: pathlib.Path | str) -> None:
   """Writes detect.json, alarms.csv (one line per detector, column and alarm) and detect.png into
-  folder `out`.
+  folder `out`, and inject.csv and inject.png where faults were put into the nominal log.
   """
   out, text = pathlib.Path(out), io.StringIO()
   alarms = csv.writer(text, lineterminator="\n")
@@ -78,10 +80,62 @@ def write(result: Detection, out: pathlib.Path | str) -> None:
       at = "" if result.seconds is None else f"{result.seconds[t]:.9g}"
       told = f"{score:.9g}" if np.isfinite(score) else ""
       alarms.writerow((detector, names[c], t, at, told))
+  faults = result.summary.get("inject", {}).get("faults", [])
   with folders.together():
+    if faults:
+      folders.atomic(out / "inject.csv", lambda file: file.write(_faults_csv(faults).encode()))
+      folders.atomic(out / "inject.png", lambda file: faults_figure(result.summary, file))
     folders.atomic(out / "alarms.csv", lambda file: file.write(text.getvalue().encode()))
     folders.atomic(out / "detect.png", lambda file: figure(result, file))
     tables.write_json(out / "detect.json", result.summary)
+  for name in () if faults else INJECTED:
+    (out / name).unlink(missing_ok=True)  # of an earlier detection
+
+
+def _faults_csv(faults: list[dict]) -> str:
+  """A line for each column, kind and severity: share of the places at which it was seen."""
+  text = io.StringIO()
+  rows = csv.writer(text, lineterminator="\n")
+  rows.writerow(("column", "kind", "severity", "seen"))
+  for fault in faults:
+    for severity, share in zip(fault["tried"], fault["shares"]):
+      rows.writerow((fault["column"], fault["kind"], severity, share))
+  return text.getvalue()
+
+
+def faults_figure(summary: dict, file: pathlib.Path | str | BinaryIO) -> None:
+  """Draws, for each column and kind of fault, the smallest severity that is seen: the darker, the
+  smaller among those tried.
+  """
+  import matplotlib
+
+  matplotlib.use("Agg")
+  import matplotlib.pyplot as plt
+
+  faults, columns = summary["inject"]["faults"], summary["columns"]
+  kinds = list(dict.fromkeys(fault["kind"] for fault in faults))
+  shade = np.zeros((len(columns), len(kinds)))
+  fig, axis = plt.subplots(
+    figsize=(2.5 + 0.9 * len(kinds), 1.2 + 0.32 * len(columns)), constrained_layout=True
+  )
+  for fault in faults:
+    at = columns.index(fault["column"]), kinds.index(fault["kind"])
+    if fault["severity"] is None:
+      text = "-"
+    else:
+      shade[at] = 1 - fault["tried"].index(fault["severity"]) / len(fault["tried"])
+      value = fault["severity"] if fault["by"] is None else fault["by"]
+      text = "yes" if len(fault["tried"]) == 1 else f"{value:.2g}"
+    dark = shade[at] > 0.6
+    axis.text(*at[::-1], text, ha="center", va="center", fontsize=8, color="w" if dark else "k")
+  axis.imshow(shade, cmap="Blues", vmin=0, vmax=1, aspect="auto")
+  axis.set_xticks(range(len(kinds)), kinds, fontsize=8)
+  axis.set_yticks(range(len(columns)), columns, fontsize=8)
+  within, rate = summary["inject"]["within"], summary["rate_hz"]
+  time = f"{within:,} samples" if rate is None else f"{within / rate:g} s"
+  axis.set_title(f"Smallest fault seen within {time} (-: none)", fontsize=9)
+  fig.savefig(file, dpi=130, format="png")
+  plt.close(fig)
 
 
 def figure(result: Detection, file: pathlib.Path | str | BinaryIO, panels: int = 8) -> None:

@@ -1,0 +1,168 @@
+"""Control charts on the residuals of `healthy`, and thresholds that reach beyond the nominal log.
+
+Three charts, each of exponentially weighted averages over spans of 5, 25 and 125 samples:
+
+- `level`: |average| of a column's residual against its neighbours, in its healthy deviations: the
+  column reads too high or too low. Blind to what changes all columns in their usual relation.
+- `spread`: |average| of ln(residual^2 + 0.01), for both predictions: noise, a frozen sensor,
+  another way of moving. Blind to a constant offset that is small beside the residual.
+- `joint`: Mahalanobis distance of all columns' averages, with the covariance of Ledoit and Wolf
+  (2004): many columns a little. Blind to one column among many that moves a little.
+
+A chart's threshold for an average run length follows from the generalised extreme value
+distribution of its healthy maxima over blocks, by L-moments (Hosking, Wallis and Wood 1985), with a
+tail that is exponential or heavier: so that it may lie above all that the nominal log has shown.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy import signal, special
+
+SPANS = (5, 25, 125)  # samples
+CHARTS = ("level", "spread", "joint")
+LEAST_BLOCKS = 20  # of which maxima are taken; blocks of a short log are shorter than the last span
+HEAVIEST = 0.3  # of the tails that are believed, as shape of the distribution
+
+
+class Scales(NamedTuple):
+  """Healthy means and deviations of the averages.
+
+  Attributes:
+    level: (spans, C) deviation of the averages of residuals.
+    spread: (2, 2, spans, C) mean and deviation of those of ln(residual^2 + 0.01), of both
+      predictions.
+    joint: (spans, C, C) inverse covariance of the averages, of one span each.
+  """
+
+  level: np.ndarray
+  spread: np.ndarray
+  joint: np.ndarray
+
+
+def averages(x: np.ndarray, start: np.ndarray | float = 0.0) -> np.ndarray:
+  """(spans, ..., T, C) exponentially weighted averages of x (..., T, C), which begin at `start`."""
+  found = []
+  for span in SPANS:
+    rate = 2 / (span + 1)
+    begin = np.broadcast_to(start, (*x.shape[:-2], 1, x.shape[-1])) * (1 - rate)
+    found.append(signal.lfilter([rate], [1, rate - 1], x, -2, begin)[0])
+  return np.stack(found)
+
+
+def logs(residuals: np.ndarray) -> np.ndarray:
+  """What the chart `spread` averages."""
+  return np.log(residuals**2 + 0.01)
+
+
+def _known(x: np.ndarray, otherwise: np.ndarray | float = 0.0) -> np.ndarray:
+  return np.where(np.isnan(x), otherwise, x)
+
+
+def _shrunk(x: np.ndarray) -> np.ndarray:
+  """Covariance of x (N, C) shrunk towards a multiple of the identity, Ledoit and Wolf (2004),
+  equation 14, with every SPANS[-1]-th row counted as independent.
+  """
+  rows, columns = x.shape
+  covariance = x.T @ x / rows
+  level = np.trace(covariance) / columns
+  distance = ((covariance - level * np.eye(columns)) ** 2).sum()
+  error = max(0.0, ((x**2).sum(1) ** 2).mean() - (covariance**2).sum())
+  share = min(1.0, error / max(1.0, rows / SPANS[-1]) / max(distance, 1e-300))
+  return share * level * np.eye(columns) + (1 - share) * covariance
+
+
+def scales(residuals: np.ndarray) -> Scales:
+  """Of the nominal log's residuals (2, N, C); nan counts as neither high nor low."""
+  level, energy = averages(_known(residuals[0])), logs(residuals)
+  middle = np.nanmean(energy, 1, keepdims=True)
+  spread = averages(_known(energy, middle), middle)
+  return Scales(
+    np.maximum(level.std(1), 1e-9),
+    np.stack([spread.mean(2).swapaxes(0, 1), np.maximum(spread.std(2).swapaxes(0, 1), 1e-9)]),
+    np.stack([np.linalg.inv(_shrunk(x)) for x in level]),
+  )
+
+
+def scores(residuals: np.ndarray, own: Scales) -> dict[str, np.ndarray]:
+  """Chart -> (..., T, C), of `joint` (..., T, 1), for residuals (2, ..., T, C)."""
+  level = averages(_known(residuals[0]))
+  along = lambda x: x.reshape(len(SPANS), *[1] * (level.ndim - 2), -1)
+  joint = [((x @ inverse) * x).sum(-1) for x, inverse in zip(level, own.joint)]
+  spread = np.zeros(residuals.shape[1:])
+  for one, mean, deviation in zip(residuals, *own.spread):
+    energy = averages(_known(logs(one), mean[-1]), mean[-1])
+    spread = np.maximum(spread, np.abs((energy - along(mean)) / along(deviation)).max(0))
+  return {
+    "level": np.abs(level / along(own.level)).max(0),
+    "spread": spread,
+    "joint": np.sqrt(np.maximum(np.max(joint, 0), 0))[..., None],
+  }
+
+
+class Tail(NamedTuple):
+  """Distribution of a healthy score's maximum over a block, one for each column: generalised
+  extreme value, P(M <= x) = exp(-(1 + shape (x - middle) / width)^(-1 / shape)).
+
+  Attributes:
+    middle: (C,).
+    width: (C,).
+    shape: (C,) 0 to HEAVIEST.
+    block: samples.
+  """
+
+  middle: np.ndarray
+  width: np.ndarray
+  shape: np.ndarray
+  block: int
+
+  def threshold(self, arl0: float) -> np.ndarray:
+    """(C,) that all columns together exceed in one of `arl0` samples on average."""
+    rate = min(0.5, self.block / (arl0 * len(self.middle)))
+    y = -np.log(-np.log1p(-rate))  # the standard Gumbel's quantile
+    small = self.shape < 1e-6
+    shape = np.where(small, 1.0, self.shape)
+    return self.middle + self.width * np.where(small, y, np.expm1(shape * y) / shape)
+
+  def expected(self, score: np.ndarray, samples: int) -> np.ndarray:
+    """How many blocks of `samples` healthy ones would exceed a score in some column; score
+    (..., C).
+    """
+    z = (np.asarray(score) - self.middle) / self.width
+    small = self.shape < 1e-6
+    shape = np.where(small, 1.0, self.shape)
+    inner = np.maximum(1 + shape * z, 1e-300)
+    with np.errstate(over="ignore"):
+      rate = -np.expm1(-np.where(small, np.exp(-z), inner ** (-1 / shape)))
+    rate = np.where(~small & (1 + self.shape * z <= 0), 1.0, rate)
+    return rate * len(self.middle) * samples / self.block
+
+
+def tail(score: np.ndarray) -> Tail:
+  """Of a healthy score (N, C)."""
+  block = max(1, min(SPANS[-1], len(score) // LEAST_BLOCKS))
+  usable = len(score) // block * block
+  maxima = np.sort(score[:usable].reshape(-1, block, score.shape[1]).max(1), 0)
+  n = len(maxima)
+  at = np.arange(n)[:, None]
+  first, second = maxima.mean(0), (at / (n - 1) * maxima).mean(0)
+  third = (at * (at - 1) / ((n - 1) * (n - 2)) * maxima).mean(0)
+  l2 = np.maximum(2 * second - first, 1e-9)
+  c = l2 / np.where(np.abs(3 * third - first) < 1e-12, 1e-12, 3 * third - first)
+  c = c - np.log(2) / np.log(3)
+  k = -(
+    7.8590 * c + 2.9554 * c**2
+  )  # Hosking, Wallis and Wood (1985), equation 14; theirs is -shape
+  shape = np.clip(k, 0.0, HEAVIEST)
+  small = shape < 1e-6
+  safe = np.where(small, 0.1, shape)
+  gamma = special.gamma(1 - safe)
+  width = np.where(small, l2 / np.log(2), l2 * safe / (gamma * np.expm1(safe * np.log(2))))
+  middle = first - np.where(small, np.euler_gamma * width, width * (gamma - 1) / safe)
+  return Tail(middle, width, shape, block)
+
+
+def alarms(score: np.ndarray, threshold: np.ndarray) -> np.ndarray:
+  """Bool (T, C): samples at which a score rises above its threshold."""
+  above = score > threshold
+  return above & ~np.concatenate([np.zeros((1, above.shape[1]), bool), above[:-1]])

@@ -1,0 +1,241 @@
+"""What is healthy: a linear model of the nominal log, and what a log deviates from it.
+
+Each column is predicted twice by ridge regression: from the present and recent past of the other
+columns (`others`: a sensor that is wrong stays wrong against its neighbours), and from the recent
+past of all (`past`: what changes from one sample to the next). Columns that drift while healthy,
+such as a battery's voltage, are taken relative to a slow average of their own first. Which columns
+predict which follows Gertler, "Fault Detection and Diagnosis in Engineering Systems" (1998),
+chapter 4, with regression in place of a physical model.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy import signal
+
+FOLDS = 5  # consecutive shares of the nominal log; what is said of one comes from the others
+NOW = (0, 1, 2, 4, 8, 16)  # lags of other columns that predict a column
+BEFORE = (1, 2, 3, 4, 8, 16)  # lags of all columns that predict all
+RIDGES = (1e-4, 1e-2, 1.0, 100.0)  # tried, relative to the mean square of a feature
+USEFUL = 0.05  # share of a column's variance that a prediction has to explain to be used
+DRIFTS = 0.2  # share of a column's variance in the means of DRIFT_BLOCKS shares: above, it drifts
+DRIFT_BLOCKS = 10
+SLOW = 1000  # samples of a drifting column's average, a tenth of the nominal log at most
+HELD = 3  # samples that a missing one is replaced by the last known one for
+FARTHEST = 10.0  # deviations at which a residual is cut
+ROWS = 20_000  # predicted at a time
+MODELS = ("ar", "none")
+
+
+class Healthy(NamedTuple):
+  """A nominal log's model; C columns.
+
+  Attributes:
+    mean: (C,) of the nominal log.
+    spread: (C,) its standard deviation.
+    drifts: bool (C,), taken relative to its slow average.
+    slow: samples of that average.
+    others: (FOLDS + 1, len(NOW) * C, C) weights, each fold's from the other folds, the last from
+      all.
+    past: (FOLDS + 1, len(BEFORE) * C, C), likewise.
+    explained: (2, C) share of the variance that each prediction explains of folds it has not seen.
+    middle: (2, C) mean of the residuals.
+    scale: (2, C) their standard deviation.
+  """
+
+  mean: np.ndarray
+  spread: np.ndarray
+  drifts: np.ndarray
+  slow: int
+  others: np.ndarray
+  past: np.ndarray
+  explained: np.ndarray
+  middle: np.ndarray
+  scale: np.ndarray
+
+
+def held(x: np.ndarray) -> np.ndarray:
+  """(T, C) with missing samples replaced by the last known one, before the first by the first."""
+  at = np.where(np.isfinite(x), np.arange(len(x))[:, None], -1)
+  at = np.maximum.accumulate(at, 0)
+  first = np.isfinite(x).argmax(0)
+  return np.take_along_axis(x, np.where(at < 0, first, at), 0)
+
+
+def known(x: np.ndarray) -> np.ndarray:
+  """Bool (T,): rows of x (T, C) whose predictions rest on samples of which none is missing for more
+  than HELD rows.
+  """
+  missing = ~np.isfinite(x)
+  at = np.where(missing, -1, np.arange(len(x))[:, None])
+  age = np.arange(len(x))[:, None] - np.maximum.accumulate(at, 0)
+  long = (age > HELD).any(1)
+  reach = np.cumsum(np.r_[0, long])
+  begin = np.maximum(0, np.arange(len(x)) - max(*NOW, *BEFORE))
+  return reach[1:] == reach[begin]
+
+
+def _levelled(x: np.ndarray, drifts: np.ndarray, slow: int) -> np.ndarray:
+  """X (..., T, C) with the drifting columns relative to a slow average of their own: twice the
+  exponentially weighted one over `slow` samples less the average of that, which follows a straight
+  line without lag; both begin with the mean of the first tenth of `slow`.
+  """
+  if not drifts.any():
+    return x
+  x, rate = x.copy(), 2 / (slow + 1)
+  own = x[..., drifts]
+  begin = own[..., : max(1, slow // 10), :].mean(-2, keepdims=True)
+  average = lambda y: signal.lfilter([rate], [1, rate - 1], y, -2, (1 - rate) * begin)[0]
+  once = average(own)
+  x[..., drifts] = own - 2 * once + average(once)
+  return x
+
+
+def standard(model: Healthy, x: np.ndarray) -> np.ndarray:
+  """Samples (..., T, C), none missing, in nominal deviations, without drift."""
+  with np.errstate(over="ignore"):
+    z = np.clip((x - model.mean) / model.spread, -1e6, 1e6)
+  return _levelled(z, model.drifts, model.slow)
+
+
+def lagged(z: np.ndarray, lags: tuple[int, ...]) -> np.ndarray:
+  """(..., T, len(lags) * C): z at each lag in turn, the first sample where there is none."""
+  at = np.maximum(np.arange(z.shape[-2])[:, None] - np.array(lags), 0)
+  return z[..., at, :].reshape(*z.shape[:-1], -1)
+
+
+def _predicted(weights: np.ndarray, lags: tuple[int, ...], z: np.ndarray) -> np.ndarray:
+  """Prediction of z (T, C) or (B, T, C)."""
+  if not weights.any():
+    return np.zeros_like(z)
+  parts = []
+  for begin in range(0, z.shape[-2], ROWS):
+    from_ = max(0, begin - max(lags))
+    part = lagged(z[..., from_ : begin + ROWS, :], lags)[..., begin - from_ :, :]
+    parts.append(part @ weights)
+  return np.concatenate(parts, -2)
+
+
+def residuals(model: Healthy, z: np.ndarray, fold: int = -1) -> np.ndarray:
+  """(2, ..., T, C): what z, from `standard`, deviates from both predictions, in deviations; nan
+  where the past is unknown.
+  """
+  found = np.stack(
+    [
+      z - _predicted(weights[fold], lags, z)
+      for weights, lags in ((model.others, NOW), (model.past, BEFORE))
+    ]
+  )
+  shape = (2, *[1] * (z.ndim - 1), z.shape[-1])
+  found -= model.middle.reshape(shape)
+  found /= model.scale.reshape(shape)
+  found[..., : max(*NOW, *BEFORE), :] = np.nan
+  return np.clip(found, -FARTHEST, FARTHEST, out=found)
+
+
+def folds(rows: int) -> list[slice]:
+  """The shares of a nominal log of so many rows."""
+  ends = np.linspace(0, rows, FOLDS + 1).astype(int)
+  return [slice(a, b) for a, b in zip(ends[:-1], ends[1:])]
+
+
+def unseen(model: Healthy, z: np.ndarray) -> np.ndarray:
+  """(2, N, C) residuals of the nominal log, each fold by the weights of the others."""
+  parts = []
+  for k, share in enumerate(folds(len(z))):
+    begin = max(0, share.start - 2 * max(*NOW, *BEFORE))
+    parts.append(residuals(model, z[begin : share.stop], k)[:, share.start - begin :])
+  return np.concatenate(parts, 1)
+
+
+def drifting(x: np.ndarray) -> np.ndarray:
+  """Bool (C,): columns of (N, C) whose means of DRIFT_BLOCKS shares hold DRIFTS of their variance;
+  where nothing moves slowly they hold about DRIFT_BLOCKS / N.
+  """
+  usable = len(x) // DRIFT_BLOCKS * DRIFT_BLOCKS
+  means = x[:usable].reshape(DRIFT_BLOCKS, -1, x.shape[1]).mean(1)
+  return means.var(0) > DRIFTS * np.maximum(x.var(0), 1e-300)
+
+
+def _solved(gram: np.ndarray, target: np.ndarray, ridge: float, own: bool) -> np.ndarray:
+  """Weights (F, C) of ridge regression on features with Gram matrix (F, F); with `own` of False no
+  column's own features are used for it.
+  """
+  size, columns = target.shape
+  penalty = ridge * np.trace(gram) / size
+  if own:
+    return np.linalg.solve(gram + penalty * np.eye(size), target)
+  weights = np.zeros_like(target)
+  for c in range(columns):
+    use = np.arange(size) % columns != c
+    weights[use, c] = np.linalg.solve(
+      gram[np.ix_(use, use)] + penalty * np.eye(use.sum()), target[use, c]
+    )
+  return weights
+
+
+def _regression(z: np.ndarray, lags: tuple[int, ...], own: bool) -> tuple[np.ndarray, np.ndarray]:
+  """(weights (FOLDS + 1, F, C), share of variance explained in folds that were left out (C,)); the
+  ridge is the one of RIDGES that explains most, and a column is left without prediction where it
+  explains less than USEFUL.
+  """
+  grams, targets = [], []
+  for share in folds(len(z)):
+    size = len(lags) * z.shape[1]
+    gram, target = np.zeros((size, size)), np.zeros((size, z.shape[1]))
+    for begin in range(share.start, share.stop, ROWS):
+      from_ = max(0, begin - max(lags))
+      to = min(begin + ROWS, share.stop)
+      part = lagged(z[from_:to], lags)[begin - from_ :]
+      gram, target = gram + part.T @ part, target + part.T @ z[begin:to]
+    grams.append(gram)
+    targets.append(target)
+  total, aim = np.sum(grams, 0), np.sum(targets, 0)
+  best: tuple[float, np.ndarray, np.ndarray] | None = None
+  for ridge in RIDGES:
+    each = [_solved(total - gram, aim - target, ridge, own) for gram, target in zip(grams, targets)]
+    left = np.zeros(z.shape[1])  # sum of squares of what is not explained
+    for weights, gram, target, share in zip(each, grams, targets, folds(len(z))):
+      square = (z[share] ** 2).sum(0)
+      left += square - 2 * (weights * target).sum(0) + (weights * (gram @ weights)).sum(0)
+    explained = 1 - left / np.maximum((z**2).sum(0), 1e-300)
+    score = float(np.clip(explained, 0, 1).sum())
+    if best is None or score > best[0]:
+      best = score, explained, np.stack([*each, _solved(total, aim, ridge, own)])
+  assert best is not None
+  _, explained, weights = best
+  weights[:, :, explained < USEFUL] = 0.0
+  return weights, np.clip(explained, 0, 1)
+
+
+def fit(x: np.ndarray, model: str = "ar") -> tuple[Healthy, np.ndarray]:
+  """The model of a nominal log, and its `unseen` residuals, nan where they are not `known`.
+
+  Args:
+    x: (N, C), missing samples nan, no column constant.
+    model: "ar", or "none": no prediction, the columns themselves.
+  """
+  columns, unknown = x.shape[1], ~known(x)
+  x = held(x)
+  mean, spread = x.mean(0), x.std(0)
+  drifts = drifting(x)
+  slow = max(10, min(SLOW, len(x) // 10))
+  level = _levelled((x - mean) / spread, drifts, slow)
+  spread = spread * level.std(0)
+  one = np.ones((2, columns))
+  blank = lambda lags: np.zeros((FOLDS + 1, len(lags) * columns, columns))
+  fitted = Healthy(
+    mean, spread, drifts, slow, blank(NOW), blank(BEFORE), 0 * one, 0 * one, one
+  )  # fmt: skip
+  z = standard(fitted, x)
+  if model == "ar" and len(x) >= 20 * columns + 200:
+    others, first = _regression(z, NOW, False)
+    past, second = _regression(z, BEFORE, True)
+    fitted = fitted._replace(others=others, past=past, explained=np.stack([first, second]))
+  found = unseen(fitted, z)
+  found[:, unknown] = np.nan
+  middle, scale = np.nanmean(found, 1), np.maximum(np.nanstd(found, 1), 1e-9)
+  fitted = fitted._replace(middle=middle, scale=scale)
+  found = unseen(fitted, z)
+  found[:, unknown] = np.nan
+  return fitted, found

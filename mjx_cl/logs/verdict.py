@@ -1,0 +1,258 @@
+"""What a log says: has it changed, when, where, and how sure is that.
+
+Alarms of the charts that lie closer together than the refractory time are one event. An event is
+believed where a healthy log of this length would show as much less than DOUBT times, by the tails
+of `charts`; the columns it names are the few that, moved by themselves, would move the residuals so
+(orthogonal matching pursuit, Pati, Rezaiifar and Krishnaprasad 1993).
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mjx_cl.logs import charts, healthy
+from mjx_cl.logs.charts import CHARTS, SPANS
+
+DOUBT = 0.01  # expected number of such events in a healthy log, above which one is not believed
+MOST = 4  # columns that an event names
+GAIN = 25.0  # squared deviations that a column has to explain to be named
+SHARE = 0.1  # of what the first column explains, that each of the others has to
+
+
+class Watch(NamedTuple):
+  """A calibrated model of a nominal log.
+
+  Attributes:
+    model: see healthy.
+    scales: of the charts.
+    tails: chart -> distribution of its healthy maxima.
+    thresholds: chart -> (C,), of `joint` (1,).
+    unseen: (2, N, C) residuals of the nominal log.
+    means: (C, C) inverse covariance of the healthy averages over the middle span.
+  """
+
+  model: healthy.Healthy
+  scales: charts.Scales
+  tails: dict[str, charts.Tail]
+  thresholds: dict[str, np.ndarray]
+  unseen: np.ndarray
+  means: np.ndarray
+
+
+def calibrated(past: np.ndarray, arl0: float, model: str = "ar") -> Watch:
+  """Watches for what deviates from a nominal log (N, C), missing samples nan, each chart with one
+  alarm in `arl0` healthy samples on average.
+  """
+  fitted, unseen = healthy.fit(past, model)
+  scales = charts.scales(unseen)
+  tails = {name: charts.tail(score) for name, score in charts.scores(unseen, scales).items()}
+  thresholds = {name: tail.threshold(arl0) for name, tail in tails.items()}
+  return Watch(fitted, scales, tails, thresholds, unseen, scales.joint[1])
+
+
+class Found(NamedTuple):
+  """What the charts show of a log.
+
+  Attributes:
+    residuals: (2, T, C).
+    scores: chart -> (T, C), of `joint` (T, 1).
+    fired: chart -> bool, likewise.
+  """
+
+  residuals: np.ndarray
+  scores: dict[str, np.ndarray]
+  fired: dict[str, np.ndarray]
+
+
+def watch(own: Watch, xs: np.ndarray) -> Found:
+  """Of a log (T, C), in which missing samples are nan; nothing is judged where too many are."""
+  z = healthy.standard(own.model, healthy.held(xs))
+  residuals = healthy.residuals(own.model, z)
+  residuals[:, ~np.isfinite(xs)] = np.nan
+  residuals[:, ~healthy.known(xs)] = np.nan
+  scores = charts.scores(residuals, own.scales)
+  fired = {name: charts.alarms(x, own.thresholds[name]) for name, x in scores.items()}
+  return Found(residuals, scores, fired)
+
+
+def cross_validated(own: Watch, arl0: float) -> tuple[int, float]:
+  """(events in the nominal log, expected ones): each fifth watched with thresholds from the others,
+  alarms closer than the longest span counted once for each chart.
+  """
+  healthy_scores, count = charts.scores(own.unseen, own.scales), 0
+  shares = healthy.folds(own.unseen.shape[1])
+  for score in healthy_scores.values():
+    for share in shares:
+      rest = np.delete(score, np.r_[share], axis=0)
+      threshold = charts.tail(rest).threshold(arl0)
+      at = np.flatnonzero(charts.alarms(score[share], threshold).any(1))
+      count += len(_events(at, SPANS[-1]))
+  return count, len(CHARTS) * own.unseen.shape[1] / arl0
+
+
+def _events(at: np.ndarray, refractory: int) -> list[np.ndarray]:
+  """Samples of alarms, those of one event together."""
+  if not len(at):
+    return []
+  return np.split(at, np.flatnonzero(np.diff(at) > refractory) + 1)
+
+
+def _begin(x: np.ndarray, at: int) -> int:
+  """First sample of a shift of x (T,) that was noticed at `at`: where the cumulative sum of x less
+  half of the shift was lowest (Page 1954), within four of the longest spans before.
+  """
+  shift = np.nanmean(x[at : at + SPANS[-1]]) if np.isfinite(x[at : at + SPANS[-1]]).any() else 0.0
+  from_ = max(0, at - 4 * SPANS[-1])
+  moved = np.nan_to_num(x[from_:at] * np.sign(shift)) - abs(shift) / 2
+  return from_ + int(np.argmin(np.r_[0.0, np.cumsum(moved)]))
+
+
+def _series(own: Watch, found: Found, chart: str, c: int, at: int) -> np.ndarray:
+  """(T,) what shifted when a chart noticed it."""
+  if chart == "spread":
+    energy = [
+      charts.logs(r[:, c]) - m[-1, c] for r, m in zip(found.residuals, own.scales.spread[0])
+    ]
+    near = slice(at, at + SPANS[-1])
+    return max(energy, key=lambda x: abs(np.nan_to_num(x[near]).mean()))
+  if chart == "joint":
+    c = int(np.argmax(found.scores["level"][at]))
+  return found.residuals[0][:, c]
+
+
+def _moved(own: Watch, shift: np.ndarray) -> list[tuple[int, float]]:
+  """(column, deviations that it moved by) that explain a shift of the residuals (C,), the first
+  most.
+
+  One of a column by itself shifts its own residual by one and those it predicts by minus its
+  weights.
+  """
+  columns = len(shift)
+  gains = own.model.others[-1].reshape(len(healthy.NOW), columns, columns).sum(0)
+  effect = (np.eye(columns) - gains.T) / own.model.scale[0][:, None]
+  root = np.linalg.cholesky(own.means).T
+  left, seen = root @ shift, root @ effect
+  named: list[int] = []
+  first, by = 0.0, np.zeros(0)
+  target = left.copy()
+  while len(named) < min(MOST, columns):
+    explains = (seen.T @ left) ** 2 / np.maximum((seen**2).sum(0), 1e-300)
+    explains[named] = 0.0
+    best = int(np.argmax(explains))
+    if explains[best] < max(GAIN, SHARE * first):
+      break
+    first = first or float(explains[best])
+    named.append(best)
+    by = np.linalg.lstsq(seen[:, named], target, rcond=None)[0]
+    left = target - seen[:, named] @ by
+  return [(c, float(b)) for c, b in zip(named, by)]
+
+
+def _where(
+  own: Watch, found: Found, begin: int, end: int, names: list[str]
+) -> list[dict[str, Any]]:
+  """Columns that an event is in: those whose mean moved, else those whose spread did, since the
+  former changes the spread of what is predicted from it.
+  """
+  columns = []
+  shift = np.nan_to_num(found.residuals[0, begin:end]).mean(0)
+  shift *= min(1.0, (end - begin) / SPANS[1])
+  for c, by in _moved(own, shift):
+    columns.append(
+      {"column": names[c], "how": "mean", "by": by * float(own.model.spread[c]), "deviations": by}
+    )
+  if columns:
+    return columns
+  excess = found.scores["spread"][begin:end].max(0) / own.thresholds["spread"]
+  for c in np.argsort(-excess)[:MOST]:
+    if excess[c] < 1 or excess[c] < 0.5 * excess.max():
+      break
+    before, after = (np.nanstd(x[:, c]) for x in (own.unseen[0], found.residuals[0, begin:end]))
+    how = {"column": names[c], "how": "spread", "by": float(after / before), "deviations": None}
+    columns.append(how)
+  return columns
+
+
+def judge(own: Watch, found: Found, names: list[str], refractory: int) -> list[dict[str, Any]]:
+  """Events of a log, in order of time.
+
+  Returns:
+    each with begin, first_alarm and end (samples), charts (which gave an alarm), expected
+    (events as clear in a healthy log of this length), believed and columns.
+  """
+  samples = len(found.residuals[0])
+  above = np.zeros(samples, bool)
+  for name, score in found.scores.items():
+    above |= (score > own.thresholds[name]).any(1)
+  events = []
+  for at in _events(np.flatnonzero(above), refractory):
+    within = slice(at[0], at[-1] + 1)
+    expected, strongest = np.inf, ("joint", 0)
+    for name in CHARTS:
+      rates = own.tails[name].expected(found.scores[name][within], samples).min(0)
+      if rates.min() < expected:
+        expected, strongest = float(rates.min()), (name, int(rates.argmin()))
+    chart, c = strongest
+    score = found.scores[chart][within, c]
+    peak = int(np.argmax(score))  # the event is what led to it
+    below = np.flatnonzero(score[:peak] <= own.thresholds[chart][c])
+    first = int(at[0]) + (int(below[-1]) + 1 if len(below) else 0)
+    begin = _begin(_series(own, found, chart, c, first), first)
+    end = min(samples, first + SPANS[-1])
+    events.append(
+      {
+        "begin": begin,
+        "first_alarm": first,
+        "end": int(at[-1]) + 1,
+        "charts": [name for name in CHARTS if found.fired[name][within].any()],
+        "expected": expected * len(CHARTS),
+        "believed": expected * len(CHARTS) < DOUBT,
+        "columns": _where(own, found, first, end, names),
+      }
+    )
+  return events
+
+
+class Times(NamedTuple):
+  """The clock of a log.
+
+  Attributes:
+    seconds: (T,) since the first sample, or None.
+    rate: samples per second, or None.
+  """
+
+  seconds: np.ndarray | None
+  rate: float | None
+
+  def samples(self, seconds: float | None, otherwise: int) -> int:
+    """A time in samples; of a log without a clock it is given in samples."""
+    return otherwise if seconds is None else max(1, round(seconds * (self.rate or 1.0)))
+
+
+def summary(
+  own: Watch, found: Found, names: list[str], times: Times, arl0: float, refractory: int
+) -> dict[str, Any]:
+  """What detect.json holds of it: verdict, events, false_alarms, model."""
+  events = judge(own, found, names, refractory)
+  for event in events:
+    known = times.seconds is not None
+    event["begin_s"] = float(times.seconds[event["begin"]]) if known else None  # type: ignore[index]
+  believed = [event for event in events if event["believed"]]
+  counted, wanted = cross_validated(own, arl0)
+  return {
+    "verdict": {
+      "changed": bool(believed),
+      "charts": len(believed[0]["charts"]) if believed else 0,
+      "of": len(CHARTS),
+      **(
+        {k: believed[0][k] for k in ("expected", "begin", "begin_s", "columns")} if believed else {}
+      ),
+    },
+    "events": events,
+    "refractory": refractory,
+    "false_alarms": {"counted": counted, "expected": wanted},
+    "model": {
+      "explained": dict(zip(names, np.round(own.model.explained[0], 3).tolist())),
+      "drifts": [name for name, drifts in zip(names, own.model.drifts) if drifts],
+    },
+  }

@@ -1,0 +1,385 @@
+"""The charts on what deviates from a model of the nominal log, and what they conclude."""
+
+import json
+import pathlib
+
+import numpy as np
+import pyarrow
+import pyarrow.parquet
+import pytest
+from scipy import stats
+from test_detect import example
+
+from mjx_cl.cli import app
+from mjx_cl.errors import FileError, UserError
+from mjx_cl.logs import charts, detect, healthy, inject, verdict
+from mjx_cl.logs.clocks import epoch_seconds, irregular, iso_seconds
+from mjx_cl.logs.read import read
+
+HZ = 50
+NAMES = ["hip_encoder", "knee_encoder", "hip_current", "knee_current", "pitch", "battery", "heat"]
+
+
+@pytest.fixture
+def mjx(capsys):
+  """mjx(*argv): (exit code, standard output, standard error) of `mjx-cl detect`."""
+
+  def call(*argv):
+    capsys.readouterr()
+    return app.main(["detect", *map(str, argv)]), *capsys.readouterr()
+
+  return call
+
+
+def smooth(rng, samples, span):
+  """Slow normal noise of deviation one."""
+  return np.convolve(rng.normal(size=samples + span), np.ones(span) / span**0.5, "valid")[:samples]
+
+
+def gait(samples, seed, since=None):
+  """A walk whose pace and stride wander, a battery that empties, a motor that warms up; from sample
+  `since` on the hip's encoder is off by 0.1 rad and its current by 15 %.
+  """
+  rng, t = np.random.default_rng(seed), np.arange(samples) / HZ
+  phase = 2 * np.pi * np.cumsum(1.4 + 0.05 * smooth(rng, samples, 400)) / HZ
+  stride = 1 + 0.05 * smooth(rng, samples, 200)
+  noise = lambda scale: scale * rng.normal(size=samples)
+  hip = 0.4 * stride * np.sin(phase) + noise(0.02)
+  knee = 0.6 + 0.5 * stride * np.maximum(0, np.sin(phase + 0.8)) + noise(0.02)
+  hip_current = 2 + 1.2 * stride * np.sin(phase + 0.5) + noise(0.15)
+  knee_current = 1.5 + 0.8 * stride * np.cos(phase) + noise(0.15)
+  pitch = 0.03 * np.sin(2 * phase) + noise(0.01)
+  battery = 50.4 - 0.0008 * t - 0.02 * hip_current + noise(0.02)
+  heat = 35 + 8 * (1 - np.exp(-t / 300)) + noise(0.1)
+  if since is not None:
+    hip[since:] += 0.1
+    hip_current[since:] *= 1.15
+  return np.stack([hip, knee, hip_current, knee_current, pitch, battery, heat], 1)
+
+
+def save(path, x, names=NAMES):
+  time = np.arange(len(x)) / HZ
+  np.savetxt(path, np.c_[time, x], "%.7g", ",", header=",".join(["time", *names]), comments="")
+  return path
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory):
+  """(changed, healthy for ten minutes, nominal of two minutes)."""
+  home = tmp_path_factory.mktemp("logs")
+  return (
+    save(home / "changed.csv", gait(9000, 1, 6000)),
+    save(home / "fine.csv", gait(30_000, 2)),
+    save(home / "nominal.csv", gait(6000, 3)),
+  )
+
+
+@pytest.fixture(scope="module")
+def watched():
+  past = gait(6000, 3)
+  return past, verdict.calibrated(past, 10_000)
+
+
+def test_what_changed_when_and_where(logs):
+  """The audit's log: both columns, by how much, within two seconds of the change."""
+  said = detect.detect(logs[0], logs[2]).summary
+  found = said["verdict"]
+  assert found["changed"] and found["charts"] >= 2 and found["expected"] < 1e-6
+  assert abs(found["begin_s"] - 120.0) < 0.5
+  by = {c["column"]: c["by"] for c in found["columns"]}
+  assert by.keys() == {"hip_encoder", "hip_current"}
+  assert by["hip_encoder"] == pytest.approx(0.1, abs=0.02)
+  assert by["hip_current"] == pytest.approx(0.3, abs=0.1)  # 15 % of a mean of 2
+  (event,) = [e for e in said["events"] if e["believed"]]
+  assert 6000 <= event["first_alarm"] < 6000 + 2 * HZ
+  assert said["model"]["drifts"] == ["battery", "heat"]
+  assert said["model"]["explained"]["hip_encoder"] > 0.95
+  assert any("drifting while healthy" in note for note in said["notes"])
+
+
+def test_ten_healthy_minutes_hold_no_event(logs):
+  said = detect.detect(logs[1], logs[2]).summary
+  assert not said["verdict"]["changed"] and "begin" not in said["verdict"]
+  assert not [e for e in said["events"] if e["believed"]]
+
+
+def test_a_frozen_sensor_and_one_that_drops_out(logs, tmp_path):
+  frozen = gait(9000, 4)
+  frozen[5000:, 1] = frozen[5000, 1]
+  found = detect.detect(save(tmp_path / "a.csv", frozen), logs[2]).summary["verdict"]
+  assert found["changed"] and abs(found["begin"] - 5000) < HZ
+  assert "knee_encoder" in [c["column"] for c in found["columns"]]
+
+
+def test_without_a_model_the_columns_themselves_are_watched(logs, tmp_path):
+  """One column by itself: nothing predicts it."""
+  x = np.random.default_rng(0).normal(size=(4000, 1))
+  y = np.random.default_rng(1).normal(size=(2000, 1)) + 1.5 * (np.arange(2000) >= 900)[:, None]
+  now, past = save(tmp_path / "y.csv", y, ["x"]), save(tmp_path / "x.csv", x, ["x"])
+  for model in healthy.MODELS:
+    found = detect.detect(now, past, model=model).summary["verdict"]
+    assert found["changed"] and abs(found["begin"] - 900) < 20
+    assert found["columns"][0]["by"] == pytest.approx(1.5, abs=0.3)
+
+
+def test_an_alarm_needs_a_clear_score(watched):
+  """In expectation: standard residuals, the levels exceed their thresholds as often as asked."""
+  _, own = watched
+  counted, wanted = verdict.cross_validated(own, 1000)
+  assert wanted == 18 and 4 <= counted <= 40  # Poisson, and thresholds from four fifths
+
+
+# ---- model ---------------------------------------------------------------------------------------
+
+
+def test_ridge_is_least_squares_where_the_ridge_is_small():
+  rng = np.random.default_rng(0)
+  x = rng.normal(size=(4000, 3))
+  x[:, 2] = 0.5 * x[:, 0] - 0.8 * x[:, 1] + 0.1 * rng.normal(size=4000)
+  own, unseen = healthy.fit(x)
+  z = healthy.standard(own, x)
+  features = healthy.lagged(z, healthy.NOW)
+  use = np.arange(features.shape[1]) % 3 != 2
+  want = np.linalg.lstsq(features[:, use], z[:, 2], rcond=None)[0]
+  np.testing.assert_allclose(own.others[-1][use, 2], want, atol=2e-3)  # of the smallest ridge
+  assert not own.others[:, ~use, 2].any()
+  assert own.explained[0, 2] == pytest.approx(1 - 0.01 / x[:, 2].var(), abs=2e-3)
+  np.testing.assert_allclose(np.nanstd(unseen, 1), 1.0, rtol=1e-6)
+
+
+def test_lags_by_hand():
+  z = np.arange(6.0)[:, None] * [1, 10]
+  got = healthy.lagged(z, (0, 2))
+  assert got[5].tolist() == [5, 50, 3, 30] and got[1].tolist() == [1, 10, 0, 0]
+
+
+def test_a_ramp_leaves_nothing_and_a_step_is_seen_and_forgotten():
+  x = np.arange(20_000.0)[:, None]
+  level = healthy._levelled(x, np.array([True]), 100)
+  assert np.abs(level[2000:]).max() < 1e-6
+  step = healthy._levelled((x > 5000) * 1.0, np.array([True]), 100)
+  assert step[5001, 0] > 0.9 and abs(step[6000, 0]) < 1e-6
+
+
+def test_the_chunks_of_a_prediction_change_nothing(watched, monkeypatch):
+  past, own = watched
+  z = healthy.standard(own.model, past)
+  want = healthy.residuals(own.model, z)
+  monkeypatch.setattr(healthy, "ROWS", 700)
+  np.testing.assert_allclose(healthy.residuals(own.model, z), want, atol=1e-9)
+
+
+def test_missing_samples_are_neither_high_nor_low(watched):
+  """A stretch is not judged, in no column, until the longest lag has passed it; a few here and there
+  are held.
+  """
+  _, own = watched
+  x = gait(3000, 7)
+  x[1000:1500, 0] = np.nan
+  x[2000:2300:10, 2] = np.nan
+  found = verdict.watch(own, x)
+  unknown = np.isnan(found.residuals).all((0, 2))
+  assert np.flatnonzero(unknown).tolist() == [*range(16), *range(1003, 1516)]
+  assert np.isnan(found.residuals[:, 2000:2300:10, 2]).all()
+  assert all(np.isfinite(score).all() for score in found.scores.values())
+  assert not [e for e in verdict.judge(own, found, NAMES, 500) if e["believed"]]
+
+
+# ---- charts --------------------------------------------------------------------------------------
+
+
+def test_averages_against_a_loop():
+  x = np.random.default_rng(0).normal(size=(50, 2))
+  for got, span in zip(charts.averages(x, 0.5), charts.SPANS):
+    m = np.full(2, 0.5)
+    for t in range(50):
+      m = m + 2 / (span + 1) * (x[t] - m)
+      np.testing.assert_allclose(got[t], m, atol=1e-12)
+
+
+@pytest.mark.parametrize("shape", [0.0, 0.2])
+def test_the_tail_of_a_known_distribution(shape):
+  """L-moments find the parameters, and its quantile is SciPy's (whose shape is negative)."""
+  of = stats.genextreme(-shape, loc=3.0, scale=0.5)
+  maxima = of.rvs(size=20_000, random_state=0)
+  score = np.repeat(maxima, charts.SPANS[-1])[:, None]
+  got = charts.tail(score)
+  assert got.block == charts.SPANS[-1]
+  assert got.middle[0] == pytest.approx(3.0, abs=0.02)
+  assert got.shape[0] == pytest.approx(shape, abs=0.03)
+  exact = charts.Tail(np.array([3.0]), np.array([0.5]), np.array([shape]), 125)
+  assert exact.threshold(1.25e6)[0] == pytest.approx(of.isf(1e-4), rel=1e-6)
+  assert exact.expected(np.array([of.isf(1e-3)]), 125)[0] == pytest.approx(1e-3, rel=1e-6)
+
+
+def test_alarms_are_where_a_score_rises():
+  score = np.array([0, 2, 2, 0, 3.0])[:, None]
+  assert charts.alarms(score, np.array([1.0]))[:, 0].tolist() == [False, True, False, False, True]
+
+
+def test_the_shrunk_covariance_lies_between_sample_and_identity():
+  x = np.random.default_rng(0).normal(size=(500, 4)) * [1, 2, 3, 4]
+  got, sample = charts._shrunk(x), x.T @ x / 500
+  assert np.trace(got) == pytest.approx(np.trace(sample))
+  assert (np.abs(got - np.diag(np.diag(got))) < np.abs(sample)).sum() >= 12
+  assert np.linalg.eigvalsh(got)[0] > np.linalg.eigvalsh(sample)[0]
+
+
+def test_the_columns_that_moved_are_found_through_those_they_predict(watched):
+  """A shift made of two columns' effects by hand."""
+  _, own = watched
+  columns = len(NAMES)
+  gains = own.model.others[-1].reshape(len(healthy.NOW), columns, columns).sum(0)
+  effect = (np.eye(columns) - gains.T) / own.model.scale[0][:, None]
+  by = np.zeros(columns)
+  by[1], by[3] = 0.7, -0.9
+  got = dict(verdict._moved(own, effect @ by))
+  assert got == pytest.approx({1: 0.7, 3: -0.9})
+  assert verdict._moved(own, np.zeros(columns)) == []
+
+
+def test_where_a_shift_began():
+  x = np.random.default_rng(0).normal(size=1000) * 0.3
+  x[620:] -= 2.0
+  assert abs(verdict._begin(x, 640) - 620) <= 1
+
+
+# ---- faults put in -------------------------------------------------------------------------------
+
+
+def test_faults_by_hand():
+  x, rng = np.arange(6.0), np.random.default_rng(0)
+  put = lambda kind, severity: inject.spoiled(x, kind, severity, 3, 2.0, rng).tolist()
+  assert put("bias", 0.5) == [0, 1, 2, 4, 5, 6]
+  assert put("drift", 1.5) == [0, 1, 2, 4, 6, 8]
+  assert put("scale", 0.5) == [0, 1, 2, 4.5, 6, 7.5]
+  assert put("freeze", 1.0) == [0, 1, 2, 2, 2, 2]
+  assert put("delay", 2.0) == [0, 1, 2, 1, 2, 3]
+  assert put("dropout", 1.0) == [0, 1, 2, 0, 0, 0]
+  assert put("noise", 0.0) == x.tolist() and x.tolist() == [0, 1, 2, 3, 4, 5]
+
+
+def test_the_smallest_fault_that_is_seen(watched):
+  """Seen are the severities from the smallest on; a bias much below it gives no alarm in a log."""
+  past, own = watched
+  rows, places = inject.smallest(own, past, NAMES[:2], 2 * HZ)
+  assert 5 <= places <= inject.PLACES
+  assert len(rows) == 2 * len(inject.KINDS)
+  found = {(r["column"], r["kind"]): r for r in rows}
+  assert found["hip_encoder", "freeze"]["severity"] == 1.0
+  row = found["hip_encoder", "bias"]
+  assert row["severity"] <= 0.5 and row["by"] == pytest.approx(row["severity"] * past[:, 0].std())
+  for row in rows:
+    seen = [share >= inject.SEEN for share in row["shares"]]
+    first = None if row["severity"] is None else row["tried"].index(row["severity"])
+    assert not seen[-1] if first is None else all(seen[first:]) and not (first and seen[first - 1])
+  assert inject.smallest(own, past[:500], NAMES, 500) == ([], 0)
+
+
+# ---- the command ---------------------------------------------------------------------------------
+
+
+def test_the_command_answers_three_questions(mjx, logs, tmp_path):
+  out = tmp_path / "out"
+  few = "--column", *NAMES[:5]
+  argv = logs[0], "--nominal", logs[2], *few, "--inject", 2, "--out", out
+  code, text, err = mjx(*argv)
+  assert code == 0 and "(120.0" in text and "hip_encoder (mean +0.1" in text
+  assert "false alarms:" in text and "seen within 100 samples (2 s)" in text
+  names = {p.name for p in out.iterdir()}
+  assert names == {"detect.json", "alarms.csv", "detect.png", "inject.csv", "inject.png"}
+  said = json.loads((out / "detect.json").read_text())
+  assert said["inject"]["within"] == 100 and said["verdict"]["changed"]
+  assert (out / "inject.csv").read_text().startswith("column,kind,severity,seen\nhip_encoder,bias,")
+  assert mjx(logs[1], "--nominal", logs[2], "--out", out)[0] == 2  # one is there
+  code, text, _ = mjx(logs[1], "--nominal", logs[2], "--out", out, "--overwrite")
+  assert code == 0 and text.startswith("no change")
+  assert {p.name for p in out.iterdir()} == {"detect.json", "alarms.csv", "detect.png"}
+
+
+@pytest.mark.parametrize(
+  "more, words",
+  [
+    (("--model", "tree"), ("model", "ar", "none")),
+    (("--inject", "0"), ("inject",)),
+    (("--inject", "nan"), ("inject",)),
+    (("--refractory", "-1"), ("refractory",)),
+  ],
+)
+def test_wrong_settings_are_one_line(mjx, logs, more, words):
+  code, out, err = mjx(logs[0], "--nominal", logs[2], *more)
+  assert code == 2 and out == "" and err.startswith("mjx-cl: ") and err.count("\n") == 1
+  assert all(word in err for word in words)
+
+
+def test_the_gait_of_the_example(mjx, tmp_path, monkeypatch):
+  monkeypatch.chdir(tmp_path)
+  exec(compile(example("log.py"), "log.py", "exec"), {})
+  code, text, err = mjx("today.csv", "--nominal", "healthy.csv", "--out", "detected")
+  assert code == 0, err
+  said = json.loads(pathlib.Path("detected/detect.json").read_text())["verdict"]
+  assert abs(said["begin_s"] - 120) < 0.5 and text.startswith("changed from sample ")
+  assert [c["column"] for c in said["columns"]] == ["hip_encoder", "hip_current"]
+
+
+# ---- times ---------------------------------------------------------------------------------------
+
+
+def test_time_stamps_tell_times(tmp_path):
+  text = "stamp,x\n" + "".join(
+    f"2026-11-25T10:00:{t // 50:02d}.{t % 50 * 20:03d}Z,{t % 7}\n" for t in range(200)
+  )
+  (tmp_path / "iso.csv").write_text(text)
+  log = read(tmp_path / "iso.csv")
+  np.testing.assert_allclose(log.time, np.arange(200) / 50, atol=1e-9)
+  assert log.clocks == ("stamp",) and list(log.columns) == ["x"] and not log.ignored
+  for unit, scale in (("s", 1), ("ms", 1e3), ("us", 1e6), ("ns", 1e9)):
+    rows = "".join(f"{1.7e9 * scale + t * scale / 4:.20g},{t % 7}\n" for t in range(100))
+    (tmp_path / "epoch.csv").write_text("timestamp,x\n" + rows)
+    log = read(tmp_path / "epoch.csv")
+    np.testing.assert_allclose(log.time, np.arange(100) / 4, atol=1e-6, err_msg=unit)
+    assert list(log.columns) == ["x"]
+
+
+def test_gaps_and_repeated_times_are_named(tmp_path):
+  at = np.arange(100) * 0.02 + (np.arange(100) >= 60) * 1.0
+  at[30] = at[29]
+  rows = "".join(f"{1.7e9 + t:.17g},{k % 7}\n" for k, t in enumerate(at))
+  (tmp_path / "log.csv").write_text("timestamp,x\n" + rows)
+  notes = " ".join(read(tmp_path / "log.csv").notes)
+  assert "1 times stand in more than one row" in notes
+  assert "2 gaps" in notes and "1.02 s before sample 60" in notes
+  falling = np.r_[at[:50], at[:50]]
+  rows = "".join(f"{1.7e9 + t:.17g},{k % 7}\n" for k, t in enumerate(falling))
+  (tmp_path / "back.csv").write_text("timestamp,x\n" + rows)
+  log = read(tmp_path / "back.csv")
+  assert log.time is None and any("tells no times" in note for note in log.notes)
+
+
+def test_what_is_no_time_stamp():
+  assert iso_seconds(["2026-11-25T10:00:00", "never"]) is None and iso_seconds(["12:30"]) is None
+  assert epoch_seconds(np.arange(5.0)) is None and epoch_seconds(np.array([1e9, np.nan])) is None
+  assert irregular(np.arange(10) * 0.1) == []
+
+
+def test_a_parquet_log_is_the_csv_log(tmp_path, logs):
+  x = gait(800, 5)
+  x[3, 1] = np.nan
+  save(tmp_path / "log.csv", x)
+  want = read(tmp_path / "log.csv")
+  columns = {"time": np.arange(800) / HZ} | {name: x[:, k] for k, name in enumerate(NAMES)}
+  table = pyarrow.table(columns | {"mode": ["walk"] * 800})
+  pyarrow.parquet.write_table(table, tmp_path / "log.parquet")
+  got = read(tmp_path / "log.parquet")
+  np.testing.assert_allclose(got.time, want.time)
+  assert list(got.columns) == list(want.columns) and list(got.ignored) == ["mode"]
+  for name in NAMES:
+    np.testing.assert_allclose(got.columns[name], want.columns[name], rtol=1e-6)
+  stamps = pyarrow.array((np.arange(800) * 20).astype("datetime64[ms]"))
+  pyarrow.parquet.write_table(pyarrow.table({"when": stamps, "x": x[:, 0]}), tmp_path / "s.parquet")
+  np.testing.assert_allclose(read(tmp_path / "s.parquet").time, np.arange(800) / HZ, atol=1e-9)
+  (tmp_path / "broken.parquet").write_bytes(b"PAR1 nothing")
+  with pytest.raises(FileError, match="broken.parquet"):
+    read(tmp_path / "broken.parquet")
+  with pytest.raises(UserError):
+    detect.detect(logs[0], logs[2], model="tree")
