@@ -7,6 +7,7 @@ them.
 """
 
 import importlib
+import sys
 from typing import Any
 
 __version__ = "0.1.0"
@@ -15,6 +16,7 @@ __all__ = [
   "make_detector",
   "make_env",
   "make_fault",
+  "register_envs",
   "run",
   "score",
   "setup",
@@ -24,10 +26,14 @@ __all__ = [
 def __getattr__(name: str) -> Any:
   if name not in __all__:
     raise AttributeError(f"module 'mjx_cl' has no attribute {name!r}; it has: {', '.join(__all__)}")
-  # `setup` comes before the first use of JAX, all else brings JAX with it
-  room = "mjx_cl.io.runtime" if name == "setup" else "mjx_cl.library"
-  return getattr(importlib.import_module(room), name)
+  # these two come before the first use of JAX, all else brings JAX with it
+  early = {"setup": "mjx_cl.io.runtime", "register_envs": "mjx_cl.io.registration"}
+  return getattr(importlib.import_module(early.get(name, "mjx_cl.library")), name)
 
 
 def __dir__() -> list[str]:
   return sorted([*globals(), *__all__])
+
+
+if "gymnasium" in sys.modules:
+  __getattr__("register_envs")()

@@ -1,5 +1,6 @@
 """Errors that reach a user as one line. The CLI prints the message and leaves with `exit_code`."""
 
+import difflib
 from collections.abc import Mapping
 from typing import TypeVar
 
@@ -31,8 +32,11 @@ def require(holds: object, text: str) -> None:
 
 
 def choose(kind: str, name: str, table: Mapping[str, Member]) -> Member:
-  """table[name], or a UserError that names every valid choice."""
+  """table[name], or a UserError that names every valid choice, and the one most like it."""
   try:
     return table[name]
   except KeyError:
-    raise UserError(f"unknown {kind} {name!r}; choose from: {', '.join(sorted(table))}") from None
+    like = difflib.get_close_matches(name, table, 1)
+    meant = f"; did you mean {like[0]!r}?" if like else ""
+    known = ", ".join(sorted(table))
+    raise UserError(f"unknown {kind} {name!r}; choose from: {known}{meant}") from None

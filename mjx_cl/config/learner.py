@@ -10,6 +10,8 @@ from mjx_cl.errors import choose, require
 
 MOST_REPEAT = 100  # control steps; a chunk of decisions takes so many times as long
 
+LARGEST = 65_536  # of a batch, a sequence and what is imagined
+
 
 @dataclass(frozen=True)
 class DreamerConfig:
@@ -87,6 +89,9 @@ class DreamerConfig:
     )
     # the value of a replayed state is learnt from the one behind it
     require(self.length >= 2, f"length must be at least 2; got {self.length}")
+    for name in ("batch", "length", "imagine"):
+      value = getattr(self, name)
+      require(value <= LARGEST, f"{name} must be at most {LARGEST:,}; got {value:,}")
     require(
       self.last_starts != 1 and 0 <= self.last_starts <= self.length,
       f"last_starts must be 0, or lie in 2..length={self.length}; got {self.last_starts}",

@@ -4,6 +4,7 @@ as oracles of the vector one.
 
 import copy
 import pickle
+import subprocess
 import sys
 import warnings
 
@@ -15,8 +16,10 @@ import pytest
 from gymnasium.utils.env_checker import check_env, check_step_determinism
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
+from mjx_cl import envs
 from mjx_cl.envs import adapters
 from mjx_cl.errors import UserError
+from mjx_cl.io import registration
 
 ROBOTS, STEPS, SEED = 3, 30, 11
 FAULT = dict(
@@ -339,3 +342,41 @@ def test_a_missing_package_is_one_line(short_walker, monkeypatch, package, call)
   with pytest.raises(UserError) as refused:
     call(short_walker)
   assert f"pip install 'mjx-cl[{package}]'" in str(refused.value) and "\n" not in str(refused.value)
+
+
+# ---- gymnasium's names ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("order", ["gymnasium, mjx_cl", "mjx_cl, gymnasium"])
+def test_gymnasium_knows_every_robot_by_name(order):
+  """Before JAX is imported; where gymnasium comes second, by a call."""
+  program = (
+    f"import {order}, sys; {'mjx_cl.register_envs();' * order.startswith('mjx')}"
+    "print('jax' in sys.modules);"
+    "print(sorted(k for k in gymnasium.registry if k.startswith('mjx_cl/')))"
+  )
+  out = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+  loaded, names = out.stdout.splitlines()
+  assert loaded == "False"
+  assert names == str(sorted(f"mjx_cl/{name}" for name in registration.ROBOTS))
+  assert set(registration.ROBOTS.values()) == {*envs.ENVS}
+
+
+def test_made_by_name_it_is_our_robot():
+  """One step of both ways equals the adapter's own; gymnasium's checks run on it without a warning."""
+  fault = dict(fault="gear", target="left_hip", severity=0.5, onset=7)
+  want = adapters.gymnasium_env("walker", **fault)
+  registration.register_envs()
+  with warnings.catch_warnings():
+    warnings.simplefilter("error")
+    got = gymnasium.make("mjx_cl/Walker-v0", **fault)
+    first = got.reset(seed=3)[0]
+    after = got.step(np.zeros(6, np.float32))
+    many = gymnasium.make_vec(
+      "mjx_cl/Walker-v0", 2, vectorization_mode="vector_entry_point", **fault
+    )
+  np.testing.assert_array_equal(first, want.reset(seed=3)[0])
+  np.testing.assert_array_equal(after[0], want.step(np.zeros(6, np.float32))[0])
+  np.testing.assert_array_equal(many.reset(seed=3)[0][0], first)
+  with pytest.raises(UserError, match="mjx-cl render"):
+    gymnasium.make("mjx_cl/Walker-v0", render_mode="human")

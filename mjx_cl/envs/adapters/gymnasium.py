@@ -1,5 +1,6 @@
 """One robot as a `gymnasium.Env`, robots side by side as a `gymnasium.vector.VectorEnv`; see
-`gymnasium_env` and `gymnasium_vector`. Importing this needs gymnasium.
+`gymnasium_env` and `gymnasium_vector`. Importing this needs gymnasium, which finds `make` and
+`make_vec` by what io.registration tells it.
 """
 
 from collections.abc import Sequence
@@ -12,6 +13,7 @@ from gymnasium.vector.utils import batch_space
 
 from mjx_cl.envs.adapters.driven import Robots
 from mjx_cl.errors import UserError
+from mjx_cl.io import runtime
 from mjx_cl.types import Var
 
 
@@ -114,6 +116,25 @@ class GymnasiumVector(gymnasium.vector.VectorEnv):
       "_t": moved.copy(),
     }
     return obs, reward, terminated, truncated, infos
+
+
+def make(render_mode: str | None = None, **settings: Any) -> GymnasiumEnv:
+  """What `gymnasium.make("mjx_cl/...")` calls; settings: of GymnasiumEnv."""
+  _unseen(render_mode)
+  runtime.setup()
+  return GymnasiumEnv(**settings)
+
+
+def make_vec(render_mode: str | None = None, **settings: Any) -> GymnasiumVector:
+  """What `gymnasium.make_vec("mjx_cl/...")` calls; settings: of GymnasiumVector."""
+  _unseen(render_mode)
+  runtime.setup()
+  return GymnasiumVector(**settings)
+
+
+def _unseen(render_mode: str | None) -> None:
+  if render_mode is not None:
+    raise UserError(f"robots are drawn by `mjx-cl render`; got render_mode={render_mode!r}")
 
 
 def _box(variables: Sequence[Var]) -> Box:

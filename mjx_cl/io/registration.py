@@ -1,0 +1,25 @@
+"""Our robots under gymnasium's names, `gymnasium.make("mjx_cl/Walker-v0", fault="gear")` and
+`gymnasium.make_vec`. JAX comes with the first robot.
+"""
+
+# name -> robot; v0 becomes v1 where rewards, observations or episodes of a robot change
+ROBOTS = {
+  "Walker-v0": "walker",
+  "Quadruped-v0": "quadruped",
+  "Car-v0": "car",
+  "CarReal-v0": "car_real",
+}
+ADAPTERS = "mjx_cl.envs.adapters.gymnasium"
+
+
+def register_envs() -> None:
+  """Tells gymnasium the names. `import mjx_cl` does so where gymnasium is imported already."""
+  from gymnasium.envs import registration
+
+  for name, robot in ROBOTS.items():
+    registration.register(
+      id=f"mjx_cl/{name}",
+      entry_point=f"{ADAPTERS}:make",
+      vector_entry_point=f"{ADAPTERS}:make_vec",
+      kwargs={"env": robot},
+    )
