@@ -285,11 +285,12 @@ class Render(FaultConfig):
 class Detect:
   """Says whether a log has changed against a healthy one, when, and in which columns.
 
-  Read are Parquet files and CSV files, also .csv.gz, with a header row (a row of units may follow)
-  and cells between commas, semicolons (then with a decimal comma too) or tabulators; an empty cell
-  or nan is a missing sample. `time` [s], `step` or time stamps tell when samples were taken. Not
-  watched are clocks and counters, columns that are constant in the nominal log, that hold text or
-  that one log lacks; all of it is printed, --column watches even a clock.
+  Read are Parquet and MCAP files (rosbag2; extra [ros]), and CSV files, also .csv.gz, with a header
+  row (a row of units may follow) and cells between commas, semicolons (then with a decimal comma
+  too) or tabulators; an empty cell or nan is a missing sample. `time` [s], `step` or time stamps
+  tell when samples were taken. Not watched are clocks and counters, columns that are constant in
+  the nominal log, that hold text or that one log lacks; all of it is printed, --column watches even
+  a clock.
 
   The nominal log is modelled: each column from the others and from the recent past, drifting ones
   relative to their slow average. Three charts watch what deviates. --detector runs detectors of the
@@ -299,7 +300,7 @@ class Detect:
   Example: mjx-cl detect today.csv --nominal healthy.csv --inject 2 --out runs/detect
 
   Attributes:
-    file: Log to judge, .csv, .csv.gz or .parquet.
+    file: Log to judge, .csv, .csv.gz, .parquet or .mcap.
     nominal: Log of the healthy system, same columns.
     column: Columns to watch; default: all columns of numbers that both files have, less clocks
       and constant ones.

@@ -1,4 +1,4 @@
-"""Logs of one's own as CSV and Parquet files: what is read of them."""
+"""Logs of one's own as CSV, Parquet and MCAP files: what is read of them."""
 
 import csv
 import gzip
@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow
+import pyarrow.csv
 import pyarrow.parquet
 
 from mjx_cl.errors import FileError
@@ -24,6 +25,9 @@ from mjx_cl.logs.clocks import (
   throughout,
   told_by_name,
 )
+from mjx_cl.logs.mcap_file import read_mcap
+
+LARGE = 2_000_000  # bytes from which a file is given to pyarrow's reader first
 
 
 class Log(NamedTuple):
@@ -50,8 +54,8 @@ class Log(NamedTuple):
 
 
 def read(path: pathlib.Path | str) -> Log:
-  """Reads a Parquet file, by its ending, or a CSV file, also one compressed by gzip: a header row,
-  then numbers; an empty cell, `nan` or anything infinite is a missing sample.
+  """Reads a Parquet or MCAP file, by its ending, or a CSV file, also one compressed by gzip: a
+  header row, then numbers; an empty cell, `nan` or anything infinite is a missing sample.
 
   The separator is the comma, or where the header has none the semicolon or the tabulator; then
   numbers may have a decimal comma, if most that have a fraction do: one sign for the whole file, a
@@ -64,6 +68,12 @@ def read(path: pathlib.Path | str) -> Log:
   """
   if str(path).endswith(".parquet"):
     return _parquet(path)
+  if str(path).endswith(".mcap"):
+    time, columns, notes = read_mcap(path)
+    clean = {name: np.where(np.isfinite(x), x, np.nan) for name, x in columns.items()}
+    return _timed(path, clean, {}, {name: name for name in clean}, {"log_time": time}, notes)
+  if quick := _large(path):
+    return quick
   text, notes = _text(path)
   head = _first_line(text)
   sign = next((s for s in ",;\t" if s in head), ",")
@@ -104,6 +114,36 @@ def read(path: pathlib.Path | str) -> Log:
         stamps[name] = found
         del ignored[name]
   return _timed(path, columns, ignored, labels, stamps, notes)
+
+
+def _large(path: pathlib.Path | str) -> Log | None:
+  """A large file of commas and numbers as `read` has it, by pyarrow's reader; None where the file is
+  another one, so that its own reader says what is wrong with it.
+  """
+  try:
+    if pathlib.Path(path).stat().st_size < LARGE:
+      return None
+    with open(path, encoding="utf-8") as file:
+      head, first = file.readline().rstrip("\r\n"), file.readline()
+    names = _header(path, head, [cell.strip() for cell in next(csv.reader([head]))])
+    if "," not in head or ";" in first or _number(first.split(",")[0]) is None:
+      return None  # units, other signs
+    table = pyarrow.csv.read_csv(
+      path,
+      read_options=pyarrow.csv.ReadOptions(column_names=names, skip_rows=1),
+      convert_options=pyarrow.csv.ConvertOptions(null_values=["", "nan", "NaN", "NAN"]),
+    )
+  except (OSError, ValueError, StopIteration, csv.Error, FileError, pyarrow.ArrowException):
+    return None
+  kinds = pyarrow.types
+  for kind in table.schema.types:
+    if not (kinds.is_integer(kind) or kinds.is_floating(kind) or kinds.is_null(kind)):
+      return None
+  columns = {}
+  for name, column in zip(names, table.columns):
+    values = column.cast(pyarrow.float64()).to_numpy()
+    columns[name] = np.where(np.isfinite(values), values, np.nan)
+  return _timed(path, columns, {}, {name: name for name in names}, {}, [])
 
 
 def _timed(

@@ -12,7 +12,8 @@ from test_detect import example
 
 from mjx_cl.cli import app
 from mjx_cl.errors import FileError, UserError
-from mjx_cl.logs import charts, detect, healthy, inject, verdict
+from mjx_cl.logs import charts, detect, healthy, inject, mcap_file, verdict
+from mjx_cl.logs import read as reading
 from mjx_cl.logs.clocks import epoch_seconds, irregular, iso_seconds
 from mjx_cl.logs.read import read
 
@@ -383,3 +384,78 @@ def test_a_parquet_log_is_the_csv_log(tmp_path, logs):
     read(tmp_path / "broken.parquet")
   with pytest.raises(UserError):
     detect.detect(logs[0], logs[2], model="tree")
+
+
+@pytest.mark.parametrize("change", ["none", "text", "missing", "short row"])
+def test_a_large_file_is_read_as_a_small_one(tmp_path, monkeypatch, change):
+  """By pyarrow's reader where it can be, with the same columns, or the same error."""
+  save(tmp_path / "log.csv", gait(300, 5))
+  lines = (tmp_path / "log.csv").read_text().splitlines()
+  cells = lines[50].split(",")
+  cells[2] = {"text": "walk", "missing": ""}.get(change, cells[2])
+  lines[50] = ",".join(cells[: -1 if change == "short row" else None])
+  (tmp_path / "log.csv").write_text("\n".join(lines) + "\n\n")
+  said = []
+  for size in (10**9, 0):
+    monkeypatch.setattr(reading, "LARGE", size)
+    try:
+      said.append(read(tmp_path / "log.csv"))
+    except FileError as e:
+      said.append(str(e))
+  if change == "short row":
+    assert said[0] == said[1]
+  else:
+    np.testing.assert_equal(said[1]._asdict(), said[0]._asdict())
+  monkeypatch.setattr(reading, "LARGE", 0)
+  assert (reading._large(tmp_path / "log.csv") is None) == (change in ("text", "short row"))
+
+
+# ---- MCAP ----------------------------------------------------------------------------------------
+
+JOINTS = """string[] name
+float64[] position
+float64[] effort
+"""
+
+
+def bag(path, samples=400):
+  """Joint states at 50 Hz, a battery at 5 Hz as JSON, and a topic that nobody can read."""
+  from mcap_ros2.writer import Writer
+
+  rng = np.random.default_rng(0)
+  position = rng.normal(size=(samples, 2))
+  with open(path, "wb") as file:
+    writer = Writer(file)
+    schema = writer.register_msgdef("sensor_msgs/msg/JointState", JOINTS)
+    raw = writer._writer
+    battery = raw.register_channel("/battery", "json", 0)
+    odd = raw.register_channel("/odd", "cdr-of-mars", 0)
+    for k in range(samples):
+      at = int(1.7e18) + k * 20_000_000
+      message = {"name": ["hip", "knee"], "position": position[k].tolist(), "effort": []}
+      writer.write_message("/joints", schema, message, at, at)
+      if k % 10 == 5:
+        raw.add_message(battery, at, json.dumps({"volts": 50.0 - k, "ok": True}).encode(), at)
+        raw.add_message(odd, at, b"??", at)
+    writer.finish()
+  return position
+
+
+def test_a_bag_is_read_at_the_times_of_the_fastest_topic(tmp_path):
+  pytest.importorskip("mcap_ros2")
+  position = bag(tmp_path / "walk.mcap")
+  log = read(tmp_path / "walk.mcap")
+  np.testing.assert_allclose(log.time, np.arange(400) / 50, atol=1e-9)
+  joints = [log.columns[f"/joints/position.{name}"] for name in ("hip", "knee")]
+  np.testing.assert_array_equal(np.stack(joints, 1), position)
+  volts = log.columns["/battery/volts"]
+  assert np.isnan(volts[:5]).all() and volts[5:16].tolist() == [45.0] * 10 + [35.0]
+  assert any("times of /joints" in n for n in log.notes) and any("/odd" in n for n in log.notes)
+  (tmp_path / "no.mcap").write_bytes(b"nothing of the kind")
+  with pytest.raises(FileError, match="no.mcap is no MCAP file"):
+    read(tmp_path / "no.mcap")
+
+
+def test_numbers_of_a_message():
+  message = {"a": 1, "b": {"c": [2.0, True]}, "header": {"stamp": 3}, "text": "x", "long": [0] * 99}
+  assert dict(mcap_file.numbers(message)) == {"a": 1.0, "b.c[0]": 2.0, "b.c[1]": 1.0}
