@@ -117,8 +117,8 @@ def read(path: pathlib.Path | str) -> Log:
 
 
 def _large(path: pathlib.Path | str) -> Log | None:
-  """A large file of commas and numbers as `read` has it, by pyarrow's reader; None where the file is
-  another one, so that its own reader says what is wrong with it.
+  """A large file of commas and numbers as `read` has it, by the reader of pyarrow; None where it is
+  another one, so that our own says what is wrong with it.
   """
   try:
     if pathlib.Path(path).stat().st_size < LARGE:
