@@ -501,6 +501,7 @@ def story():
   return tell(Agent)
 
 
+@pytest.mark.slow  # of lives in a run: tests/runs/test_lives.py
 def test_blocks_of_streams_live_as_each_alone(story):
   """A block of two streams and one of one: the same decisions, alarms, phases and updates. Numbers
   differ by rounding alone, since XLA rounds a product by its shape, which a dozen updates make
