@@ -139,8 +139,8 @@ def faults_figure(summary: dict, file: pathlib.Path | str | BinaryIO) -> None:
 
 
 def figure(result: Detection, file: pathlib.Path | str | BinaryIO, panels: int = 8) -> None:
-  """Draws the columns, before sample 0 the end of the nominal log in grey, and beneath them each
-  detector's alarms as marks.
+  """Draws the columns, before sample 0 the end of the nominal log in grey, events that are believed
+  shaded in the columns they name, and beneath them each detector's alarms as marks.
 
   Args:
     result: what was found.
@@ -169,6 +169,11 @@ def figure(result: Detection, file: pathlib.Path | str | BinaryIO, panels: int =
     axis.plot(*_envelope(result.xs[:, c], 0), color="#1f5fa8", lw=0.7)
     axis.set_ylabel(f"ln {names[c]}" if result.summary["logarithm"] else names[c], fontsize=8)
     axis.tick_params(labelsize=8)
+  for event in result.summary.get("events", ()):
+    named = {column["column"] for column in event["columns"]} if event["believed"] else ()
+    for axis, c in zip(axes, shown):
+      if names[c] in named:
+        axis.axvspan(event["begin"], event["end"], color="#c4472b", alpha=0.2, lw=0)
   _marks(result, axes[-1])
   for axis in axes:
     axis.axvline(0, color="k", lw=0.8)
