@@ -29,6 +29,7 @@ from mjx_cl.adapt.arms import ARMS
 from mjx_cl.cli.flags import (
   Bench,
   Certify,
+  Compare,
   Detect,
   Doctor,
   Eval,
@@ -58,6 +59,7 @@ COMMANDS = {
   Leaderboard: "board",
   Bench: "runs",
   Plot: "results",
+  Compare: "results",
   Render: "robots",
   Query: "results",
   Detect: "log",

@@ -249,6 +249,27 @@ class Plot:
 
 
 @dataclass(frozen=True)
+class Compare:
+  """Finished runs of one robot against each other, or the arms of one: interquartile means, and
+  differences of the streams of a seed from the first one's, with 95 % bootstrap intervals.
+
+  Example: mjx-cl compare runs/mine runs/theirs:rollback --out compare.png
+
+  Attributes:
+    runs: FOLDER or FOLDER:ARM; of one folder alone all of its arms, of several the arm `detector`.
+    measure: Of the table; default: all.
+    out: Picture (.png): shares of streams that keep so much of their reward.
+    overwrite: Replace --out.
+  """
+
+  runs: Positional[tuple[str, ...]]
+  measure: tuple[str, ...] = ()
+  out: str | None = None
+  json: bool = False
+  overwrite: bool = False
+
+
+@dataclass(frozen=True)
 class Render(FaultConfig):
   """A moving picture of an agent at work: GIF, or MP4 with mjx-cl[video]; red border while a fault
   acts.

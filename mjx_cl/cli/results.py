@@ -1,5 +1,5 @@
-"""The commands plot, query and report: what result files say. Free of JAX but where figures are
-drawn anew.
+"""The commands plot, compare, query and report: what result files say. Free of JAX but where
+figures are drawn anew.
 """
 
 import decimal
@@ -10,11 +10,12 @@ import sys
 import types
 from typing import Any
 
-from mjx_cl.cli.flags import Plot, Query, Report
+from mjx_cl.cli.flags import Compare, Plot, Query, Report
 from mjx_cl.cli.output import emit, say
 from mjx_cl.cli.tables import console, table
-from mjx_cl.errors import FileError, require
+from mjx_cl.errors import FileError, choose, require
 from mjx_cl.io import tables
+from mjx_cl.scoring import versus
 
 FIRST = 100  # rows that are printed unless more are asked for, and under one heading
 
@@ -28,6 +29,53 @@ def do_plot(args: Plot) -> None:
     f"{args.folder} holds no finished run (no trace.parquet)",
   )
   print(figures.figure(args.folder))
+
+
+def do_compare(args: Compare) -> None:
+  """Compares runs, or arms of one."""
+  require(args.runs, "compare takes folders of runs: FOLDER or FOLDER:ARM ...")
+  for measure in args.measure:
+    choose("measure", measure, versus.MEASURES)
+  out = None if args.out is None else pathlib.Path(args.out)
+  if out is not None:
+    require(out.suffix == ".png", f"--out is a picture, .png; got {args.out}")
+    require(not out.is_dir(), f"--out {out} is a folder")
+    require(args.overwrite or not out.exists(), f"{out} is there; --overwrite replaces it")
+  found = versus.variants(list(args.runs))
+  if other := versus.unlike(found):
+    say(f"mjx-cl: these runs differ in {', '.join(other)}")
+  rows = [r for r in versus.compare(found) if not args.measure or r["measure"] in args.measure]
+  if args.json:
+    emit(rows)
+  else:
+    _show_comparison(rows, found[0].name)
+  if out is not None:
+    from mjx_cl.render import figures
+
+    print(figures.versus(found, out), file=sys.stderr if args.json else sys.stdout)
+
+
+def _show_comparison(rows: list[dict], first: str) -> None:
+  """A table: variants beneath each measure."""
+  number = lambda x: "-" if x is None else f"{x:.4g}"
+  between = lambda x: "" if x is None else f" [{number(x[0])}, {number(x[1])}]"
+  cells = []
+  for row in rows:
+    own = row["variant"] == first
+    cells.append(
+      (
+        row["measure"] if own else "",
+        row["variant"],
+        row["streams"],
+        number(row["iqm"]) + between(row["iqm_ci"]),
+        "" if own else row["pairs"],
+        "" if own else number(row["difference"]) + between(row["difference_ci"]),
+        "" if own else "-" if row["better"] is None else f"{row['better']:.0%}",
+      )
+    )
+  heads = ("measure", "variant", "streams", "interquartile mean", "pairs", "difference", "better")
+  console().print(table(heads, cells, left=("measure", "variant")))
+  print(f"difference: mean over pairs of one seed, from {first}; [95 % interval]; better: of pairs")
 
 
 def do_query(args: Query) -> None:

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from mjx_cl.errors import FileError
 from mjx_cl.io import folders, tables
 from mjx_cl.scoring import survival as estimate
+from mjx_cl.scoring.versus import Variant, profile
 
 UPPER = (("reward", "reward per step"), ("opr", "OPR"), ("rpr", "RPR"))
 LOWER = (
@@ -197,6 +198,26 @@ def _share(axis: Axes, time: np.ndarray, seen: np.ndarray, arm: str, color: str)
   lost = time[~seen]
   heights = [level[int(np.searchsorted(curve.time, t, "right"))] for t in lost]
   axis.plot(lost, heights, "|", color=color, ms=7)
+
+
+def versus(found: list[Variant], path: os.PathLike | str) -> pathlib.Path:
+  """Draws, for each variant, the share of its streams that keep at least so much of their reward
+  before the onset (a performance profile), with 95 % bootstrap intervals over streams.
+  """
+  levels = np.linspace(0.0, 1.2, 121)
+  drawn = Figure(figsize=(6.4, 4.2), layout="constrained")
+  axis = drawn.subplots()
+  for k, one in enumerate(found):
+    share, (low, high) = profile(one, levels)
+    axis.step(levels, share, where="post", color=f"C{k}", lw=1.6, label=one.name)
+    axis.fill_between(levels, low, high, step="post", color=f"C{k}", alpha=0.12, lw=0)
+  axis.set(
+    xlabel="reward over the last 2,000 steps / reward before the onset",
+    ylabel="share of streams with at least that",
+    ylim=(-0.03, 1.05),
+  )
+  axis.legend(fontsize=8)
+  return _saved(drawn, pathlib.Path(path), 130)
 
 
 def ratios(out: os.PathLike | str, points: list[dict]) -> pathlib.Path | None:

@@ -1,0 +1,131 @@
+"""Finished runs, or arms of one, against each other: interquartile means, paired differences and
+performance profiles (Agarwal et al. 2021, "Deep Reinforcement Learning at the Edge of the
+Statistical Precipice").
+"""
+
+import pathlib
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mjx_cl.errors import FileError, UserError
+from mjx_cl.io import tables
+from mjx_cl.scoring import intervals
+
+# name -> (what it is, whether more is better)
+MEASURES: dict[str, tuple[str, bool]] = {
+  "reward_final": ("reward a step over the last 2,000 steps", True),
+  "reward_kept": ("that reward over the reward before the onset", True),
+  "return_lost": ("return lost after the onset", False),
+  "terminations": ("falls or crashes", False),
+  "updates": ("updates", False),
+}
+MUST_AGREE = ("env", "fault", "target", "severity", "schedule", "onset", "steps", "agent", "seeds")
+
+
+class Variant(NamedTuple):
+  """One arm of one run.
+
+  Attributes:
+    name: FOLDER:ARM.
+    config: of the run.
+    rows: (seed, change) -> row of runs.parquet.
+  """
+
+  name: str
+  config: dict[str, Any]
+  rows: dict[tuple[int, int], dict[str, Any]]
+
+
+def variants(words: list[str]) -> list[Variant]:
+  """Reads FOLDER or FOLDER:ARM each; of one folder alone all of its arms, of several the arm that
+  is their only one, or `detector`.
+
+  Raises:
+    UserError: no run there, no such arm, other robots, fewer than two variants.
+  """
+  found = []
+  for word in words:
+    folder, _, arm = (word, "", "") if pathlib.Path(word).is_dir() else word.rpartition(":")
+    home = pathlib.Path(folder or word)
+    if not (home / "runs.parquet").is_file() or not (home / "config.json").is_file():
+      raise FileError(f"{home} holds no finished run (no runs.parquet)")
+    rows = tables.read_rows(home / "runs.parquet")
+    arms = list(dict.fromkeys(str(row["arm"]) for row in rows))
+    chosen = [arm] if arm else arms if len(words) == 1 or len(arms) == 1 else ["detector"]
+    for name in chosen:
+      if name not in arms:
+        raise UserError(f"{home} has no arm {name!r}; name one as FOLDER:ARM, of {', '.join(arms)}")
+      own = {(int(r["seed"]), int(r["change"])): r for r in rows if r["arm"] == name}
+      label = name if len(words) == 1 else f"{home}:{name}"
+      found.append(Variant(label, tables.read_json(home / "config.json"), own))
+  if len(found) < 2:
+    raise UserError(f"{words[0]} has one arm; name another run to compare it with")
+  robots = {str(one.config.get("env")) for one in found}
+  if len(robots) > 1:
+    raise UserError(f"runs of different robots cannot be compared: {', '.join(sorted(robots))}")
+  return found
+
+
+def unlike(found: list[Variant]) -> list[str]:
+  """Settings in which the runs differ that a comparison would have alike."""
+  return [
+    key for key in MUST_AGREE if len({str(one.config.get(key)) for one in found}) > 1
+  ]  # fmt: skip
+
+
+def value(row: dict[str, Any], measure: str) -> float:
+  """A measure of one stream, nan where it has none."""
+  if measure == "reward_kept":
+    before, after = row["reward_pre"], row["reward_final"]
+    return after / before if before and before > 0 and after is not None else np.nan
+  return np.nan if row.get(measure) is None else float(row[measure])
+
+
+def against(one: Variant, first: Variant, measure: str) -> dict[str, Any]:
+  """A variant's measure and its difference from the first variant's.
+
+  Returns:
+    streams, iqm and iqm_ci of the variant; pairs (streams of the same seed in both), difference
+    (mean of variant - first over the pairs), difference_ci (bootstrap over pairs), better (share of
+    the pairs in which the variant is better, ties half).
+  """
+  own = np.array([value(row, measure) for row in one.rows.values()])
+  own = own[np.isfinite(own)]
+  both = [
+    (value(one.rows[k], measure), value(first.rows[k], measure))
+    for k in one.rows.keys() & first.rows.keys()
+  ]
+  pairs = np.array(sorted(p for p in both if np.isfinite(p).all())).reshape(-1, 2)
+  gain = pairs[:, 0] - pairs[:, 1]
+  sign = 1 if MEASURES[measure][1] else -1
+  mean = lambda x, axis=-1: np.mean(x, axis)
+  return {
+    "variant": one.name,
+    "measure": measure,
+    "streams": len(own),
+    "iqm": float(intervals.iqm(own)) if len(own) else None,
+    "iqm_ci": intervals.interval(own),
+    "pairs": len(gain),
+    "difference": float(gain.mean()) if len(gain) else None,
+    "difference_ci": intervals.interval(gain, mean),
+    "better": float(np.mean((sign * gain > 0) + 0.5 * (gain == 0))) if len(gain) else None,
+  }
+
+
+def compare(found: list[Variant]) -> list[dict[str, Any]]:
+  """Rows of `against` for every measure and variant, the first with itself included."""
+  return [against(one, found[0], measure) for measure in MEASURES for one in found]
+
+
+def profile(one: Variant, levels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+  """(share of streams that keep at least each level of their reward before the onset, its 95 %
+  bootstrap interval (2, levels)).
+  """
+  kept = np.array([value(row, "reward_kept") for row in one.rows.values()])
+  kept = kept[np.isfinite(kept)]
+  if not len(kept):
+    return np.full(len(levels), np.nan), np.full((2, len(levels)), np.nan)
+  reached = kept[:, None] >= levels
+  drawn = reached[intervals.draws(len(kept), 2000)].mean(1)
+  return reached.mean(0), np.quantile(drawn, [0.025, 0.975], 0)

@@ -1,0 +1,119 @@
+"""Runs against each other: differences by hand, intervals against another bootstrap, bad input."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from mjx_cl.cli import app
+from mjx_cl.io import tables
+from mjx_cl.scoring import versus
+
+PRE = 2.0
+
+
+def run_of(folder, arms, env="walker", steps=25_000):
+  """A finished run: arm -> reward_final of seeds 0, 1, ...; None: not known."""
+  rows = [
+    dict(arm=arm, seed=seed, change=0, reward_pre=PRE, reward_final=x, return_lost=10.0 - seed,
+         terminations=seed, updates=5)
+    for arm, values in arms.items() for seed, x in enumerate(values)
+  ]  # fmt: skip
+  folder.mkdir(parents=True)
+  names = list(rows[0])
+  tables.write_table(folder / "runs.parquet", {k: [r[k] for r in rows] for k in names})
+  tables.write_json(folder / "config.json", {"env": env, "steps": steps, "arms": list(arms)})
+  return folder
+
+
+@pytest.fixture
+def mjx(capsys):
+  """mjx(*argv): (exit code, standard output, standard error) of `mjx-cl compare`."""
+
+  def call(*argv):
+    capsys.readouterr()
+    return app.main(["compare", *map(str, argv)]), *capsys.readouterr()
+
+  return call
+
+
+def test_arms_of_one_run_by_hand(tmp_path):
+  run = run_of(tmp_path / "a", {"detector": [1.0, 1.2, None, 1.8], "none": [0.5, 1.4, 0.9, 1.0]})
+  found = versus.variants([str(run)])
+  rows = {(r["variant"], r["measure"]): r for r in versus.compare(found)}
+  row = rows["none", "reward_final"]
+  gain = np.array([-0.5, 0.2, -0.8])  # seed 2 has no partner
+  assert row["pairs"] == 3 and row["streams"] == 4
+  assert row["difference"] == pytest.approx(gain.mean()) and row["better"] == pytest.approx(1 / 3)
+  assert row["iqm"] == pytest.approx((0.9 + 1.0) / 2)
+  assert rows["none", "reward_kept"]["difference"] == pytest.approx(gain.mean() / PRE)
+  assert rows["none", "return_lost"]["better"] == 0.5  # ties
+  same = rows["detector", "reward_final"]
+  assert same["difference"] == 0 and same["difference_ci"] == [0, 0]
+
+
+def test_less_of_a_loss_is_better(tmp_path):
+  run = run_of(tmp_path / "a", {"detector": [1.0, 1.0], "none": [1.0, 1.0]})
+  one, two = versus.variants([str(run)])
+  for key in two.rows:
+    two.rows[key]["terminations"] -= 1
+  assert versus.against(two, one, "terminations")["better"] == 1.0
+
+
+def test_the_interval_is_that_of_another_bootstrap(tmp_path):
+  rng = np.random.default_rng(0)
+  mine, theirs = rng.normal(1.0, 0.2, 40), rng.normal(0.9, 0.2, 40)
+  a = run_of(tmp_path / "a", {"detector": mine.tolist()})
+  b = run_of(tmp_path / "b", {"detector": theirs.tolist()})
+  row = versus.against(*reversed(versus.variants([str(a), str(b)])), "reward_final")
+  want = stats.bootstrap((theirs - mine,), np.mean, method="percentile", rng=1)
+  low, high = want.confidence_interval
+  assert row["difference_ci"] == pytest.approx([low, high], abs=0.01)
+
+
+def test_a_profile_by_hand(tmp_path):
+  run = run_of(tmp_path / "a", {"detector": [1.0, 2.0, 2.2, 0.2], "none": [1.0] * 4})
+  one, _ = versus.variants([str(run)])
+  share, (low, high) = versus.profile(one, np.array([0.0, 0.5, 0.6, 1.05]))
+  assert share.tolist() == [1.0, 0.75, 0.5, 0.25]
+  assert (low <= share).all() and (share <= high).all() and low[0] == high[0] == 1.0
+
+
+def test_the_command(mjx, tmp_path):
+  a = run_of(tmp_path / "a", {"detector": [1.0, 1.2], "none": [0.5, 0.4]})
+  b = run_of(tmp_path / "b:c", {"rollback": [1.4, 1.6]}, steps=20_000)
+  out = tmp_path / "profile.png"
+  code, text, err = mjx(a, b, "--out", out)
+  assert code == 0 and "runs differ in steps" in err and f"{b}:rollback" in text
+  assert out.read_bytes()[:4] == b"\x89PNG" and out.stat().st_size > 10_000
+  code, text, err = mjx(f"{a}:none", b, "--json", "--measure", "reward_final")
+  (first, second) = json.loads(text)
+  assert (code, first["variant"]) == (0, f"{a}:none")
+  assert second["difference"] == pytest.approx(1.05) and second["pairs"] == 2
+  assert mjx(a, "--out", out)[0] == 2  # it is there
+  assert mjx(a, "--out", out, "--overwrite")[0] == 0
+
+
+@pytest.mark.parametrize(
+  "argv, code, words",
+  [
+    ((), 2, ()),
+    (("{a}", "{nothing}"), 1, ("nothing", "no finished run")),
+    (("{a}:rollbcak", "{a}"), 2, ("rollbcak", "detector, none")),
+    (("{one}",), 2, ("one arm",)),
+    (("{a}", "{car}"), 2, ("different robots", "car, walker")),
+    (("{a}", "--measure", "reward"), 2, ("measure", "reward_final")),
+    (("{a}", "--out", "x.gif"), 2, (".png",)),
+  ],
+)
+def test_wrong_words_are_one_line(mjx, tmp_path, argv, code, words):
+  folders = {
+    "a": run_of(tmp_path / "a", {"detector": [1.0], "none": [0.5]}),
+    "one": run_of(tmp_path / "one", {"none": [0.5]}),
+    "car": run_of(tmp_path / "car", {"detector": [0.5]}, "car"),
+    "nothing": tmp_path / "nothing",
+  }
+  got, text, err = mjx(*(word.format(**folders) for word in argv))
+  assert (got, text) == (code, "") and all(word in err for word in words), err
+  assert not words or err.startswith("mjx-cl: ") and err.count("\n") == 1
