@@ -327,7 +327,7 @@ def leaderboard(results: pathlib.Path) -> str:
       {high - low + 1} scoring seeds each. Thresholds are set to ARL0 = {number(meta["arl0_target"])} control steps on other seeds' healthy streams, that is
       {joined([f"{number(asked[r], 1)} ({r})" for r in robots])} false alarms an hour; they rest on {alarms} alarms for most detectors{", so the rates are orders of magnitude" if alarms < 50 else ""},
       and the table holds what the scoring seeds gave. Score: 0 for never alarming, 100 for alarming at the onset and at no other time; mean over all faults of all robots,
-      intervals over seeds. Best on each robot: {best(rows)}. {lead(rows, overall)} Mean ranks closer than {number(meta["critical_difference"], 1)} are not
+      intervals over seeds; *costly faults*: over the {overall[0]["blocks_costly"]} settings that take a tenth of the reward or more from a robot that does not adapt. Best on each robot: {best(rows)}. {lead(rows, overall)} Mean ranks closer than {number(meta["critical_difference"], 1)} are not
       told apart (Nemenyi test; oracles and dummies take no rank). {number(meta["stream_steps"] / 1e6, 1)} million stream-steps in {number(minutes, 1)} minutes on
       {meta["machine"]["cores"]} core{"s" if meta["machine"]["cores"] > 1 else ""} (goal 3 minutes{", missed" if minutes > 3 else ""}). The page, sortable, one view per fault:
       [results/leaderboard.html](results/leaderboard.html).""")
@@ -347,6 +347,7 @@ def leaderboard(results: pathlib.Path) -> str:
     (
       r["detector"] + " §" * (r["detector"] in silent) + " ¶" * (r["detector"] in fitted),
       f"{number(r['cost_standard'])} {span((r['cost_standard_low'], r['cost_standard_high']))}",
+      number(r["cost_costly"]),
       whole(r["detected_within_1s"]),
       whole(r["detected_within_5s"]),
       whole(r["miss_probability"]),
@@ -372,6 +373,7 @@ def leaderboard(results: pathlib.Path) -> str:
     (
       "detector",
       "score [95 %]",
+      "costly faults",
       "within 1 s",
       "within 5 s",
       "missed",

@@ -186,6 +186,7 @@ def show(board: score.Board, held: streams.StreamSet) -> None:
         r["detector"],
         number(r["cost_standard"], ".1f"),
         f"{number(ci[0], '.1f')} to {number(ci[1], '.1f')}" if ci else "-",
+        number(r["cost_costly"], ".1f"),
         number(r["detected_within_1s"], ".0%"),
         number(r["detected_within_5s"], ".0%"),
         number(r["miss_probability"], ".0%"),
@@ -193,7 +194,7 @@ def show(board: score.Board, held: streams.StreamSet) -> None:
         number(r["mean_rank"], ".1f"),
       )
     )
-  named = ("detector", "score", "95 %", "within 1 s", "within 5 s", "missed")
+  named = ("detector", "score", "95 %", "costly faults", "within 1 s", "within 5 s", "missed")
   title = (
     f"{len(board.rows):,} rows, ARL0 {held.suite.arl0:,.0f} steps, means over robots, faults and "
     "severities"

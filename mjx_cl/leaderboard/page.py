@@ -61,7 +61,19 @@ COLUMNS = (
   Column(
     "severity", "Severity", "number", 0, "0: healthy, 1: the worst that the fault can do", True
   ),
+  Column(
+    "reward_lost", "Reward lost", "share", 0, "Share that the fault takes from a frozen robot"
+  ),
   Column("cost_standard", "Cost score, standard", "score", 1, SCORE, True, BOTH),
+  Column(
+    "cost_costly",
+    "Cost score, costly faults",
+    "score",
+    1,
+    f"Over faults that take a tenth of the reward or more. {SCORE}",
+    True,
+    ("overall",),
+  ),
   Column(
     "cost_few_false",
     "Cost score, few false alarms",

@@ -235,6 +235,7 @@ def _row(
     "robot": data.robot,
     "fault": key[0],
     "severity": key[1],
+    "reward_lost": reward_lost(data, key),
     "threshold": threshold if threshold is None or math.isfinite(threshold) else None,
     "arl0": arl0.get("arl0"),
     "arl0_ci": arl0.get("arl0_ci"),
@@ -247,6 +248,18 @@ def _row(
     **share,
     "note": "; ".join(notes) or None,
   }
+
+
+def reward_lost(data: Data, key: tuple[str, float]) -> float | None:
+  """Share of the reward that a fault takes from the recorded robots, which do not adapt: 1 - mean
+  reward within the horizon after the onset / mean reward of healthy streams of the same seeds; None
+  where that is not positive or unknown.
+  """
+  reward, own = np.asarray(data.fault.residual.reward), data.own(key)
+  after = [reward[t : t + data.horizon, k] for k, t in zip(own, data.fault.onset[own])]
+  healthy = np.nanmean(np.asarray(data.score.residual.reward)[data.count_from :])
+  broken = np.nanmean(np.concatenate(after))
+  return float(1 - broken / healthy) if healthy > 0 and np.isfinite(broken) else None
 
 
 def oracle_rows(data: Data, known: dict[tuple, oracles.Oracle]) -> list[dict]:

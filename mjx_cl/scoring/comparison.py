@@ -9,6 +9,7 @@ from mjx_cl.errors import UserError
 from mjx_cl.scoring import intervals as bootstrap
 from mjx_cl.scoring.metrics import REPS, SHARES, per_stream
 
+COSTLY = 0.1  # of the reward; a fault that takes so much from a robot that does not adapt is costly
 # every metric that is a mean over streams
 MEASURES = tuple(per_stream(np.zeros(1), np.zeros(1), 1, 1.0))
 
@@ -51,7 +52,8 @@ def overall(rows: list[dict], reps: int = REPS) -> Overall:
 
   Returns:
     Overall; each row has detector, blocks, and for every mean over streams its value and its _ci,
-    None where any of its rows has none; mean_rank.
+    None where any of its rows has none; mean_rank; cost_costly, cost_costly_ci and blocks_costly:
+    cost_standard over the rows whose `reward_lost` is COSTLY or more.
   Reference: Demsar 2006, Journal of Machine Learning Research 7, 1-30.
   """
   table: dict[str, dict[tuple, dict]] = {}
@@ -71,6 +73,7 @@ def overall(rows: list[dict], reps: int = REPS) -> Overall:
   out = [
     {"detector": name, "blocks": len(own)}
     | _means(list(own.values()), reps)
+    | _costly(list(own.values()), reps)
     | {"mean_rank": bootstrap.finite(mean.get(name))}
     for name, own in table.items()
   ]
@@ -157,6 +160,14 @@ def _values(row: dict) -> np.ndarray:
     row["control_s"],
   )
   return np.stack(list(values.values()))
+
+
+def _costly(rows: list[dict], reps: int) -> dict[str, Any]:
+  """The cost score over faults that cost the robot something."""
+  costly = [r for r in rows if (r.get("reward_lost") or 0.0) >= COSTLY]
+  found = _means(costly, reps) if costly else {}
+  ends = {"cost_costly" + end: found.get("cost_standard" + end) for end in ("", "_ci")}
+  return ends | {"blocks_costly": len(costly)}
 
 
 def _means(rows: list[dict], reps: int) -> dict:

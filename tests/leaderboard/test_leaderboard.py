@@ -336,6 +336,22 @@ def test_false_alarms_match_the_asked_rate(board):
   assert abs(row["false_alarms_per_hour"] - per_hour) < 4 * np.sqrt(16.5) / 16.5 * per_hour
 
 
+def test_what_a_fault_takes_of_the_reward(small):
+  """By a loop over its streams' rewards from their onsets on."""
+  data = streams.load(small[0], "walker")
+  key = ("gear", 1.0)
+  after = []
+  for k in data.own(key):
+    onset = data.fault.onset[k]
+    after += np.asarray(data.fault.residual.reward)[onset : onset + data.horizon, k].tolist()
+  healthy = np.asarray(data.score.residual.reward)[data.count_from :]
+  assert leaderboard.reward_lost(data, key) == pytest.approx(
+    1 - np.mean(after) / healthy.mean(), rel=1e-5
+  )
+  gone = data.fault.residual._replace(reward=np.zeros_like(data.fault.residual.reward))
+  assert leaderboard.reward_lost(data._replace(fault=data.fault._replace(residual=gone)), key) == 1
+
+
 def test_stronger_faults_are_found_sooner_and_the_oracles_bound_all(board):
   late = lambda d, f, s: pick(board, detector=d, fault=f, severity=s)[0]["delay_steps"]
   assert late("cusum", "bias", 1.0) < late("cusum", "gear", 1.0) < late("cusum", "gear", 0.5)

@@ -84,6 +84,7 @@ def synthetic(
               "robot": robot,
               "fault": fault,
               "severity": severity,
+              "reward_lost": 0.3 * severity,
               "streams": 10,
               "threshold": rng.uniform(3, 9),
               "arl0": 1e6 / alarms,
@@ -130,6 +131,7 @@ def synthetic(
       {
         "detector": d,
         **means,
+        "cost_costly": means["cost_standard"] + 10,
         **{f"{k}_ci": around(rng, v, 3) for k, v in means.items() if k.startswith("cost")},
         "mean_rank": float(1 + (len(detectors) - 1) * (1 - skill[d])),
       }

@@ -484,6 +484,15 @@ def test_overall_means_ranks_and_order():
       assert r[name] == pytest.approx(np.mean([x[name] for x in mine]))
     low, high = r["cost_standard_ci"]
     assert low < r["cost_standard"] < high < low + 10
+  costly = comparison.overall(
+    [r | {"reward_lost": 0.1 if r["fault"] == "f0" else 0.09} for r in rows]
+  ).rows[0]
+  mine = [x for x in rows if x["detector"] == "quick" and x["fault"] == "f0"]
+  assert 0 < costly["blocks_costly"] == len(mine) < 8
+  assert costly["cost_costly"] == pytest.approx(np.mean([x["cost_standard"] for x in mine]))
+  low, high = costly["cost_costly_ci"]
+  assert low <= costly["cost_costly"] <= high
+  assert got.rows[0]["cost_costly"] is None and got.rows[0]["blocks_costly"] == 0
   again = comparison.overall(rows[::-1])
   assert [r["detector"] for r in again.rows] == ["quick", "middle", "slow"]
   assert again.rows[0]["cost_standard_ci"] == pytest.approx(
