@@ -215,10 +215,9 @@ def _said_of(own: Watch, names: list[str], xs: np.ndarray, rows: int, arl0: floa
       f"{', '.join(drifts)}: drifting while healthy, so only changes quicker than "
       f"{own.model.slow} samples are seen there"
     )
-  if blind := int((~healthy.known(xs)).sum()):
+  if blind := int((~healthy.known(xs, own.model.held)).sum()):
     notes.append(
-      f"{blind:,} of {len(xs):,} samples are not judged: columns are missing there for more than "
-      f"{healthy.HELD} samples"
+      f"{blind:,} of {len(xs):,} samples are not judged: columns are missing there for too long"
     )
   if rows < arl0 * len(names):
     notes.append(

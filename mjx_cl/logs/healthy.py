@@ -13,6 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy import signal
 
+from mjx_cl.errors import UserError
+
 FOLDS = 5  # consecutive shares of the nominal log; what is said of one comes from the others
 NOW = (0, 1, 2, 4, 8, 16)  # lags of other columns that predict a column
 BEFORE = (1, 2, 3, 4, 8, 16)  # lags of all columns that predict all
@@ -21,7 +23,9 @@ USEFUL = 0.05  # share of a column's variance that a prediction has to explain t
 DRIFTS = 0.2  # share of a column's variance in the means of DRIFT_BLOCKS shares: above, it drifts
 DRIFT_BLOCKS = 10
 SLOW = 1000  # samples of a drifting column's average, a tenth of the nominal log at most
-HELD = 3  # samples that a missing one is replaced by the last known one for
+# rows that a missing sample is replaced by the last known one for; twice the usual distance of a
+# column that is written less often than others
+HELD = 3
 FARTHEST = 10.0  # deviations at which a residual is cut
 ROWS = 20_000  # predicted at a time
 MODELS = ("ar", "none")
@@ -35,6 +39,7 @@ class Healthy(NamedTuple):
     spread: (C,) its standard deviation.
     drifts: bool (C,), taken relative to its slow average.
     slow: samples of that average.
+    held: (C,) rows that a missing sample is replaced for.
     others: (FOLDS + 1, len(NOW) * C, C) weights, each fold's from the other folds, the last from
       all.
     past: (FOLDS + 1, len(BEFORE) * C, C), likewise.
@@ -47,6 +52,7 @@ class Healthy(NamedTuple):
   spread: np.ndarray
   drifts: np.ndarray
   slow: int
+  held: np.ndarray
   others: np.ndarray
   past: np.ndarray
   explained: np.ndarray
@@ -62,17 +68,34 @@ def held(x: np.ndarray) -> np.ndarray:
   return np.take_along_axis(x, np.where(at < 0, first, at), 0)
 
 
-def known(x: np.ndarray) -> np.ndarray:
+def usual(x: np.ndarray) -> np.ndarray:
+  """(C,) `Healthy.held` of a nominal log."""
+  each = [np.diff(np.flatnonzero(np.isfinite(column))) for column in x.T]
+  gaps = np.array([np.median(gap) if len(gap) else 1.0 for gap in each])
+  return np.maximum(HELD, np.ceil(2 * gaps)).astype(int)
+
+
+def known(x: np.ndarray, longest: np.ndarray) -> np.ndarray:
   """Bool (T,): rows of x (T, C) whose predictions rest on samples of which none is missing for more
-  than HELD rows.
+  than `longest` (C,) rows.
   """
-  missing = ~np.isfinite(x)
-  at = np.where(missing, -1, np.arange(len(x))[:, None])
+  at = np.where(np.isfinite(x), np.arange(len(x))[:, None], -1)
   age = np.arange(len(x))[:, None] - np.maximum.accumulate(at, 0)
-  long = (age > HELD).any(1)
-  reach = np.cumsum(np.r_[0, long])
+  reach = np.cumsum(np.r_[0, (age > longest).any(1)])
   begin = np.maximum(0, np.arange(len(x)) - max(*NOW, *BEFORE))
   return reach[1:] == reach[begin]
+
+
+def judged(residuals: np.ndarray, x: np.ndarray, longest: np.ndarray) -> np.ndarray:
+  """Residuals (2, T, C) of x (T, C), where a sample is missing those of the last known one, nan in
+  rows that are not `known`.
+  """
+  there = np.isfinite(x)
+  at = np.maximum.accumulate(np.where(there, np.arange(len(x))[:, None], 0), 0)
+  found = np.take_along_axis(residuals, at[None], 1)
+  found[:, ~known(x, longest)] = np.nan
+  found[:, : max(*NOW, *BEFORE)] = np.nan
+  return found
 
 
 def _levelled(x: np.ndarray, drifts: np.ndarray, slow: int) -> np.ndarray:
@@ -209,13 +232,21 @@ def _regression(z: np.ndarray, lags: tuple[int, ...], own: bool) -> tuple[np.nda
 
 
 def fit(x: np.ndarray, model: str = "ar") -> tuple[Healthy, np.ndarray]:
-  """The model of a nominal log, and its `unseen` residuals, nan where they are not `known`.
+  """The model of a nominal log, and its `unseen` residuals as `judged`.
 
   Args:
     x: (N, C), missing samples nan, no column constant.
     model: "ar", or "none": no prediction, the columns themselves.
+
+  Raises:
+    UserError: too much of the log is missing.
   """
-  columns, unknown = x.shape[1], ~known(x)
+  columns, longest, samples = x.shape[1], usual(x), x
+  if known(x, longest).mean() < 0.5:
+    raise UserError(
+      "columns of the nominal log are missing for so long that less than half of it can be used; "
+      "name others by --column"
+    )
   x = held(x)
   mean, spread = x.mean(0), x.std(0)
   drifts = drifting(x)
@@ -225,17 +256,14 @@ def fit(x: np.ndarray, model: str = "ar") -> tuple[Healthy, np.ndarray]:
   one = np.ones((2, columns))
   blank = lambda lags: np.zeros((FOLDS + 1, len(lags) * columns, columns))
   fitted = Healthy(
-    mean, spread, drifts, slow, blank(NOW), blank(BEFORE), 0 * one, 0 * one, one
+    mean, spread, drifts, slow, longest, blank(NOW), blank(BEFORE), 0 * one, 0 * one, one
   )  # fmt: skip
   z = standard(fitted, x)
   if model == "ar" and len(x) >= 20 * columns + 200:
     others, first = _regression(z, NOW, False)
     past, second = _regression(z, BEFORE, True)
     fitted = fitted._replace(others=others, past=past, explained=np.stack([first, second]))
-  found = unseen(fitted, z)
-  found[:, unknown] = np.nan
+  found = judged(unseen(fitted, z), samples, longest)
   middle, scale = np.nanmean(found, 1), np.maximum(np.nanstd(found, 1), 1e-9)
   fitted = fitted._replace(middle=middle, scale=scale)
-  found = unseen(fitted, z)
-  found[:, unknown] = np.nan
-  return fitted, found
+  return fitted, judged(unseen(fitted, z), samples, longest)

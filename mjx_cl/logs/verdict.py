@@ -67,9 +67,7 @@ class Found(NamedTuple):
 def watch(own: Watch, xs: np.ndarray) -> Found:
   """Of a log (T, C), in which missing samples are nan; nothing is judged where too many are."""
   z = healthy.standard(own.model, healthy.held(xs))
-  residuals = healthy.residuals(own.model, z)
-  residuals[:, ~np.isfinite(xs)] = np.nan
-  residuals[:, ~healthy.known(xs)] = np.nan
+  residuals = healthy.judged(healthy.residuals(own.model, z), xs, own.model.held)
   scores = charts.scores(residuals, own.scales)
   fired = {name: charts.alarms(x, own.thresholds[name]) for name, x in scores.items()}
   return Found(residuals, scores, fired)

@@ -181,9 +181,33 @@ def test_missing_samples_are_neither_high_nor_low(watched):
   found = verdict.watch(own, x)
   unknown = np.isnan(found.residuals).all((0, 2))
   assert np.flatnonzero(unknown).tolist() == [*range(16), *range(1003, 1516)]
-  assert np.isnan(found.residuals[:, 2000:2300:10, 2]).all()
+  one = found.residuals[:, :, 2]
+  np.testing.assert_array_equal(one[:, 2000:2300:10], one[:, 1999:2299:10])
   assert all(np.isfinite(score).all() for score in found.scores.values())
   assert not [e for e in verdict.judge(own, found, NAMES, 500) if e["believed"]]
+
+
+def test_a_column_that_is_written_less_often_is_watched(tmp_path):
+  """The battery in every tenth row alone, in both logs; a shift of it is found."""
+
+  def rare(x):
+    x = x.copy()
+    x[np.arange(len(x)) % 10 != 0, 5] = np.nan
+    return x
+
+  now = gait(6000, 8)
+  now[4000:, 5] -= 0.5
+  past = gait(6000, 3)
+  own = verdict.calibrated(rare(past), 10_000)
+  assert own.model.held.tolist() == [3, 3, 3, 3, 3, 20, 3]
+  found = verdict.watch(own, rare(now))
+  (event,) = [e for e in verdict.judge(own, found, NAMES, 500) if e["believed"]]
+  assert abs(event["begin"] - 4000) < 100 and event["columns"][0]["column"] == "battery"
+  past[::2] = np.nan
+  past[1::40] = np.nan
+  past[2000:5500] = np.nan
+  with pytest.raises(UserError, match="less than half"):
+    verdict.calibrated(past, 10_000)
 
 
 # ---- charts --------------------------------------------------------------------------------------
