@@ -197,6 +197,7 @@ def test_ppo_bad_input_is_one_line(ppo, policy, words, message):
     ppo.measure(ppo.parser().parse_args(["walker", "--policy", str(policy), *words]))
 
 
+@pytest.mark.slow  # a script of one experiment
 def test_policy_gradient_moves_the_policy_by_what_it_says(tiny, tmp_path):
   """Of an agent with made-up heads: five policies at the distances asked for; the unmoved one
   promises and gains nothing on itself, the others differ.
@@ -322,6 +323,7 @@ def test_settled_stretches_of_a_run(tmp_path):
     calibrate.settled(tmp_path)
 
 
+@pytest.mark.slow  # a script of one experiment
 def test_socks_at_the_healthy_grip_are_none_and_less_grip_costs(monkeypatch):
   """Cars of two seeds at three coefficients in one program: the friction that MuJoCo gets, and cars
   without any fault beside the first column.
