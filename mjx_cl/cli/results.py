@@ -5,6 +5,7 @@ figures are drawn anew.
 import decimal
 import importlib
 import math
+import os
 import pathlib
 import sys
 import types
@@ -60,12 +61,13 @@ def _show_comparison(rows: list[dict], first: str) -> None:
   number = lambda x: "-" if x is None else f"{x:.4g}"
   between = lambda x: "" if x is None else f" [{number(x[0])}, {number(x[1])}]"
   cells = []
+  shared = os.path.commonprefix([row["variant"] for row in rows]).rfind("/") + 1
   for row in rows:
     own = row["variant"] == first
     cells.append(
       (
         row["measure"] if own else "",
-        row["variant"],
+        row["variant"][shared:],
         row["streams"],
         number(row["iqm"]) + between(row["iqm_ci"]),
         "" if own else row["pairs"],
@@ -75,7 +77,7 @@ def _show_comparison(rows: list[dict], first: str) -> None:
     )
   heads = ("measure", "variant", "streams", "interquartile mean", "pairs", "difference", "better")
   console().print(table(heads, cells, left=("measure", "variant")))
-  print(f"difference: mean over pairs of one seed, from {first}; [95 % interval]; better: of pairs")
+  print(f"difference: mean over pairs of one seed, from {first[shared:]}; [95 % interval]; better: of pairs")
 
 
 def do_query(args: Query) -> None:

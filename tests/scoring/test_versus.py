@@ -81,11 +81,13 @@ def test_a_profile_by_hand(tmp_path):
 
 
 def test_the_command(mjx, tmp_path):
-  a = run_of(tmp_path / "a", {"detector": [1.0, 1.2], "none": [0.5, 0.4]})
-  b = run_of(tmp_path / "b:c", {"rollback": [1.4, 1.6]}, steps=20_000)
+  far = tmp_path / "a folder of a name that is wider than its column"
+  a = run_of(far / "a", {"detector": [1.0, 1.2], "none": [0.5, 0.4]})
+  b = run_of(far / "b:c", {"rollback": [1.4, 1.6]}, steps=20_000)
   out = tmp_path / "profile.png"
   code, text, err = mjx(a, b, "--out", out)
-  assert code == 0 and "runs differ in steps" in err and f"{b}:rollback" in text
+  assert code == 0 and "runs differ in steps" in err
+  assert " a:detector " in text and " b:c:rollback " in text and "wider" not in text.split("png")[0]
   assert out.read_bytes()[:4] == b"\x89PNG" and out.stat().st_size > 10_000
   code, text, err = mjx(f"{a}:none", b, "--json", "--measure", "reward_final")
   (first, second) = json.loads(text)
