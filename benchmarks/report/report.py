@@ -1908,9 +1908,10 @@ def render(name: str, results: pathlib.Path) -> str:
 
 
 def pages(root=".") -> list[pathlib.Path]:
-  """README.md and docs/*.md of a folder, as far as they hold marked blocks."""
+  """README.md, docs/*.md and results/*/README.md of a folder, as far as they hold marked blocks."""
   root = pathlib.Path(root)
   texts = [root / "README.md", *sorted((root / "docs").glob("*.md"))]
+  texts += sorted((root / "results").glob("*/README.md"))
   return [
     path for path in texts if path.is_file() and "<!-- report:" in path.read_text(errors="replace")
   ]

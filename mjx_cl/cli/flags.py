@@ -394,7 +394,7 @@ class Report:
 
   Attributes:
     results: Folder of the results.
-    page: Texts with marked blocks; default: README.md and docs/*.md.
+    page: Texts with marked blocks; default: README.md, docs/*.md and results/*/README.md.
     check: Write nothing; exit code 1 and the names of the blocks where text and results
       disagree.
     figures: Draw recovery.png and ratio.png of every published suite anew as well. A run's

@@ -77,7 +77,8 @@ def _show_comparison(rows: list[dict], first: str) -> None:
     )
   heads = ("measure", "variant", "streams", "interquartile mean", "pairs", "difference", "better")
   console().print(table(heads, cells, left=("measure", "variant")))
-  print(f"difference: mean over pairs of one seed, from {first[shared:]}; [95 % interval]; better: of pairs")
+  about = "mean over pairs of one seed"
+  print(f"difference: {about}, from {first[shared:]}; [95 % interval]; better: of pairs")
 
 
 def do_query(args: Query) -> None:

@@ -372,7 +372,7 @@ def block(name):
 # ---- README and results --------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: str(p.relative_to(ROOT)))
 def test_pages_agree_with_results(page):
   rows = report.report(RESULTS, page, check=True)
   assert rows and [r["name"] for r in rows if not r["agrees"]] == [], "run `mjx-cl report`"
@@ -388,20 +388,47 @@ def test_every_block_is_shown_once():
   ids=lambda p: str(p.relative_to(ROOT)),
 )
 def test_links_of_a_page_lead_somewhere(page):
-  links = re.findall(r"\]\(([^)#\s]+)[^)]*\)", page.read_text())
-  assert [
-    at for at in links if not re.match(r"https?:", at) and not (page.parent / at).exists()
-  ] == []
+  lost = []
+  for at, _, anchor in re.findall(r"\]\(([^)#\s]*)(#([^)\s]+))?\)", page.read_text()):
+    target = page.parent / at if at else page
+    if re.match(r"https?:", at):
+      continue
+    if not target.exists() or (anchor and anchor not in anchors(target)):
+      lost.append(f"{at}#{anchor}" if anchor else at)
+  assert lost == []
+
+
+def anchors(page):
+  """Of the headings of a Markdown page, as GitHub writes them."""
+  heads = re.findall(r"^#+ (.+)$", page.read_text(), re.M)
+  return {re.sub(r"[^\w\- ]", "", head.lower()).replace(" ", "-") for head in heads}
+
+
+def test_a_figure_of_the_answers_stands_on_the_page_that_is_linked():
+  blocks = r"<!-- report:.*?<!-- /report -->"
+  page = (ROOT / "docs/results.md").read_text()
+  shown, seen, lost = " ".join(re.findall(blocks, page, re.S)), 0, []
+  for section in re.split(r"\n## ", re.sub(blocks, "", page, flags=re.S)):
+    linked = set(re.findall(r"\]\((\.\./results/[^)#]+/README.md)", section))
+    text = shown + "".join((ROOT / "docs" / at).read_text() for at in linked)
+    text = " ".join(text.split())
+    figures = re.findall(r"-?\d[\d.,]* \[-?\d[^\]]+\]", section)
+    seen += len(figures)
+    lost += [figure for figure in figures if figure not in text]
+  assert seen > 15 and lost == []
 
 
 def test_every_block_has_its_sources_here():
   assert set(SOURCES) == set(report.BLOCKS)
 
 
-@pytest.mark.parametrize("shown", sorted({page for page, _ in USED}), ids=lambda x: x.stem)
+@pytest.mark.parametrize(
+  "shown", sorted({page for page, _ in USED}), ids=lambda x: str(x.relative_to(ROOT))
+)
 def test_one_changed_digit_of_each_block_is_found(shown, mjx, tmp_path):
   # the copy does not lie beside the results
-  lines = shown.read_text().replace("../results/", "results/").splitlines(keepends=True)
+  text = re.sub(r"(\.\./)+results/", "results/", shown.read_text())
+  lines = text.splitlines(keepends=True)
   right = "".join(lines)
   blocks = report.find(lines, shown.name)
   for block in blocks:
