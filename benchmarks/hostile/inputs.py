@@ -68,7 +68,7 @@ BASES = {
                       "--out", "out"], ("out",), ("own.py",), 0.3, False),
   "detect charts": Base(["detect", "log.csv", "--nominal", "nominal.csv", "--inject", "0.2", "--out", "out"], ("out",),
                         ("log.csv", "nominal.csv"), 2),
-  "compare": Base(["compare", "run", "--out", "out.png"], ("out.png",), RESULT),
+  "compare": Base(["compare", "run", "run", "--out", "out.png"], ("out.png",), RESULT),
   "certify": Base(["certify", "walker", "--fault", "gear", "--episodes", "0", "--out", "out"], ("out",)),
   "bench": Base(["bench", "suite.toml", "--out", "out", "--jobs", "1"], ("out",), ("suite.toml", *AGENT), 2),
   "bench again": Base(["bench", "suite.toml", "--out", "bench", "--jobs", "1"], ("bench",), (

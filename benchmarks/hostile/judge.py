@@ -20,6 +20,9 @@ NOISE = re.compile(
 )
 
 
+OURS = ("mjx-cl: ", "note: ")  # what a line that is meant for the user begins with
+
+
 class Verdict(NamedTuple):
   """What became of a case.
 
@@ -84,7 +87,7 @@ def lines_of(done: Done) -> list[str]:
 def spoken(done: Done, names: tuple[str, ...]) -> str:
   """What is wrong with how an error is told; "" where nothing is."""
   lines = lines_of(done)
-  if noise := next((x for x in lines if NOISE.search(x) and not x.startswith("mjx-cl: ")), None):
+  if noise := next((x for x in lines if NOISE.search(x) and not x.startswith(OURS)), None):
     return f"noise: {noise.strip()[:200]}"
   errors = [x for x in lines if x.startswith("mjx-cl: ")]
   if not errors or lines[-1] != errors[-1]:
@@ -117,7 +120,7 @@ def judge(done: Done, names: tuple[str, ...], before: dict[str, str], after: dic
       return Verdict("failed", f"Ctrl-C: status {done.status}, {wrong}", last)
     return Verdict("valid", "", last)
   if done.status in (0, BEGUN):
-    noise = next((x for x in lines_of(done) if NOISE.search(x)), None)
+    noise = next((x for x in lines_of(done) if NOISE.search(x) and not x.startswith(OURS)), None)
     return (
       Verdict("failed", f"status 0, noise: {noise[:200]}", last)
       if noise

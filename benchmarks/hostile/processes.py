@@ -92,6 +92,12 @@ def _wait(
   return status, seconds, True, None
 
 
+def _of_its_own(limits: dict[str, int]) -> None:
+  """As `_limited`, of what a shell has started: one that runs in the background ignores Ctrl-C."""
+  signal.signal(signal.SIGINT, signal.SIG_DFL)
+  _limited(limits)
+
+
 def _limited(limits: dict[str, int]) -> None:
   """Within a new process: its limits; it ends with the campaign."""
   if sys.platform == "linux":
@@ -119,7 +125,7 @@ def started(words: list[str], folder: pathlib.Path, limits: dict[str, int] | Non
     process = subprocess.Popen([sys.executable, *program, *map(os.fsencode, words)], cwd=folder,
                                stdin=subprocess.DEVNULL, stdout=ends[0], stderr=ends[1],
                                env=room.environment(folder), start_new_session=True,
-                               preexec_fn=lambda: _limited(limits or {}))  # fmt: skip
+                               preexec_fn=lambda: _of_its_own(limits or {}))  # fmt: skip
   for end in ends if pipes else ():
     end.close()
   PIPES[process.pid] = pipes

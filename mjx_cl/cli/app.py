@@ -165,7 +165,8 @@ def attempt(do: Callable[[], object], again: Callable[[], str] = lambda: "") -> 
   before = sys.stderr
   sys.stderr = Lasting(before)
   try:
-    return _attempt(do, again)
+    with interrupt.enforced():
+      return _attempt(do, again)
   finally:
     if getattr(sys.stderr, "_stream", None) is before:
       sys.stderr = before

@@ -1,6 +1,7 @@
 """The commands run and bench: one run, and suites of runs."""
 
 import dataclasses
+import os
 import pathlib
 import re
 from collections.abc import Collection, Mapping, Sequence
@@ -120,7 +121,7 @@ def check_merge(others: Collection[str], parts: Sequence[Part]) -> None:
   names = f"{', '.join(p.name for p in parts[:3])}{' ...' * (len(parts) > 3)}"
   for folder in map(pathlib.Path, others):
     require(
-      any((folder / p.name / "config.json").is_file() for p in parts),
+      any(os.path.lexists(folder / p.name / "config.json") for p in parts),
       f"--merge: {folder} holds none of the parts {names}; it takes the OUT of a bench of this "
       "suite",
     )

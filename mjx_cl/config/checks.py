@@ -108,7 +108,7 @@ def settings(pairs: Iterable[str]) -> dict:
   out = {}
   for pair in pairs:
     name, sign, value = pair.partition("=")
-    require(sign, f"--set takes name=value; got {pair!r}")
+    require(sign and name.strip(), f"--set takes name=value; got {pair!r}")
     try:
       out[name] = json.loads(value.lower() if value in ("True", "False") else value)
     except (ValueError, RecursionError):

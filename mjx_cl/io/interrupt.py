@@ -8,6 +8,7 @@ import concurrent.futures
 import contextlib
 import os
 import signal
+import socket
 import sys
 import threading
 import types
@@ -133,3 +134,43 @@ class Interruptible:
     """Raises KeyboardInterrupt once a signal has come."""
     if self._set:
       raise KeyboardInterrupt
+
+
+GRACE_S = 5.0
+
+
+@contextlib.contextmanager
+def enforced(grace_s: float = GRACE_S) -> Iterator[None]:
+  """A second SIGINT or SIGTERM ends the process after `grace_s`, status 130, if the context has not
+  ended by then: Python acts on signals between two of its instructions, and a compiler or foreign C
+  code may take minutes to come back. Outside the main thread it does nothing.
+  """
+  if threading.current_thread() is not threading.main_thread():
+    yield
+    return
+  ours, heard = socket.socketpair()
+  over = threading.Event()
+
+  def listen() -> None:
+    count = 0
+    while count < 2:
+      sent = ours.recv(64)  # numbers of the signals
+      if not sent:
+        return
+      count += sum(sent.count(number) for number in (signal.SIGINT, signal.SIGTERM))
+    if not over.wait(grace_s):
+      os.write(2, b"mjx-cl: interrupted\n")
+      os._exit(130)
+
+  heard.setblocking(False)
+  old = signal.set_wakeup_fd(heard.fileno(), warn_on_full_buffer=False)
+  thread = threading.Thread(target=listen, daemon=True)
+  thread.start()
+  try:
+    yield
+  finally:
+    signal.set_wakeup_fd(old)
+    over.set()
+    heard.close()
+    thread.join()
+    ours.close()

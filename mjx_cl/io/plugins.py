@@ -135,7 +135,7 @@ def file_of(source: str) -> pathlib.Path | None:
   where, colon, _ = source.rpartition(":")
   if not colon or not where.endswith(".py"):
     return None
-  return pathlib.Path(os.path.expanduser(where)).resolve()
+  return pathlib.Path(os.path.realpath(os.path.expanduser(where)))  # takes links in a circle
 
 
 def find(source: str, kind: str) -> Callable:

@@ -157,6 +157,8 @@ def suite(name: str) -> Suite:
     raise UserError(f"suite {path.name}: {', '.join(wrong)}; it takes: {', '.join(sorted(fields))}")
   try:
     return of(data)
+  except UserError as e:
+    raise UserError(f"{path.name}: {e}") from None
   except (TypeError, AttributeError, ValueError) as e:
     raise UserError(f"suite {path.name}: a value of the wrong kind ({e})") from None
 

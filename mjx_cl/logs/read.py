@@ -1,10 +1,13 @@
 """Logs of one's own as CSV, Parquet and MCAP files: what is read of them."""
 
+import contextlib
 import csv
 import gzip
 import io
+import os
 import pathlib
 import re
+import stat
 import unicodedata
 import zlib
 from typing import Any, NamedTuple
@@ -66,6 +69,10 @@ def read(path: pathlib.Path | str) -> Log:
   cell that is no number is left out. Where nothing else tells times, a column of time stamps does:
   ISO 8601, or seconds, ms, us or ns since 1970; gaps and repeated ones are noted.
   """
+  with contextlib.suppress(OSError):  # whoever opens it says what is wrong
+    mode = os.stat(path).st_mode
+    if stat.S_ISCHR(mode) or stat.S_ISBLK(mode):
+      raise FileError(f"{path} is a device, not a log")
   if str(path).endswith(".parquet"):
     return _parquet(path)
   if str(path).endswith(".mcap"):

@@ -390,6 +390,7 @@ RUN = {
   "detector setting": (["run", "walker", "--set", "windows=5"], ["windows"]),
   "detector setting out of range": (["run", "walker", "--set", "window=1"], ["window"]),
   "setting without a value": (["run", "walker", "--set", "window"], ["name=value"]),
+  "setting without a name": (["run", "walker", "--set", "=5"], ["name=value", "'=5'"]),
   "arm": (
     ["run", "walker", "--arm", "detektor"],
     ["detektor", "always, detector, no-fault, none, oracle"],

@@ -1,7 +1,9 @@
 """Signals: what is said as one comes must not cost the save."""
 
+import contextlib
 import io
 import signal
+import subprocess
 import sys
 
 import pytest
@@ -34,3 +36,34 @@ def test_a_signal_within_a_write_is_acted_on_between_two_chunks(monkeypatch):
     with pytest.raises(KeyboardInterrupt):
       interrupt.check()
   assert b"".join(raw.written) == b"a line of progress\n"
+
+
+IN_C = """
+import contextlib, hashlib, signal, sys
+from mjx_cl.io.interrupt import enforced
+signal.signal(signal.SIGINT, signal.default_int_handler)
+with contextlib.suppress(KeyboardInterrupt), enforced(0.2):
+  print("begun", flush=True)
+  hashlib.pbkdf2_hmac("sha256", b"", b"", int(sys.argv[1]))  # Python hears nothing meanwhile
+print("ended", flush=True)
+"""
+
+
+@pytest.mark.parametrize("signals, rounds", [(1000, 10**9), (1, 10**6), (0, 1)])
+def test_a_second_signal_ends_what_hears_none(signals, rounds):
+  process = subprocess.Popen(
+    [sys.executable, "-c", IN_C, str(rounds)],
+    stdout=subprocess.PIPE,
+    stderr=subprocess.PIPE,
+    text=True,
+  )
+  assert process.stdout.readline() == "begun\n"
+  for _ in range(signals):
+    process.send_signal(signal.SIGINT)  # one that another is waiting before counts as the same
+    with contextlib.suppress(subprocess.TimeoutExpired):
+      process.wait(0.05)
+      break
+  out, err = process.communicate(timeout=60)
+  stopped = signals > 1
+  assert process.returncode == (130 if stopped else 0), err
+  assert (out, err) == (("", "mjx-cl: interrupted\n") if stopped else ("ended\n", ""))

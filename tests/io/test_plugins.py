@@ -575,7 +575,9 @@ def test_robot_and_fault_of_a_file(tmp_path, capsys, tiny):
     identity.check_same(tmp_path / "run", unresolved())
   assert "files" not in identity.identity(RunConfig("walker"))
 
+  (tmp_path / "circle.py").symlink_to("circle.py")
   for argv, words in (
+    (("eval", f"{tmp_path}/circle.py:Robot"), "circle.py"),
     (("eval", f"{tmp_path}/mine.py:Nobody"), "nothing of the name 'Nobody'"),
     (("eval", "nowhere.py:Robot"), "no file nowhere.py"),
     (("eval", "no_such_module:Robot"), "no module 'no_such_module' is installed"),

@@ -979,6 +979,7 @@ def test_the_table_cuts_nothing(tmp_path, mjx, monkeypatch, width):
     (dict(log="none.csv"), 1, ["none.csv", "No such file"]),
     (dict(nominal="none.csv"), 1, ["none.csv"]),
     (dict(log="."), 1, ["directory"]),
+    (dict(nominal="/dev/zero"), 1, ["/dev/zero is a device"]),
     (dict(log="words.csv"), 1, ["words.csv", "no column of numbers", "line 2 holds 'a'"]),
     (dict(nominal="short.csv"), 1, ["short.csv", "too short", "99", "100"]),
     (dict(nominal="flat.csv"), 1, ["flat.csv", "x is constant"]),
