@@ -18,7 +18,6 @@ import signal
 import sys
 import threading
 import traceback
-import types
 from collections.abc import Callable, Iterator
 from typing import Annotated, Any, Union
 
@@ -46,8 +45,8 @@ from mjx_cl.cli.flags import (
 from mjx_cl.cli.output import apart, printable, say
 from mjx_cl.config import FaultConfig, quick
 from mjx_cl.errors import FileError, PluginError, UserError
-from mjx_cl.io import folders, interrupt, limits, plugins
-from mjx_cl.io.interrupt import Interruptible, Lasting, later
+from mjx_cl.io import folders, interrupt, limits, plugins, runtime
+from mjx_cl.io.interrupt import Interruptible, Lasting
 
 # what is said of a command in flags.py -> the module that does it, imported once it is called
 COMMANDS = {
@@ -152,25 +151,22 @@ def attempt(do: Callable[[], object], again: Callable[[], str] = lambda: "") -> 
   """Exit status of `do()`; what goes wrong becomes one line on standard error, an interrupt one
   that ends in `again()`.
   """
-
-  def stop(number: int, frame: types.FrameType | None) -> None:
-    if not later(number, frame):
-      interrupt.note(number)
-      raise KeyboardInterrupt
-
+  runtime.quiet()
   interrupt.forget()
-  signal.signal(signal.SIGTERM, stop)
+  signal.signal(signal.SIGTERM, interrupt.stop)
   if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-    signal.signal(signal.SIGINT, stop)
-  before = sys.stderr
-  sys.stderr = Lasting(before)
+    signal.signal(signal.SIGINT, interrupt.stop)
+  before, hook = sys.stderr, sys.unraisablehook
+  sys.stderr, sys.unraisablehook = Lasting(before), interrupt.unraisable(hook)
   try:
     with interrupt.enforced():
       return _attempt(do, again)
   finally:
     if getattr(sys.stderr, "_stream", None) is before:
       sys.stderr = before
-    if signal.getsignal(signal.SIGINT) is stop:
+    sys.unraisablehook = hook
+    interrupt.forget()
+    if signal.getsignal(signal.SIGINT) is interrupt.stop:
       signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
@@ -265,8 +261,6 @@ def main(argv: list[str] | None = None) -> int:
     command = parse(argv)
     check_filled(command)
     if not isinstance(command, (Plot, Query, Report)):
-      from mjx_cl.io import runtime
-
       shared = isinstance(command, Train) and command.seeds > 0
       runtime.setup(runtime.sharing(command.seeds) if shared else 1)
     # a run locks its own folder, and so does each part of a suite

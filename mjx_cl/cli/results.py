@@ -11,6 +11,8 @@ import sys
 import types
 from typing import Any
 
+from rich import box
+
 from mjx_cl.cli.flags import Compare, Plot, Query, Report
 from mjx_cl.cli.output import emit, say
 from mjx_cl.cli.tables import console, table
@@ -57,28 +59,32 @@ def do_compare(args: Compare) -> None:
 
 
 def _show_comparison(rows: list[dict], first: str) -> None:
-  """A table: variants beneath each measure."""
-  number = lambda x: "-" if x is None else f"{x:.4g}"
-  between = lambda x: "" if x is None else f" [{number(x[0])}, {number(x[1])}]"
-  cells = []
+  """A table for each measure: a line for each variant, intervals beneath the numbers."""
+  number = lambda x: "-" if x is None else f"{x:.3g}" if abs(x) < 1e3 else f"{x:.0f}"
+  between = lambda x: "" if x is None else f"\n[{number(x[0])}, {number(x[1])}]"
   shared = os.path.commonprefix([row["variant"] for row in rows]).rfind("/") + 1
-  for row in rows:
-    own = row["variant"] == first
-    cells.append(
-      (
-        row["measure"] if own else "",
-        row["variant"][shared:],
-        row["streams"],
-        number(row["iqm"]) + between(row["iqm_ci"]),
-        "" if own else row["pairs"],
-        "" if own else number(row["difference"]) + between(row["difference_ci"]),
-        "" if own else "-" if row["better"] is None else f"{row['better']:.0%}",
+  heads = ("variant", "n", "IQM", "pairs", "difference", "better")
+  for measure in dict.fromkeys(row["measure"] for row in rows):
+    cells = []
+    for row in (row for row in rows if row["measure"] == measure):
+      own = row["variant"] == first
+      cells.append(
+        (
+          row["variant"][shared:],
+          row["streams"],
+          number(row["iqm"]) + between(row["iqm_ci"]),
+          "" if own else row["pairs"],
+          "" if own else number(row["difference"]) + between(row["difference_ci"]),
+          "" if own else "-" if row["better"] is None else f"{row['better']:.0%}",
+        )
       )
-    )
-  heads = ("measure", "variant", "streams", "interquartile mean", "pairs", "difference", "better")
-  console().print(table(heads, cells, left=("measure", "variant")))
-  about = "mean over pairs of one seed"
-  print(f"difference: {about}, from {first[shared:]}; [95 % interval]; better: of pairs")
+    title = f"{measure}: {versus.MEASURES[measure][0]}"
+    close = {"box": box.SIMPLE, "pad_edge": False, "collapse_padding": True}
+    console().print(table(heads, cells, left=("variant",), title=title, **close))
+  print(
+    f"n: streams; IQM: interquartile mean; difference: from {first[shared:]}, mean over pairs of "
+    "one seed; better: of pairs; [95 % interval]"
+  )
 
 
 def do_query(args: Query) -> None:

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from typing import Any
 
 from mjx_cl.cli import app
-from mjx_cl.io import runtime, tables
+from mjx_cl.io import interrupt, runtime, tables
 
 Do = Callable[[str, dict], None]  # name and values of a part
 
@@ -44,6 +44,7 @@ class Parts:
     # state is saved
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
     os.kill(os.getpid(), signal.SIGTERM)
+    self.names.put("")  # the part that it has may be at its end
 
 
 def runs(folder: pathlib.Path) -> Do:
@@ -122,6 +123,7 @@ def main(arguments: list[str]) -> int:
     runtime.setup()
     work = COMMANDS[tables.read_json(folder / "suite.json").get("command", "bench")](folder)
     while name := parts.names.get():
+      interrupt.heed()
       work(name, tables.read_json(folder / "suite.json")["parts"][name])
       parts.done += 1
       print(f"finished {name}", flush=True)

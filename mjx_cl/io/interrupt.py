@@ -12,7 +12,7 @@ import socket
 import sys
 import threading
 import types
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, Self, TextIO
 
 
@@ -64,6 +64,9 @@ def threads(count: int, name: str = "") -> Iterator[concurrent.futures.ThreadPoo
 
 
 _SENT: list[int] = []  # signals that have come and were acted upon
+_RAISED = (
+  threading.Event()
+)  # of a command: a KeyboardInterrupt was raised, and may have been dropped
 
 
 def note(number: int) -> None:
@@ -74,6 +77,7 @@ def note(number: int) -> None:
 def forget() -> None:
   """Forgets signals that have been acted upon."""
   _SENT.clear()
+  _RAISED.clear()
 
 
 def sent() -> bool:
@@ -83,14 +87,32 @@ def sent() -> bool:
   return bool(_SENT) or signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-def later(number: int, frame: types.FrameType | None) -> bool:
-  """Whether the signal came within JAX's hook of the collector, where Python drops what is raised;
-  it is then sent once more, in a moment.
+def stop(number: int, frame: types.FrameType | None) -> None:
+  """Handler of a command's signals: raises KeyboardInterrupt where the program is."""
+  note(number)
+  _RAISED.set()
+  raise KeyboardInterrupt
+
+
+def heed() -> None:
+  """Raises KeyboardInterrupt where `stop` has: C code such as NumPy's may have dropped it."""
+  if _RAISED.is_set():
+    raise KeyboardInterrupt
+
+
+def unraisable(hook: Callable[[Any], Any]) -> Callable[[Any], None]:
+  """`hook` for sys.unraisablehook, but that a KeyboardInterrupt which Python drops, such as in a
+  callback of the collector, is sent once more, in a moment.
   """
-  if frame is None or frame.f_code.co_name != "_xla_gc_callback":
-    return False
-  threading.Timer(0.01, signal.raise_signal, (number,)).start()
-  return True
+
+  def heard(what: Any) -> None:
+    if what.exc_type is not None and issubclass(what.exc_type, KeyboardInterrupt):
+      number = _SENT[-1] if _SENT else signal.SIGINT
+      threading.Timer(0.01, signal.raise_signal, (number,)).start()
+    else:
+      hook(what)
+
+  return heard
 
 
 class Interruptible:
@@ -120,8 +142,6 @@ class Interruptible:
 
   def _handle(self, number: int, frame: types.FrameType | None) -> None:
     if self._set:
-      if later(number, frame):
-        return
       Interruptible.again = True
       note(number)
       raise KeyboardInterrupt
@@ -134,6 +154,7 @@ class Interruptible:
     """Raises KeyboardInterrupt once a signal has come."""
     if self._set:
       raise KeyboardInterrupt
+    heed()
 
 
 GRACE_S = 5.0

@@ -107,6 +107,14 @@ def seeds_by() -> str:
   return "map" if jax.default_backend() == "cpu" else "vmap"
 
 
+def quiet() -> None:
+  """Keeps XLA's notes from standard error, if JAX is not imported yet and the user has not chosen:
+  its loader prints an error of a page for each cached program over two pseudo features of the
+  compiler that no CPU reports.
+  """
+  os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+
+
 def setup(devices: int = 1) -> None:
   """Sets the count of devices, the compile cache, the allocator, the garbage collector and
   synchronous CPU dispatch. Call before the first JAX computation.
@@ -132,9 +140,7 @@ def setup(devices: int = 1) -> None:
   _done = True
   keep_memory()
   collect_seldom()
-  # XLA's loader prints an error of a page for each cached program over two pseudo features of the
-  # compiler that no CPU reports
-  os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+  quiet()
   import jax
 
   theirs = _DEVICES_FLAG in os.environ.get("XLA_FLAGS", "") or "JAX_NUM_CPU_DEVICES" in os.environ

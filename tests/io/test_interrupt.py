@@ -5,9 +5,12 @@ import io
 import signal
 import subprocess
 import sys
+import time
+import weakref
 
 import pytest
 
+from mjx_cl.cli import app
 from mjx_cl.io.interrupt import Interruptible, Lasting
 
 
@@ -67,3 +70,33 @@ def test_a_second_signal_ends_what_hears_none(signals, rounds):
   stopped = signals > 1
   assert process.returncode == (130 if stopped else 0), err
   assert (out, err) == (("", "mjx-cl: interrupted\n") if stopped else ("ended\n", ""))
+
+
+def in_a_callback():
+  """Ctrl-C within a weak reference's callback, where Python drops what is raised."""
+  thing = io.StringIO()
+  kept = weakref.ref(thing, lambda _: signal.raise_signal(signal.SIGINT))
+  del thing
+  for _ in range(6000):
+    time.sleep(0.01)
+  return kept
+
+
+def dropped():
+  """Ctrl-C that C code drops."""
+  with contextlib.suppress(KeyboardInterrupt):
+    signal.raise_signal(signal.SIGINT)
+  with Interruptible() as interrupt:
+    interrupt.check()
+
+
+@pytest.mark.parametrize("do", [in_a_callback, dropped])
+def test_an_interrupt_that_is_dropped_is_not_lost(do, capsys):
+  old = signal.signal(signal.SIGINT, signal.default_int_handler)  # the caller's may be another
+  try:
+    assert app.attempt(do) == 130
+  finally:
+    signal.signal(signal.SIGINT, old)
+  assert capsys.readouterr().err == "mjx-cl: interrupted\n"
+  with Interruptible() as interrupt:  # the next command is its own
+    interrupt.check()
