@@ -36,8 +36,8 @@ def make(name: str, physics: str = "auto") -> Any:
   no `physics` has none to choose from.
 
   Raises:
-    UserError for an unknown name, a backend that the robot has not, and whatever goes wrong in a
-    robot of another package.
+    UserError: for an unknown name, a backend that the robot has not, and whatever goes wrong in a
+      robot of another package.
   """
   build: Any = choose("environment", name, ENVS)
   if name in ENVS.own:

@@ -716,6 +716,7 @@ def events(folder, arm, *kinds):
   return [(s, r) for s, k, r in zip(e["step"], e["kind"], e["reason"]) if k in kinds]
 
 
+@pytest.mark.slow
 def test_events_say_what_started_and_ended_each_arm(lived):
   out = lived(NAMES)
   drawn = int(choices([("random", SEED)], CONFIG["adapt"], LIFE).at.min())
@@ -889,6 +890,7 @@ def test_streams_pay_for_what_they_take():
   assert sum(kinds.values()) == 11.0
 
 
+@pytest.mark.slow
 def test_an_arm_with_an_agent_of_its_own(lived):
   """It lives as a run whose agent that is, the others as they do without it; the card is kept."""
   # with fresh parameters and a way back, all runs here are one program
@@ -950,6 +952,7 @@ def test_detector_and_none_are_the_same_alone_and_beside_the_others(lived):
         assert repr(a[column]) == repr(b[column]), (name, arm, column)
 
 
+@pytest.mark.slow
 def test_a_run_of_all_arms_resumes_to_the_same_files(lived):
   out, cut = (
     lived(NAMES),

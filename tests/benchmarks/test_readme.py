@@ -118,6 +118,7 @@ def test_the_table_of_four_rows_is_that_of_results():
   assert quadruped == [noticed, 10, back, n, without, n]
 
 
+@pytest.mark.slow
 def test_the_learner_learns_the_environment_of_the_example(tmp_path):
   """An untrained policy scores about 8 of 20; the example must end well above, and push towards the
   goal on either side of it.

@@ -465,7 +465,7 @@ def test_loss_equals_numpy(starts, request):
   )  # float32 sum of 9
 
 
-@pytest.mark.parametrize("starts", [0, 2])
+@pytest.mark.parametrize("starts", [pytest.param(0, marks=pytest.mark.slow), 2])
 def test_both_forms_of_the_behaviour_losses_agree(starts):
   """State by state (CPU) against large products: value, metrics, and the gradient under unequal
   weights of policy and the rest.
@@ -563,6 +563,7 @@ def test_learning_rate_factor_scales_the_step(plain):
   assert gap(full_step.params, half_step.params) > 1e-6
 
 
+@pytest.mark.slow
 def test_policy_lr_scales_the_steps_of_the_policy_alone(plain):
   agent, update, state = plain
   slow = Agent(replace(agent.config, policy_lr=0.25), agent.obs_size, agent.act_size)
@@ -585,6 +586,7 @@ def trained(update, state, steps=3, **kwargs):
   return state, metrics
 
 
+@pytest.mark.slow
 def test_clone_weight_of_zero_is_no_cloning(plain, cloning):
   a, _ = trained(plain[1], plain[2])
   b, _ = trained(cloning[1], cloning[2], weights=Weights(clone=0.0))
@@ -697,6 +699,7 @@ def test_least_deviation_of_the_actions(plain):
     )  # float32
 
 
+@pytest.mark.slow
 def test_vmap_over_seeds_equals_a_loop(plain):
   agent, update, _ = plain
   keys = jax.random.split(jax.random.key(3), 2)

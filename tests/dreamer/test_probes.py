@@ -7,6 +7,7 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from mjx_cl.config import PRESETS, replace
 from mjx_cl.dreamer import nets
@@ -112,6 +113,7 @@ def test_constant_reward_gives_the_geometric_sum_past_the_time_limit(tmp_path):
     assert abs(value - 1 / (1 - GAMMA)) < 0.15
 
 
+@pytest.mark.slow
 def test_observed_reward_is_read_from_the_observation(tmp_path):
   trainer = learnt(Probe("observed", 1, lambda coin, step, action: coin, coin=True), tmp_path, 512)
   for coin in (-1, 1):
@@ -119,6 +121,7 @@ def test_observed_reward_is_read_from_the_observation(tmp_path):
     assert abs(value - coin) < 0.22
 
 
+@pytest.mark.slow
 def test_delayed_reward_is_discounted(tmp_path):
   trainer = learnt(Probe("delayed", 2, lambda coin, step, action: step), tmp_path, 768)
   assert abs(judge(trainer, [(0, 0)])[0] - GAMMA) < 0.1
@@ -131,6 +134,7 @@ def test_chosen_reward_is_chosen(tmp_path):
   assert action > 0.8 and value > 0.6  # an untrained policy: 0 and 0
 
 
+@pytest.mark.slow
 def test_action_follows_the_observation(tmp_path):
   trainer = learnt(
     Probe("both", 1, lambda coin, step, action: coin * action, coin=True), tmp_path, 1024

@@ -59,6 +59,17 @@ def program():
   return once
 
 
+QUICK = ("walker", "car")
+
+
+@pytest.mark.parametrize(
+  "robot",
+  [
+    pytest.param(name, marks=() if name in QUICK else pytest.mark.slow)
+    for name in sorted(envs.ENVS)
+  ],
+  indirect=True,
+)
 def test_every_fault_of_every_robot_acts_as_it_claims(robot, program, monkeypatch):
   """At severity 0 nominal bit for bit; above it other, never before the onset; more with more
   severity; whatever the robot, target and preset.

@@ -164,6 +164,7 @@ def test_the_seeds_of_a_training_are_shared_by_the_cores(monkeypatch, argv, devi
   assert app.main(argv) == 0 and asked == [devices]
 
 
+@pytest.mark.slow
 def test_256_mjx_walkers_finish_and_agree_with_mujoco(walker, pair, fields, crowd, within):
   init, step = pair["mjx"]
   qpos, qvel = (
@@ -197,6 +198,7 @@ def test_256_mjx_walkers_finish_and_agree_with_mujoco(walker, pair, fields, crow
   )  # measured: 5.5e-7, 1.5e-5; contact outliers are test_physics.py's business
 
 
+@pytest.mark.slow
 def test_20000_callbacks_with_160_streams(walker, within):
   """The known risk is a deadlock (jax issues 24255, 25861); the oracle is plain mj_step, bit for
   bit. The walkers float, which takes MuJoCo a third of the time; what crosses JAX is as large.

@@ -64,6 +64,7 @@ def recorded(saved, tmp_path_factory):
   return folder / "set", folder / "mini.toml"
 
 
+@pytest.mark.slow
 def test_a_set_of_real_robots(recorded):
   held = streams.StreamSet(recorded[0])
   assert (

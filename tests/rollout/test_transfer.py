@@ -257,6 +257,7 @@ def test_after_the_change_the_robot_is_the_other_one(lived, robots, agent, param
   assert np.median(gaps) > 0.02  # the same actions in car are another life
 
 
+@pytest.mark.slow
 def test_the_certificate_of_a_change(robots):
   """It acts from the first step of the episode after the end, not before."""
   moved = certify.become(*robots, "car/sim-to-real", onset=10)
@@ -463,6 +464,7 @@ def entered(trace, g):
   return int(np.flatnonzero(over & (trace["step"][g] >= ONSET))[0]) + 1
 
 
+@pytest.mark.slow
 def test_trace_of_a_run(whole):
   trace = by_stream(whole[0])
   assert (
@@ -610,6 +612,7 @@ def test_the_replay_holds_what_the_stream_lived(whole):
     assert trace["updates"][g, -1] > 0 and not trace["updates"][g + 2].any()
 
 
+@pytest.mark.slow
 def test_a_run_killed_before_during_and_after_the_change_ends_in_the_same_files(
   whole, short, saved, tmp_path
 ):
@@ -674,6 +677,7 @@ def test_an_onset_after_the_last_step_never_comes(whole, short, saved, tmp_path)
   )
 
 
+@pytest.mark.slow
 def test_a_robot_that_is_spared_stays_what_it_is(whole, short, saved, tmp_path):
   """Arm `no-fault` beside others: no change, no onset, no second fault; until its first start the
   life of a car alone.

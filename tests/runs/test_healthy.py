@@ -107,6 +107,7 @@ def test_the_newest_pasts_are_kept():
   assert list(healthy.kept) == ["a", "c"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
   "robot",
   ["walker", *(pytest.param(name, marks=pytest.mark.slow) for name in ("quadruped", "car"))],

@@ -181,7 +181,12 @@ def test_the_shipped_walkers_life_is_the_same_alone_and_among_ten(tmp_path, same
 
 
 @pytest.mark.parametrize(
-  "changes", [dict(cores=1), dict(cores=7), dict(many=0)], ids=("one core", "seven", "many groups")
+  "changes",
+  [
+    pytest.param(dict(cores=1), id="one core", marks=pytest.mark.slow),
+    pytest.param(dict(cores=7), id="seven"),
+    pytest.param(dict(many=0), id="many groups", marks=pytest.mark.slow),
+  ],
 )
 def test_how_the_work_is_shared_changes_nothing(make, monkeypatch, same, changes):
   """Threads, and whether a group is seen to as a whole by one of them."""
@@ -222,6 +227,7 @@ def test_a_run_that_may_go_back_says_so_of_every_stream(make):
 # ---- all streams as one band ---------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_all_streams_as_one_band_decide_alike(make, monkeypatch, same, tmp_path):
   """As on an accelerator, from the start; and it goes on from what it saved. Numbers are those of
   other programs: rounded otherwise, which a robot that falls makes larger.

@@ -474,6 +474,7 @@ def test_runs_are_sums_of_the_trace(whole):
 # ---- figure --------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_preset_of_several_faults_ends_in_all_files(saved, tmp_path):
   """Six faults at once, repaired after 30 steps; each is an event, and the figure does without a
   single severity.
@@ -570,6 +571,7 @@ def test_a_healthy_run_has_no_severity_no_onset_and_no_detection(saved, tmp_path
   assert summary["severity"] == (0.5 if "onset" in change else 0.0)
 
 
+@pytest.mark.slow
 def test_an_alarm_behind_the_last_step_starts_nothing(saved, tmp_path):
   """The last chunk lives on to its end; what is decided on its surplus is no part of the run."""
   config = lambda steps: RunConfig(

@@ -136,6 +136,7 @@ def table(folder, name):
   return pyarrow.parquet.read_table(folder / f"{name}.parquet").to_pydict()
 
 
+@pytest.mark.slow
 def test_it_goes_on_where_it_was_cut_off(lived):
   """Every column of what was lived, to the last bit; wall times aside."""
   _, whole, cut, later = lived

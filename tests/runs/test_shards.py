@@ -5,6 +5,7 @@ import re
 import shlex
 import subprocess
 
+import pytest
 from test_cli import mjx  # noqa: F401  a fixture
 from test_suite import mini  # noqa: F401  a fixture
 from test_transfer import agent, saved  # noqa: F401  fixtures
@@ -39,6 +40,7 @@ def test_the_script_of_the_documentation_is_a_partition_and_its_merge(tmp_path):
   assert [part.name for part in asked(args)[1]] == whole
 
 
+@pytest.mark.slow
 def test_shards_and_a_merge_are_the_whole(mjx, mini, tmp_path, monkeypatch):  # noqa: F811
   monkeypatch.setattr(memory, "free", lambda: 2**36)  # a busy machine would refuse
   for k in (0, 1):

@@ -590,6 +590,7 @@ def test_aggregates_of_the_ablation_by_hand():
   )
 
 
+@pytest.mark.slow
 def test_evaluation_that_is_cut_off_goes_on(config, folder, lived, monkeypatch):
   """Killed in the run, interrupted in the second batch: neither lost nor twice, and the first batch
   is not lived again.

@@ -783,6 +783,7 @@ def test_publishing_a_part_keeps_the_others(mjx, refused, tmp_path):  # noqa: F8
   )
 
 
+@pytest.mark.slow
 def test_runs_of_one_kind_share_their_program(mini, tmp_path, programs):  # noqa: F811
   """Severity, seeds, length and the numbers of AdaptConfig are not in it; detector, form and
   learning rate are.
@@ -859,6 +860,7 @@ def test_a_reward_that_is_no_number_ends_a_run_in_one_line(mini, tmp_path):  # n
   again.checkpoints.close()
 
 
+@pytest.mark.slow
 def test_a_stream_whose_loss_fails_is_given_up_alone_and_named(mini, tmp_path, same, capfd):  # noqa: F811
   """Seed 1's replay gets a reward that is no number: its weights stay as they were, it lives on,
   the other stream lives as if nothing had been.

@@ -61,6 +61,7 @@ def compiled(suite, folder):
   runner.checkpoints.close()
 
 
+@pytest.mark.slow
 def test_side_by_side_is_as_one_after_the_other(mjx, refused, mini, tmp_path, monkeypatch):  # noqa: F811
   """The same streams live the same lives on the same share of the cores."""
   own = workers.cores()

@@ -89,6 +89,7 @@ def test_shaped_reward_is_the_demonstrators_alone():
   assert shaped.spec is env.spec and demonstrator.brax_env(shaped).observation_size == 48
 
 
+@pytest.mark.slow
 def test_ppo_trains_the_walker_through_the_adapter(short_walker, tmp_path):
   """A short run of brax's PPO: every layer of the policy moves, its statistics are those of what
   the robots saw.

@@ -13,7 +13,7 @@ from mjx_cl.rollout.scan import Rollout, start
 from mjx_cl.training import evaluate
 
 
-@pytest.fixture(scope="module", params=["car", "walker"])
+@pytest.fixture(scope="module", params=[pytest.param("car", marks=pytest.mark.slow), "walker"])
 def case(request):
   env = envs.make(request.param, "native")
   env.spec = env.spec._replace(episode_steps=30)

@@ -77,6 +77,7 @@ def poisoned(state, g, value):
   return state._replace(train=state.train._replace(params=params))
 
 
+@pytest.mark.slow
 def test_by_vmap_is_by_map(short_walker, tmp_path):
   """Both ways over the seeds give the same weights, replay, metrics and culprits: one seed sound,
   one that fails in its first update, one that is not active.
@@ -249,6 +250,7 @@ np.savez({out!r} + "/saved.npz", *saved.values())
 """
 
 
+@pytest.mark.slow
 def test_two_devices_equal_one(short_walker, tmp_path, monkeypatch):
   """The same training on one device, here, and on two of a process of its own; the programs differ,
   so bits may.

@@ -92,6 +92,7 @@ def expert_path(tmp_path_factory):
   return str(path)
 
 
+@pytest.mark.slow
 def test_an_update_refreshes_the_latents_that_it_was_taken_on(short_walker, tmp_path):
   """Stored latents are put to nought: after updates the sampled windows hold new ones, other
   records none.
@@ -151,6 +152,7 @@ def test_resume_gives_the_same_bits(short_walker, tmp_path, same):
   assert timeless(second.rows) == timeless(whole.rows)
 
 
+@pytest.mark.slow
 def test_randomised_faults_are_drawn_anew_with_each_episode(short_walker, tmp_path, same):
   """Targets and severities of 40 robots whose episodes last 12 of 64 steps: new ones each chunk,
   uniform below the given severity; the same after resume.
@@ -195,6 +197,7 @@ def test_randomised_faults_are_drawn_anew_with_each_episode(short_walker, tmp_pa
     train.Trainer(short_walker, DREAMER, TrainConfig(fault="geer"), tmp_path)
 
 
+@pytest.mark.slow
 def test_a_preset_is_trained_under_as_it_is(short_walker, tmp_path):
   """Severities, clocks and the targets that it names, for every robot, and still after a new draw;
   a target that it leaves open is drawn.
@@ -527,6 +530,7 @@ def test_first_update_waits_for_windows_and_pays_no_backlog(short_walker, tmp_pa
   assert all(n == (8 if ready else 0) for ready, n in counts)
 
 
+@pytest.mark.slow
 def test_published_protocol_starts_after_2048_records(tmp_path):
   """16 robots, windows of 65: 1,024 of them exist after 128 vector steps. From there one update per
   record at ratio 1,024: about 498k by 500k records.
