@@ -26,7 +26,7 @@ def test_the_agents_that_ship_are_those_that_acted(shipped):
 
 
 def test_what_the_docs_say_of_it(shipped):
-  m, text = shipped.meta, (ROOT / "docs/detection.md").read_text()
+  m, text = shipped.meta, (ROOT / "docs/recordings.md").read_text()
   hours = {
     r: sum(
       m["steps"][k] * m["control_s"][k]
@@ -48,9 +48,29 @@ def test_what_the_docs_say_of_it(shipped):
   assert files <= 20e6
 
 
+def test_duckdb_reads_it(shipped, monkeypatch, capsys):
+  text = (ROOT / "docs/recordings.md").read_text()
+  code = re.search(r"```python\n(# mean\.py.*?)```", text, re.DOTALL)[1]
+  monkeypatch.chdir(ROOT)
+  exec(compile(code.replace("print(", "keep("), "mean.py", "exec"), {"keep": (held := []).append})
+  rows = held[0].fetchall()
+  fault, severity, opr, _ = rows[0]
+  own = [
+    k for k in range(len(shipped.meta["stream"])) if all(
+      shipped.meta[name][k] == value for name, value in
+      dict(robot="walker", kind="fault", split="score", fault=fault, severity=severity).items()
+    )
+  ]  # fmt: skip
+  values = np.concatenate([
+    shipped.get("walker", [int(shipped.meta["stream"][k])]).residual.opr[int(shipped.meta["onset"][k]) :, 0] for k in own
+  ])  # fmt: skip
+  # float32 as stored, averaged in float64 by both
+  assert len(rows) == 5 and opr == pytest.approx(float(np.nanmean(values.astype(float))), rel=1e-6)
+
+
 def test_pandas_alone_joins_a_stream(shipped):
   code = re.search(
-    r"```python\n(# join\.py.*?)```", (ROOT / "docs/detection.md").read_text(), re.DOTALL
+    r"```python\n(# join\.py.*?)```", (ROOT / "docs/recordings.md").read_text(), re.DOTALL
   ).group(1)
   held = {}
   exec(compile(code, "join.py", "exec"), held)
