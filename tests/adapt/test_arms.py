@@ -772,6 +772,7 @@ def test_events_say_what_started_and_ended_each_arm(lived):
     ), name
 
 
+@pytest.mark.slow
 def test_the_robot_of_arm_no_fault_never_breaks(lived):
   out = lived(NAMES)
   for name in NAMES:
@@ -812,6 +813,7 @@ def test_the_robot_of_arm_no_fault_never_breaks(lived):
   assert summary["false_alarms_per_hour"] == pytest.approx(len(alarms) / (LIFE * 0.025 / 3600))
 
 
+@pytest.mark.slow
 def test_what_false_alarms_cost(lived):
   """From the first start to the onset, to the end for a robot that never breaks: reward_pre less
   the reward.
@@ -842,6 +844,7 @@ def test_what_false_alarms_cost(lived):
   assert recovery.return_lost_healthy(np.ones(4), 3, None, 1) is None
 
 
+@pytest.mark.slow
 def test_the_ledger_of_each_arm(lived):
   out = lived(NAMES)
   summary = json.loads((out / "summary.json").read_text())
