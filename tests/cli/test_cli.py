@@ -846,3 +846,17 @@ sys.exit(cli.main())
     out.stderr.splitlines() == ["mjx-cl: stopping after this chunk, saving", "mjx-cl: interrupted"]
     and "late" not in out.stdout
   )
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="no bash on this machine")
+def test_bash_completes_a_flag(mjx, tmp_path):
+  code, script, _ = mjx("--tyro-print-completion", "bash")
+  (tmp_path / "mjx-cl").write_text(script)
+  ask = """
+    source mjx-cl; own=$(complete -p mjx-cl | sed -E 's/.*-F ([^ ]+).*/\\1/')
+    COMP_WORDS=(mjx-cl run walker --detec); COMP_CWORD=3
+    COMP_LINE="mjx-cl run walker --detec"; COMP_POINT=${#COMP_LINE}
+    $own mjx-cl --detec walker; echo "${COMPREPLY[@]}"
+  """
+  done = subprocess.run(["bash", "-c", ask], cwd=tmp_path, capture_output=True, text=True)
+  assert (code, done.stdout.strip()) == (0, "--detector"), done.stderr
