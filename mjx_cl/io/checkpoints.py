@@ -8,6 +8,7 @@ import pathlib
 import re
 import shutil
 import sys
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -139,13 +140,22 @@ class Checkpoints:
       )
       self._manager.wait_until_finished()
     except (OSError, ValueError) as e:  # threads of TensorStore may go on complaining
-      for left in self.folder.glob(f"{number}.orbax-checkpoint-tmp*"):
-        shutil.rmtree(left, ignore_errors=True)
+      self._clear(number)
       raise FileError(
         f"cannot write checkpoint {number} in {self.folder}: {_reason(e)}; the earlier ones are "
         "intact"
       ) from None
     sys.unraisablehook = before
+
+  def _clear(self, number: int) -> None:
+    """Removes a checkpoint that was not finished; threads may be writing to it for a while yet."""
+    for _ in range(50):
+      unfinished = list(self.folder.glob(f"{number}.orbax-checkpoint-tmp*"))
+      if not unfinished:
+        return
+      for folder in unfinished:
+        shutil.rmtree(folder, ignore_errors=True)
+      time.sleep(0.1)
 
   def load(self, like: Any) -> tuple[Any, dict[str, Any]]:
     """Newest checkpoint that can be read, (tree, meta), for a tree like `like`, or, where that is
