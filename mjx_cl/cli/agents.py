@@ -6,7 +6,7 @@ import pathlib
 from typing import Any
 
 from mjx_cl import envs
-from mjx_cl.cli import trainings
+from mjx_cl.cli import track, trainings
 from mjx_cl.cli.flags import Eval, Train
 from mjx_cl.cli.live import TrainDisplay
 from mjx_cl.cli.output import command_line, emit, say
@@ -29,6 +29,7 @@ MOST_EPISODES = 10_000  # all at once in one program
 
 def do_train(args: Train) -> None:
   """Trains agents."""
+  track.check(args.track)
   on = trainings.asked(args)
   dreamer, config = chosen(args)
   env = envs.make(args.env, args.physics)
@@ -80,8 +81,17 @@ def trained(
     command,
     state == "resume",
   )
-  with TrainDisplay(config.updates) as display:
-    trainer.run(training, display, args.save_every_s)
+  going_on = state == "resume"
+  with (
+    TrainDisplay(config.updates) as display,
+    track.tracked(args.out, args.track, going_on) as write,
+  ):
+
+    def show(row: dict[str, Any]) -> None:
+      display(row)
+      write(*track.of_training(row))
+
+    trainer.run(training, show, args.save_every_s)
   card = files.export(training)
   if not args.json:
     say(

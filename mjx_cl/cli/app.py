@@ -283,6 +283,9 @@ def main(argv: list[str] | None = None) -> int:
       with contextlib.suppress(OSError, ValueError):
         stream.flush()
     os._exit(status)
+  if argv is None:  # all is done: what comes now finds an interpreter that is clearing up
+    for number in (signal.SIGINT, signal.SIGTERM):
+      signal.signal(number, signal.SIG_IGN)
   return status
 
 

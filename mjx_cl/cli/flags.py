@@ -27,6 +27,7 @@ class Run(RunConfig):
     out: Result folder.
     quick: A whole loop in about two minutes, for a first look: other defaults of fault, seeds,
       onset, steps and stop rule, for walker, quadruped and car.
+    track: Curves for other tools as well: tensorboard (OUT/tensorboard), csv (OUT/curves.csv).
     json: One JSON value on standard output, nothing else there.
     resume: Go on with a run that was cut off.
     overwrite: Replace an earlier run in --out.
@@ -34,6 +35,7 @@ class Run(RunConfig):
 
   out: str = "runs/latest"
   quick: bool = False
+  track: tuple[str, ...] = ()
   json: bool = False
   resume: bool = False
   overwrite: bool = False
@@ -57,6 +59,7 @@ class Train(GpuMachines):
     seeds: Agents trained side by side; their parameters share one program. On ray: a training of
       its own each, in OUT/seed-N.
     save_every_s: Seconds between checkpoints.
+    track: Curves for other tools as well: tensorboard (OUT/tensorboard), csv (OUT/curves.csv).
     resume: Go on with a training that was cut off, with the settings it began with; `updates`
       may be others.
     overwrite: Replace an earlier training in --out, its agent and its demonstrator too.
@@ -72,6 +75,7 @@ class Train(GpuMachines):
   seeds: int = 1
   physics: str = "auto"
   save_every_s: float = 240.0
+  track: tuple[str, ...] = ()
   json: bool = False
   resume: bool = False
   overwrite: bool = False

@@ -6,6 +6,7 @@ import pathlib
 import re
 from collections.abc import Collection, Mapping, Sequence
 
+from mjx_cl.cli import track
 from mjx_cl.cli.flags import Bench, Run
 from mjx_cl.cli.live import RunDisplay
 from mjx_cl.cli.machines import WORKER
@@ -15,6 +16,7 @@ from mjx_cl.config import RunConfig, quick
 from mjx_cl.errors import UserError, require
 from mjx_cl.io import folders, memory
 from mjx_cl.runs import bench, cluster, costs, run, workers
+from mjx_cl.runs.runner import Progress
 from mjx_cl.runs.suite import Part, Suite, finished, pick, standing, suite
 
 
@@ -23,8 +25,15 @@ def do_run(args: Run) -> None:
   config = RunConfig(**{f.name: getattr(args, f.name) for f in dataclasses.fields(RunConfig)})
   if args.quick:
     say(f"note: {quick.said(config)}")
-  with RunDisplay() as display:
-    summary = run.execute(config, args.out, args.resume, args.overwrite, display, tell=say)
+  track.check(args.track)
+  with RunDisplay() as display, track.tracked(args.out, args.track, args.resume) as write:
+
+    def show(p: Progress) -> None:
+      display(p)
+      if not p.note:
+        write(*track.of_run(p))
+
+    summary = run.execute(config, args.out, args.resume, args.overwrite, show, tell=say)
   if args.keep and not pathlib.Path(args.out, "agents").is_dir():
     say("note: --keep wrote no agent, since no stream has finetuned")
   if args.json:

@@ -9,12 +9,12 @@ import jax
 
 from mjx_cl.config import kinds
 from mjx_cl.detectors import combine
-from mjx_cl.detectors.base import Detector, Real, Setting
+from mjx_cl.detectors.base import Alarm, Detector, Real, Setting
 from mjx_cl.detectors.paper_rule import CALIBRATED, calibrated_rule, one_threshold, paper_rule
 from mjx_cl.detectors.rolling_sigma import rolling_sigma
 from mjx_cl.detectors.table import factory, split
 from mjx_cl.detectors.thresholds import Threshold, board
-from mjx_cl.errors import UserError
+from mjx_cl.errors import PluginError, UserError
 
 
 def calibrated(name: str, robot: str, settings: dict) -> Threshold | None:
@@ -104,9 +104,23 @@ def _pure(name: str, factory: Callable[..., Any]) -> Callable[..., Detector]:
           else ", a pure init/update pair as in mjx_cl/detectors/cusum.py"
         )
       )
-    return detector
+    return _answering(name, detector)
 
   return build
+
+
+def _answering(name: str, detector: Detector) -> Detector:
+  """`detector`, whose answers are looked at as a program is traced with it."""
+
+  def update(state: Any, x: Any) -> tuple[Any, Alarm]:
+    answer = detector.update(state, x)
+    sound = isinstance(answer, tuple) and len(answer) == 2 and isinstance(answer[1], Alarm)
+    if not sound:
+      given = type(answer[1] if isinstance(answer, tuple) and len(answer) == 2 else answer).__name__
+      raise PluginError(f"detector {name!r}: update gives {given} in place of (state, Alarm)")
+    return answer
+
+  return detector._replace(update=update)
 
 
 def _figures(name: str, build: Callable[..., Any], robot: str | None, shared: bool) -> dict:

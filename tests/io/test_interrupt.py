@@ -42,10 +42,10 @@ def test_a_signal_within_a_write_is_acted_on_between_two_chunks(monkeypatch):
 
 
 IN_C = """
-import contextlib, hashlib, signal, sys
+import hashlib, signal, sys
 from mjx_cl.io.interrupt import enforced
-signal.signal(signal.SIGINT, signal.default_int_handler)
-with contextlib.suppress(KeyboardInterrupt), enforced(0.2):
+signal.signal(signal.SIGINT, lambda *_: None)  # one that raises could come before the C code does
+with enforced(0.2):
   print("begun", flush=True)
   hashlib.pbkdf2_hmac("sha256", b"", b"", int(sys.argv[1]))  # Python hears nothing meanwhile
 print("ended", flush=True)

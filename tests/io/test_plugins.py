@@ -694,6 +694,8 @@ number.__doc__ = 3.5
 def late(threshold=1.0):
   def update(state, x): raise SystemExit(0)
   return mjx_cl.detectors.Detector(lambda: (), update)
+def words(threshold=1.0):
+  return mjx_cl.detectors.Detector(lambda: (), lambda state, x: "no answer")
 """
 
 
@@ -705,6 +707,7 @@ def late(threshold=1.0):
     ("own", "Own: its message cannot be read"),
     ("number", "gives int in place of a Detector"),
     ("late", "SystemExit: 0"),
+    ("words", "update gives str in place of (state, Alarm)"),
   ],
 )
 @pytest.mark.parametrize("command", ["run", "leaderboard"])
