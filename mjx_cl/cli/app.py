@@ -58,7 +58,7 @@ COMMANDS = {
   Leaderboard: "board",
   Bench: "runs",
   Plot: "results",
-  Compare: "results",
+  Compare: "comparison",
   Render: "robots",
   Query: "results",
   Detect: "log",

@@ -1,24 +1,20 @@
-"""The commands plot, compare, query and report: what result files say. Free of JAX but where
+"""The commands plot, query and report: what result files say. Free of JAX but where
 figures are drawn anew.
 """
 
 import decimal
 import importlib
 import math
-import os
 import pathlib
 import sys
 import types
 from typing import Any
 
-from rich import box
-
-from mjx_cl.cli.flags import Compare, Plot, Query, Report
+from mjx_cl.cli.flags import Plot, Query, Report
 from mjx_cl.cli.output import emit, say
 from mjx_cl.cli.tables import console, table
-from mjx_cl.errors import FileError, choose, require
+from mjx_cl.errors import FileError, require
 from mjx_cl.io import tables
-from mjx_cl.scoring import versus
 
 FIRST = 100  # rows that are printed unless more are asked for, and under one heading
 
@@ -32,59 +28,6 @@ def do_plot(args: Plot) -> None:
     f"{args.folder} holds no finished run (no trace.parquet)",
   )
   print(figures.figure(args.folder))
-
-
-def do_compare(args: Compare) -> None:
-  """Compares runs, or arms of one."""
-  require(args.runs, "compare takes folders of runs: FOLDER or FOLDER:ARM ...")
-  for measure in args.measure:
-    choose("measure", measure, versus.MEASURES)
-  out = None if args.out is None else pathlib.Path(args.out)
-  if out is not None:
-    require(out.suffix == ".png", f"--out is a picture, .png; got {args.out}")
-    require(not out.is_dir(), f"--out {out} is a folder")
-    require(args.overwrite or not out.exists(), f"{out} is there; --overwrite replaces it")
-  found = versus.variants(list(args.runs))
-  if other := versus.unlike(found):
-    say(f"mjx-cl: these runs differ in {', '.join(other)}")
-  rows = [r for r in versus.compare(found) if not args.measure or r["measure"] in args.measure]
-  if args.json:
-    emit(rows)
-  else:
-    _show_comparison(rows, found[0].name)
-  if out is not None:
-    from mjx_cl.render import figures
-
-    print(figures.versus(found, out), file=sys.stderr if args.json else sys.stdout)
-
-
-def _show_comparison(rows: list[dict], first: str) -> None:
-  """A table for each measure: a line for each variant, intervals beneath the numbers."""
-  number = lambda x: "-" if x is None else f"{x:.3g}" if abs(x) < 1e3 else f"{x:.0f}"
-  between = lambda x: "" if x is None else f"\n[{number(x[0])}, {number(x[1])}]"
-  shared = os.path.commonprefix([row["variant"] for row in rows]).rfind("/") + 1
-  heads = ("variant", "n", "IQM", "pairs", "difference", "better")
-  for measure in dict.fromkeys(row["measure"] for row in rows):
-    cells = []
-    for row in (row for row in rows if row["measure"] == measure):
-      own = row["variant"] == first
-      cells.append(
-        (
-          row["variant"][shared:],
-          row["streams"],
-          number(row["iqm"]) + between(row["iqm_ci"]),
-          "" if own else row["pairs"],
-          "" if own else number(row["difference"]) + between(row["difference_ci"]),
-          "" if own else "-" if row["better"] is None else f"{row['better']:.0%}",
-        )
-      )
-    title = f"{measure}: {versus.MEASURES[measure][0]}"
-    close = {"box": box.SIMPLE, "pad_edge": False, "collapse_padding": True}
-    console().print(table(heads, cells, left=("variant",), title=title, **close))
-  print(
-    f"n: streams; IQM: interquartile mean; difference: from {first[shared:]}, mean over pairs of "
-    "one seed; better: of pairs; [95 % interval]"
-  )
 
 
 def do_query(args: Query) -> None:
