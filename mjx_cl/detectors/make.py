@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+import numpy as np
 
 from mjx_cl.config import kinds
 from mjx_cl.detectors import combine
@@ -15,6 +16,7 @@ from mjx_cl.detectors.rolling_sigma import rolling_sigma
 from mjx_cl.detectors.table import factory, split
 from mjx_cl.detectors.thresholds import Threshold, board
 from mjx_cl.errors import PluginError, UserError
+from mjx_cl.io.plugins import line
 
 
 def calibrated(name: str, robot: str, settings: dict) -> Threshold | None:
@@ -112,15 +114,31 @@ def _pure(name: str, factory: Callable[..., Any]) -> Callable[..., Detector]:
 def _answering(name: str, detector: Detector) -> Detector:
   """`detector`, whose answers are looked at as a program is traced with it."""
 
+  def init() -> Any:
+    state = _asked(f"detector {name!r}: init", detector.init)
+    for leaf in jax.tree.leaves(state):
+      if not isinstance(leaf, (jax.Array, np.ndarray, np.generic, int, float)):
+        given = type(leaf).__name__
+        raise PluginError(f"detector {name!r}: init gives {given} in place of arrays")
+    return state
+
   def update(state: Any, x: Any) -> tuple[Any, Alarm]:
-    answer = detector.update(state, x)
+    answer = _asked(f"detector {name!r}: update", detector.update, state, x)
     sound = isinstance(answer, tuple) and len(answer) == 2 and isinstance(answer[1], Alarm)
     if not sound:
       given = type(answer[1] if isinstance(answer, tuple) and len(answer) == 2 else answer).__name__
       raise PluginError(f"detector {name!r}: update gives {given} in place of (state, Alarm)")
     return answer
 
-  return detector._replace(update=update)
+  return detector._replace(init=init, update=update)
+
+
+def _asked(where: str, function: Callable, *args: Any) -> Any:
+  """What foreign code answers; a StopIteration would end a generator of ours without a word."""
+  try:
+    return function(*args)
+  except StopIteration as e:
+    raise PluginError(f"{where} raised {line(e)}") from None
 
 
 def _figures(name: str, build: Callable[..., Any], robot: str | None, shared: bool) -> dict:

@@ -696,6 +696,10 @@ def late(threshold=1.0):
   return mjx_cl.detectors.Detector(lambda: (), update)
 def words(threshold=1.0):
   return mjx_cl.detectors.Detector(lambda: (), lambda state, x: "no answer")
+def unlike(threshold=1.0):
+  return mjx_cl.detectors.Detector(lambda: "no state", lambda state, x: state)
+def iterates(threshold=1.0):
+  return mjx_cl.detectors.Detector(lambda: next(iter(())), lambda state, x: state)
 """
 
 
@@ -708,6 +712,8 @@ def words(threshold=1.0):
     ("number", "gives int in place of a Detector"),
     ("late", "SystemExit: 0"),
     ("words", "update gives str in place of (state, Alarm)"),
+    ("unlike", "init gives str in place of arrays"),
+    ("iterates", "init raised StopIteration"),
   ],
 )
 @pytest.mark.parametrize("command", ["run", "leaderboard"])
