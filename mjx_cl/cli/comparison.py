@@ -25,7 +25,7 @@ def do_compare(args: Compare) -> None:
     require(args.overwrite or not out.exists(), f"{out} is there; --overwrite replaces it")
   found = versus.variants(list(args.runs))
   if other := versus.unlike(found):
-    say(f"mjx-cl: these runs differ in {', '.join(other)}")
+    say(f"note: these runs differ in {', '.join(other)}")
   rows = [r for r in versus.compare(found) if not args.measure or r["measure"] in args.measure]
   if args.json:
     emit(rows)

@@ -29,7 +29,7 @@ def do_detect(args: Detect) -> None:
   if out:
     results.write(result, out)
   for note in result.summary["notes"]:
-    say(f"mjx-cl: {note}")
+    say(f"note: {note}")
   if args.json:
     emit(result.summary)
   else:

@@ -64,7 +64,7 @@ def do_render(args: Render) -> None:
     acting |= {"agent": trained.agent, "params": trained.train.params}
     acting["repeat"] = trained.repeat
   size = (args.steps, args.width, args.height, args.fps)
-  tell = lambda text: say(f"mjx-cl: {text}")
+  tell = lambda text: say(f"note: {text}")
   result = pictures.render(env, out, *size, view=args.view, say=tell, **acting)
   if args.json:
     emit({"env": args.env, "agent": args.agent or args.env, "fault": args.fault, **result})

@@ -450,7 +450,7 @@ def test_notes_are_printed_and_written(tmp_path, mjx):
     and summary["ignored"] == ["mode"]
   )
   assert len(summary["notes"]) == 2 and err.splitlines() == [
-    f"mjx-cl: {note}" for note in summary["notes"]
+    f"note: {note}" for note in summary["notes"]
   ]
 
 
