@@ -140,6 +140,7 @@ def test_run_takes_every_setting_of_a_run():
   assert given.target is None and given.adapt.ratio == 2.0
   flags = {f.name for f in dataclasses.fields(app.Run)} - {
     "out",
+    "track",
     "quick",
     "json",
     "resume",
