@@ -18,7 +18,7 @@ from pymdownx import slugs
 ROOT = pathlib.Path(__file__).parents[1]
 SHOWN = {".png", ".gif", ".html"}  # what a page may link to beside pages
 LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^)#\s]+)?(#[^)\s]+)?\)")
-ROBOTS = {"walker": "walker", "quadruped": "quadruped", "car": "car", "car_real": "car_real"}
+ROBOTS = ("walker", "quadruped", "car", "car_real")
 FAULTS = {
   "Motors": "actuator",
   "Sensors": "sensor",
@@ -87,8 +87,8 @@ def reference() -> dict[str, dict[str, str]]:
   for title, module in FAULTS.items():
     about = "What each does, and to which robots: [faults](../faults.md).\n\n"
     pages["Faults"][title] = f"# {title}\n\n{about}::: mjx_cl.faults.{module}\n"
-  for title, module in ROBOTS.items():
-    pages["Robots"][title] = f"# {title}\n\n::: mjx_cl.envs.{module}\n"
+  for name in ROBOTS:
+    pages["Robots"][name] = f"# {name}\n\n::: mjx_cl.envs.{name}\n"
   for title, module in API.items():
     pages["API"][title] = f"# {title}\n\n::: mjx_cl.{module}\n"
   return pages
@@ -106,7 +106,7 @@ def on_config(config: Any) -> Any:
     -1, {"Reference": [{s: [{t: uri(s, t)} for t in own]} for s, own in reference().items()]}
   )
   shown = {page for _, page in _leaves(config.nav)}
-  own = {f"{p.split('/')[1]}": p for p in sources() if p.startswith("results/") and p not in shown}
+  own = {p.split("/")[1]: p for p in sources() if p.startswith("results/") and p not in shown}
   results = next(
     own_nav for part in config.nav for title, own_nav in part.items() if title == "Results"
   )

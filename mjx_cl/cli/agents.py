@@ -81,10 +81,9 @@ def trained(
     command,
     state == "resume",
   )
-  going_on = state == "resume"
   with (
     TrainDisplay(config.updates) as display,
-    track.tracked(args.out, args.track, going_on) as write,
+    track.tracked(args.out, args.track, state == "resume") as write,
   ):
 
     def show(row: dict[str, Any]) -> None:

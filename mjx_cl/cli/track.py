@@ -46,7 +46,6 @@ def tracked(
     kinds: of KINDS.
     resume: keeps what is there.
   """
-  check(kinds)
   home, writer, table, file = pathlib.Path(out), None, None, None
 
   def start() -> None:

@@ -124,9 +124,10 @@ def _answering(name: str, detector: Detector) -> Detector:
 
   def update(state: Any, x: Any) -> tuple[Any, Alarm]:
     answer = _asked(f"detector {name!r}: update", detector.update, state, x)
-    sound = isinstance(answer, tuple) and len(answer) == 2 and isinstance(answer[1], Alarm)
-    if not sound:
-      given = type(answer[1] if isinstance(answer, tuple) and len(answer) == 2 else answer).__name__
+    pair = isinstance(answer, tuple) and len(answer) == 2
+    alarm = answer[1] if pair else answer
+    if not pair or not isinstance(alarm, Alarm):
+      given = type(alarm).__name__
       raise PluginError(f"detector {name!r}: update gives {given} in place of (state, Alarm)")
     return answer
 

@@ -64,9 +64,7 @@ def threads(count: int, name: str = "") -> Iterator[concurrent.futures.ThreadPoo
 
 
 _SENT: list[int] = []  # signals that have come and were acted upon
-_RAISED = (
-  threading.Event()
-)  # of a command: a KeyboardInterrupt was raised, and may have been dropped
+_RAISED = threading.Event()  # `stop` has raised, and what it raised may have been dropped
 
 
 def note(number: int) -> None:

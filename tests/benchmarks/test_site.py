@@ -1,5 +1,5 @@
-"""The site: built strictly, nothing fetched from elsewhere, every link and anchor leads somewhere; the
-tutorials run as they stand there, with smaller numbers.
+"""The site: built strictly, nothing fetched from elsewhere, every link and anchor leads somewhere;
+the tutorials run as they stand there, with smaller numbers.
 """
 
 import html.parser

@@ -48,22 +48,18 @@ def test_what_the_docs_say_of_it(shipped):
   assert files <= 20e6
 
 
-def test_duckdb_reads_it(shipped, monkeypatch, capsys):
+def test_duckdb_reads_it(shipped, monkeypatch):
   text = (ROOT / "docs/recordings.md").read_text()
   code = re.search(r"```python\n(# mean\.py.*?)```", text, re.DOTALL)[1]
   monkeypatch.chdir(ROOT)
   exec(compile(code.replace("print(", "keep("), "mean.py", "exec"), {"keep": (held := []).append})
   rows = held[0].fetchall()
   fault, severity, opr, _ = rows[0]
-  own = [
-    k for k in range(len(shipped.meta["stream"])) if all(
-      shipped.meta[name][k] == value for name, value in
-      dict(robot="walker", kind="fault", split="score", fault=fault, severity=severity).items()
-    )
-  ]  # fmt: skip
-  values = np.concatenate([
-    shipped.get("walker", [int(shipped.meta["stream"][k])]).residual.opr[int(shipped.meta["onset"][k]) :, 0] for k in own
-  ])  # fmt: skip
+  m = shipped.meta
+  wanted = dict(robot="walker", kind="fault", split="score", fault=fault, severity=severity)
+  streams = [k for k in range(len(m["stream"])) if all(m[n][k] == v for n, v in wanted.items())]
+  read = lambda k: shipped.get("walker", [int(m["stream"][k])]).residual.opr[:, 0]
+  values = np.concatenate([read(k)[int(m["onset"][k]) :] for k in streams])
   # float32 as stored, averaged in float64 by both
   assert len(rows) == 5 and opr == pytest.approx(float(np.nanmean(values.astype(float))), rel=1e-6)
 

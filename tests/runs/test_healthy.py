@@ -108,10 +108,7 @@ def test_the_newest_pasts_are_kept():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-  "robot",
-  ["walker", *(pytest.param(name, marks=pytest.mark.slow) for name in ("quadruped", "car"))],
-)
+@pytest.mark.parametrize("robot", ["walker", "quadruped", "car"])
 def test_a_chunk_fills_what_a_fault_remembers(robot):
   """Of every fault of a robot, one on each stream: there from the start, and put in place of a
   healthy robot's a chunk before that of the onset.

@@ -844,23 +844,6 @@ def test_progress_that_nobody_reads_ends_no_work(monkeypatch, tmp_path):
   assert notes[-1] == "save" and sys.stderr is not broken  # what is said from now on goes nowhere
 
 
-def test_a_signal_inside_of_jaxs_collector_is_not_lost():
-  """Python drops what is raised in JAX's callback of the garbage collector; the interrupt comes a
-  moment later.
-  """
-
-  def _xla_gc_callback():
-    signal.raise_signal(signal.SIGINT)
-
-  def do():
-    _xla_gc_callback()
-    for _ in range(200):
-      time.sleep(0.01)
-    raise AssertionError("the interrupt was lost")
-
-  assert app.attempt(do) == 130
-
-
 # ---- agents --------------------------------------------------------------------------------------
 
 
