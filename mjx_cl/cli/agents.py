@@ -83,13 +83,8 @@ def trained(
   )
   with (
     TrainDisplay(config.updates) as display,
-    track.tracked(args.out, args.track, state == "resume") as write,
+    track.beside(display, track.of_training, args.out, args.track, state == "resume") as show,
   ):
-
-    def show(row: dict[str, Any]) -> None:
-      display(row)
-      write(*track.of_training(row))
-
     trainer.run(training, show, args.save_every_s)
   card = files.export(training)
   if not args.json:

@@ -16,7 +16,6 @@ from mjx_cl.config import RunConfig, quick
 from mjx_cl.errors import UserError, require
 from mjx_cl.io import folders, memory
 from mjx_cl.runs import bench, cluster, costs, run, workers
-from mjx_cl.runs.runner import Progress
 from mjx_cl.runs.suite import Part, Suite, finished, pick, standing, suite
 
 
@@ -26,13 +25,10 @@ def do_run(args: Run) -> None:
   if args.quick:
     say(f"note: {quick.said(config)}")
   track.check(args.track)
-  with RunDisplay() as display, track.tracked(args.out, args.track, args.resume) as write:
-
-    def show(p: Progress) -> None:
-      display(p)
-      if not p.note:
-        write(*track.of_run(p))
-
+  with (
+    RunDisplay() as display,
+    track.beside(display, track.of_run, args.out, args.track, args.resume) as show,
+  ):
     summary = run.execute(config, args.out, args.resume, args.overwrite, show, tell=say)
   if args.keep and not pathlib.Path(args.out, "agents").is_dir():
     say("note: --keep wrote no agent, since no stream has finetuned")

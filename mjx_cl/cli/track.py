@@ -33,6 +33,35 @@ def check(kinds: Collection[str]) -> None:
 
 
 @contextmanager
+def beside(
+  shown: Callable[[Any], object],
+  of: Callable[[Any], tuple[int, dict[str, float]]],
+  out: str,
+  kinds: Collection[str],
+  resume: bool,
+) -> Iterator[Callable[[Any], object]]:
+  """Gives `shown` that also writes the curves of what it shows; without kinds `shown` itself.
+
+  Args:
+    shown: display of a row or Progress.
+    of: of_training or of_run.
+    out: as in `tracked`.
+    kinds: of KINDS.
+    resume: as in `tracked`.
+  """
+  if not kinds:
+    yield shown
+    return
+  with tracked(out, kinds, resume) as write:
+
+    def both(what: Any) -> None:
+      shown(what)
+      write(*of(what))
+
+    yield both
+
+
+@contextmanager
 def tracked(
   out: str, kinds: Collection[str], resume: bool
 ) -> Iterator[Callable[[int, Mapping[str, float]], None]]:
@@ -66,7 +95,7 @@ def tracked(
         table.writerow(("step", "name", "value"))
 
   def write(step: int, values: Mapping[str, float]) -> None:
-    if kinds and writer is None and table is None:
+    if writer is None and table is None:
       start()  # with the first values: whatever is refused is refused before
     for name, value in values.items():
       if not math.isfinite(value):
@@ -94,8 +123,12 @@ def of_training(row: Mapping[str, Any]) -> tuple[int, dict[str, float]]:
 
 
 def of_run(p: Progress) -> tuple[int, dict[str, float]]:
-  """(control step, reward, phase, alarms and updates of each stream, ARM/SEED/NAME)."""
-  values = {}
+  """(control step, each stream's reward, alarms, updates and whether it adapts, ARM/SEED/NAME);
+  nothing of what is a note alone.
+  """
+  values: dict[str, float] = {}
+  if p.note:
+    return p.step, values
   for k, (arm, seed) in enumerate(zip(p.arms, p.seeds)):
     for name in ("reward", "alarms", "updates"):
       values[f"{arm}/{seed}/{name}"] = float(getattr(p, name)[k])

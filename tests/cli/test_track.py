@@ -48,9 +48,10 @@ def test_both_hold_what_was_written_and_a_resumed_run_goes_on(tmp_path):
 
 
 def test_nothing_is_written_unasked(tmp_path):
-  with track.tracked(str(tmp_path / "new"), (), False) as write:
-    write(1, {"y": 2.0})
-  assert not (tmp_path / "new").exists()
+  seen = []
+  with track.beside(seen.append, track.of_training, str(tmp_path / "new"), (), False) as show:
+    show({"updates": 1, "y": 2.0})
+  assert len(seen) == 1 and not (tmp_path / "new").exists()
 
 
 def test_the_numbers_of_a_run():
@@ -59,6 +60,7 @@ def test_the_numbers_of_a_run():
   step, values = track.of_run(p)
   assert step == 64 and len(values) == 8 and values["oracle/4/reward"] == 0.75
   assert (values["none/3/adapting"], values["oracle/4/adapting"]) == (0.0, 1.0)
+  assert track.of_run(p._replace(note="compiling")) == (64, {})
   assert (values["oracle/4/alarms"], values["oracle/4/updates"]) == (2.0, 9.0)
 
 
