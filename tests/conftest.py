@@ -36,6 +36,8 @@ os.environ["XLA_FLAGS"] = " ".join(
   + os.environ.get("XLA_FLAGS", "").split()
 )
 
+import typed  # noqa: E402, F401  before the package, whose checks it makes
+
 from mjx_cl.io import runtime  # noqa: E402
 
 runtime.setup()

@@ -105,6 +105,7 @@ def judge(trainer, path):
 # shift is off by 0.25 or more.
 
 
+@pytest.mark.slow
 def test_constant_reward_gives_the_geometric_sum_past_the_time_limit(tmp_path):
   env = Probe("constant", 8, lambda coin, step, action: 1.0, limit=True)
   trainer = learnt(env, tmp_path, 768)

@@ -150,6 +150,7 @@ def test_it_goes_on_where_it_was_cut_off(lived):
       assert repr(a[column]) == repr(b[column]), column
 
 
+@pytest.mark.slow
 def test_clock_episodes_and_fault_are_those_of_control_steps(lived):
   config, whole, _, _ = lived
   trace, steps = table(whole, "trace"), np.arange(STEPS)
@@ -169,6 +170,7 @@ def test_clock_episodes_and_fault_are_those_of_control_steps(lived):
   )  # of each step, not of each decision
 
 
+@pytest.mark.slow
 def test_residuals_are_known_once_a_decision(lived):
   """OPR of a decision is known 14 decisions after it, with the last control step of that one."""
   _, whole, _, _ = lived
@@ -183,6 +185,7 @@ def test_residuals_are_known_once_a_decision(lived):
   assert valid[REPEAT - 1 :: REPEAT].mean() > 0.8
 
 
+@pytest.mark.slow
 def test_finetuning_starts_with_the_chunk_of_the_onset_and_is_paid_by_decisions(lived):
   """Chunks are of CHUNK decisions. Updates: the train ratio times the records since the start, over
   the records of an update.

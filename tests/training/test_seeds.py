@@ -35,6 +35,7 @@ def seed(tree, g):
   return jax.tree.map(lambda x: x[g], tree)
 
 
+@pytest.mark.slow
 def test_seeds_in_one_program_are_a_loop_over_them(short_walker, tmp_path):
   trainer = make_trainer(short_walker, tmp_path)
   for _ in range(2):
