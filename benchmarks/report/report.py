@@ -645,7 +645,10 @@ def agents(results: pathlib.Path) -> str:
       trained("walker_learning", "then"),
       falls,
     ),
+    ("`walker-2`", "walker_2_agent/eval.json", trained("walker_2_agent"), falls),
     ("`car`", "car_agent/eval.json", trained("car_agent"), driving),
+    ("`car-2`", "car_2_agent/eval.json", trained("car_2_agent"), driving),
+    ("`car-3`", "car_3_agent/eval.json", trained("car_3_agent"), driving),
     ("the same in `car_real`, unchanged", "car_agent/eval_car_real.json", "", driving),
     (
       "`quadruped`, without a demonstrator",

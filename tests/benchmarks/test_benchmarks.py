@@ -460,6 +460,38 @@ def test_gpu_rows_are_measured_where_there_is_one(monkeypatch):
   assert asked == [{"one": ("size12m", {}), "ten": ("size12m", {"seeds": 10, "how": "vmap"})}]
 
 
+def test_slices_of_an_accelerator_go_on_and_say_what_is_missing(tmp_path, monkeypatch):
+  """What is cut off is begun again by the next call, what is done is not; the time of a run adds
+  up; a machine that has not measured a row says so.
+  """
+  bench, asked, cut = load("accelerator"), [], {"training", "run"}
+  args = types.SimpleNamespace(quick=True, out=tmp_path, minutes=60.0)
+
+  def measured(task, args, left):
+    asked.append(task)
+    return {"machine": "chip"} if task == "machine" else {f"{task.partition('-')[0]}, {task}": 2.0}
+
+  def command(words, out, left):
+    asked.append({"train": "training"}.get(words[0], words[0]))
+    over = asked[-1] not in cut
+    cut.discard(asked[-1])
+    return over
+
+  monkeypatch.setattr(bench, "measured", measured)
+  monkeypatch.setattr(bench, "command", command)
+  monkeypatch.setattr(bench, "trained", lambda out: {"training, 2 seeds": 1234.5})
+  assert [bench.work(args) for _ in range(4)] == [False, False, True, True]
+  streams = [f"streams-{n}" for n in bench.QUICK["streams"]]
+  whole = ["update", "machine", "training", "training", *streams, "run", "run"]
+  assert asked == whole
+  other = tmp_path / "other.json"
+  other.write_text(json.dumps({"machine": "cores", "rows": {"update, update": 4.0}}))
+  lines = bench.table([other, tmp_path / "rows.json"]).splitlines()
+  assert lines[0] == "| | cores | chip |"
+  assert "| update, update [ms] | 4 | 2 |" in lines
+  assert "| training, 2 seeds [records/s] | not measured | 1,234 |" in lines
+
+
 @pytest.mark.parametrize("seeds", [1, 3])
 def test_learning_curve_names_its_axes_and_covers_no_line(tmp_path, monkeypatch, seeds):
   """Two folders in, tables and a figure out: the rows in which episodes ended, the second
