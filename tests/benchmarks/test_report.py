@@ -46,6 +46,11 @@ SOURCES = {
     "car_agent/eval.json",
     "car_agent/eval_car_real.json",
     "car_agent/curve.parquet",
+    *(
+      f"{agent}_agent/{file}"
+      for agent in ("walker_2", "car_2", "car_3")
+      for file in ("eval.json", "curve.parquet")
+    ),
     "quadruped_agent/eval.json",
     "quadruped_cloned/eval.json",
     "quadruped_agent/then.parquet",
@@ -663,7 +668,7 @@ CONSTANTS = {
   "leaderboard-100k": {"100", "100k", "95", "5", "10,000"},
   "physics": {"160", "256", "16", "64", "1,024"},
   "dreamer": {"2,048", "16", "64", "15", "1,024", "256", "1", "12", "32", "40"},
-  "agents": {"95", "0.25", "5"},
+  "agents": {"95", "0.25", "5", "2", "3"},
   "detectors": {"1000"},
   "paper": {"95"}
   | {
