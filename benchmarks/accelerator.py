@@ -1,7 +1,7 @@
 """What an accelerator does with the whole loop, in slices that may be cut off.
 
   python benchmarks/accelerator.py --out runs/gpu                 size12m, slices of 8 minutes
-  python benchmarks/accelerator.py --out runs/rehearsal --quick   the same on any machine, with `tiny`
+  python benchmarks/accelerator.py --out runs/rehearsal --quick   on any machine, with `tiny`
   python benchmarks/accelerator.py --table runs/*/rows.json       machines side by side
 
 A call works for `--minutes` at most, leaves what it has done in OUT and may be called again until
@@ -40,7 +40,7 @@ QUICK = {
 UNITS = {"update": "ms", "streams": "control steps/s", "training": "records/s", "run": "s"}
 
 
-# ---- one measurement, in a process of its own: an accelerator's memory goes with it ----------------
+# ---- one measurement, in a process of its own: an accelerator's memory goes with it --------------
 
 
 def update(plan: dict, rounds: int) -> dict[str, float]:
@@ -89,7 +89,7 @@ def streams(plan: dict, out: pathlib.Path, count: int, rounds: int) -> dict[str,
   return {f"streams, {count} frozen": count * CHUNK / sorted(times[2:])[rounds // 2]}
 
 
-# ---- slices ----------------------------------------------------------------------------------------
+# ---- slices --------------------------------------------------------------------------------------
 
 
 def command(words: list[str], out: pathlib.Path, left: float) -> bool:
@@ -175,7 +175,7 @@ def work(args: argparse.Namespace) -> bool:
   return True
 
 
-# ---- in front ----------------------------------------------------------------------------------------
+# ---- in front ------------------------------------------------------------------------------------
 
 
 def table(files: list[pathlib.Path]) -> str:

@@ -1,4 +1,4 @@
-"""Shapes of the rooms that compute are checked at every call of a test."""
+"""Shapes of the rooms that compute are checked at every call of a test, inner functions apart."""
 
 import jax.numpy as jnp
 import pytest
