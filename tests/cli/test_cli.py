@@ -418,7 +418,7 @@ RUN = {
   "adaptation out of range": (["run", "walker", "--adapt.patience", "0"], ["patience"]),
   "agent that is not there": (
     ["run", "walker", "--agent", "wlaker"],
-    ["wlaker", "shipped: car, quadruped, quadruped-cloned, walker"],
+    ["wlaker", f"shipped: {', '.join(agents.shipped())};"],
   ),
 }
 OTHER = {

@@ -918,7 +918,7 @@ def test_a_related_robot_takes_the_agent():
 def test_load_refuses_what_does_not_fit(saved, tmp_path):
   with pytest.raises(FileError, match="does not fit"):
     agents.load(str(saved), "walker", 25, 6)
-  with pytest.raises(UserError, match="shipped: car, quadruped, quadruped-cloned, walker"):
+  with pytest.raises(UserError, match=f"shipped: {', '.join(agents.shipped())};"):
     agents.load(str(tmp_path / "none"), "walker", 24, 6)
 
 
