@@ -5,25 +5,35 @@ import os
 import pathlib
 import re
 from collections.abc import Collection, Mapping, Sequence
+from typing import NamedTuple
 
 from mjx_cl.cli import track
 from mjx_cl.cli.flags import Bench, Run
 from mjx_cl.cli.live import RunDisplay
 from mjx_cl.cli.machines import WORKER
 from mjx_cl.cli.output import clock, emit, say
-from mjx_cl.cli.tables import show_summary
+from mjx_cl.cli.tables import show_agents, show_summary
 from mjx_cl.config import RunConfig, quick
 from mjx_cl.errors import UserError, require
 from mjx_cl.io import folders, memory
 from mjx_cl.runs import bench, cluster, costs, run, workers
-from mjx_cl.runs.suite import Part, Suite, finished, pick, standing, suite
+from mjx_cl.runs.suite import Part, Suite, by_agent, finished, of_agents, pick, standing, suite
+from mjx_cl.training.agents import of_one_recipe
 
 
 def do_run(args: Run) -> None:
   """Lives the loop and prints its table."""
-  config = RunConfig(**{f.name: getattr(args, f.name) for f in dataclasses.fields(RunConfig)})
+  given = {f.name: getattr(args, f.name) for f in dataclasses.fields(RunConfig)}
+  names = args.agent
+  if "all" in names:
+    require(len(names) == 1, "--agent: 'all' stands alone")
+    names = tuple(of_one_recipe(args.env))
+  config = RunConfig(**given | {"agent": names[0] if len(names) == 1 else None})
   if args.quick:
     say(f"note: {quick.said(config)}")
+  if len(names) > 1:
+    several(args, of_agents(config, names))
+    return
   track.check(args.track)
   with (
     RunDisplay() as display,
@@ -38,6 +48,31 @@ def do_run(args: Run) -> None:
     show_summary(summary, args.out)
 
 
+def several(args: Run, plan: Suite) -> None:
+  """Lives the run of each agent and prints what they say together."""
+  require(not args.track, "--track is of one agent; give one --agent")
+  require(args.stops is None, "--stops is a run of one agent; give one --agent")
+  require(not (args.resume and args.overwrite), "--resume and --overwrite exclude each other")
+  out = folders.usable(args.out)
+  begun = [f for f in (out, *(out / p.name for p in plan.parts)) if (f / "config.json").exists()]
+  require(
+    args.overwrite or not begun or (args.resume and out not in begun),
+    f"{out} holds another run; give --resume to go on with it, --overwrite to replace it, or "
+    "another --out",
+  )
+  for folder in begun if args.overwrite else ():
+    with folders.alone(folder):
+      run.clear(folder)
+  value = live(plan, plan.parts, out)
+  if args.json:
+    emit(value)
+    return
+  apart = {p.config.agent or p.config.env: value["entries"][p.name] for p in plan.parts}
+  for together in value["agents"].values():
+    show_agents(together, apart)
+  print(f"files in {out}")
+
+
 def do_bench(args: Bench) -> None:
   """Runs, plans, merges or publishes a suite."""
   require(args.jobs is None or args.on == "here", "--jobs is of this machine; leave out --on ray")
@@ -47,22 +82,88 @@ def do_bench(args: Bench) -> None:
   check_merge(args.merge, parts)
   if args.publish:
     bench.earlier(args.publish, plan)
+  if args.plan:
+    todo = planned(plan, parts, out, args.merge)
+    if args.json:
+      emit(
+        [
+          {"part": p.name, "finished": p.name in todo.done, **todo.estimates[p.name]._asdict()}
+          for p in parts
+        ]
+      )
+    else:
+      print("\n".join(todo.lines))
+    return
+  value = live(plan, parts, out, args.merge, args.jobs, on)
+  if args.publish:
+    bench.publish(out, plan, args.publish)
+  if args.json:
+    emit(value)
+    return
+  for name, summary in value["entries"].items():
+    print(f"{name}: ", end="")
+    show_summary(summary, str(out / name))
+  for name, own in by_agent(plan.parts).items():
+    if name in value.get("agents", {}):
+      print(f"{name}: ", end="")
+      names = value["agents"][name]["agents"]
+      show_agents(
+        value["agents"][name], {agent: value["entries"][own[agent].name] for agent in names}
+      )
+  print(f"{value['finished']} of {value['parts']} parts finished; files in {out}")
+
+
+class Planned(NamedTuple):
+  """What is left to do of parts.
+
+  Attributes:
+    done: names of those that are finished or found.
+    found: name -> folders of others that it is taken from.
+    estimates: name -> what it costs.
+    lines: the plan for a reader.
+  """
+
+  done: set[str]
+  found: dict[str, list[pathlib.Path]]
+  estimates: dict[str, costs.Estimate]
+  lines: list[str]
+
+
+def planned(
+  plan: Suite, parts: Sequence[Part], out: pathlib.Path, others: Collection[str] = ()
+) -> Planned:
+  """The plan of a suite's parts; whatever can be refused is refused before the first part runs.
+
+  Args:
+    plan: the suite.
+    parts: of it, those that are asked for.
+    out: its folder.
+    others: folders of --merge.
+  """
   done = {p.name for p in parts if finished(out, p)}
-  found = bench.offers(out, parts, args.merge, say)
+  found = bench.offers(out, parts, others, say)
   robots = costs.Robots()
-  for part in parts:  # whatever can be refused is refused before the first part runs
+  for part in parts:
     if part.name not in done and part.name not in found:
       costs.check(part, robots)
   estimates = costs.estimates(parts, robots)
   note_others(out, [p for p in plan.parts if p not in parts])
   done |= set(found)
-  lines = plan_lines(plan, parts, done, estimates)
-  if args.plan:
-    rows = [
-      {"part": p.name, "finished": p.name in done, **estimates[p.name]._asdict()} for p in parts
-    ]
-    emit(rows) if args.json else print("\n".join(lines))
-    return
+  return Planned(done, found, estimates, plan_lines(plan, parts, done, estimates))
+
+
+def live(
+  plan: Suite,
+  parts: Sequence[Part],
+  out: pathlib.Path,
+  others: Collection[str] = (),
+  jobs: int | None = None,
+  on: cluster.Cluster | None = None,
+) -> dict:
+  """Runs what is left of a suite's parts and returns bench.json's value; arguments as of `planned`,
+  jobs: parts side by side, None: as many as this machine takes, on: a cluster.
+  """
+  done, found, estimates, lines = planned(plan, parts, out, others)
   folders.make(out)
   bench.take(out, parts, found)
   for name in found:
@@ -74,29 +175,12 @@ def do_bench(args: Bench) -> None:
     f"a part needs {most / 2**30:.1f} GiB, {space / 2**30:.1f} GiB may be used; fewer "
     "--seeds would fit",
   )
-  jobs = workers.number(args.jobs, needs, space) if on is None else 1
+  jobs = workers.number(jobs, needs, space) if on is None else 1
   for line in lines:
     say(line)
-  value = bench.execute(
-    plan,
-    out,
-    parts,
-    estimates,
-    say,
-    RunDisplay,
-    jobs=jobs,
-    worker=WORKER,
-    on=on,
+  return bench.execute(
+    plan, out, parts, estimates, say, RunDisplay, jobs=jobs, worker=WORKER, on=on
   )
-  if args.publish:
-    bench.publish(out, plan, args.publish)
-  if args.json:
-    emit(value)
-    return
-  for name, summary in value["entries"].items():
-    print(f"{name}: ", end="")
-    show_summary(summary, str(out / name))
-  print(f"{value['finished']} of {value['parts']} parts finished; files in {out}")
 
 
 def asked(args: Bench) -> tuple[Suite, list[Part]]:

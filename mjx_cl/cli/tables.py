@@ -2,7 +2,7 @@
 
 import os
 import sys
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 from rich.console import Console
@@ -98,28 +98,60 @@ def show_summary(s: dict, out: str) -> None:
   """Prints a run's numbers for a reader: a row an arm. What does not fit into the line is left to
   summary.json.
   """
-  severity = "" if s["severity"] is None else f" {s['severity']:g}"
   shares = ", ".join(f"{k} {v:.0%}" for k, v in s["wall_share"].items())
-  print(
+  print(f"{_headline(s)}; {clock(s['wall_s'])} wall ({shares})")
+  dropped = _show_arms(("arm",), [((name,), arm) for name, arm in s["arms"].items()])
+  _explain(dropped, "95 % interval", "summary.json")
+  print(f"files in {out}")
+
+
+def show_agents(together: dict, apart: Mapping[str, dict]) -> None:
+  """Prints what runs of several agents say: of each arm a row for all, then one for each agent.
+
+  Args:
+    together: entry of `agents` in bench.json.
+    apart: agent -> its summary.
+  """
+  print(_headline(together))
+  rows = []
+  for arm, every in together["arms"].items():
+    rows += [((arm, f"all {len(apart)}"), every)]
+    rows += [((arm, agent), own["arms"][arm]) for agent, own in apart.items()]
+  dropped = _show_arms(("arm", "agent"), rows)
+  interval = "95 % interval, of all by a bootstrap of agents and then of their streams"
+  _explain(dropped, interval, "bench.json")
+
+
+def _headline(s: dict) -> str:
+  severity = "" if s["severity"] is None else f" {s['severity']:g}"
+  return (
     f"{s['env']}, {s['fault']}{severity} at step {s['onset']:,} of {s['steps']:,}, detector "
-    f"{s['detector']}; {clock(s['wall_s'])} wall ({shares})"
+    f"{s['detector']}"
   )
+
+
+def _show_arms(names: tuple[str, ...], arms: Collection[tuple[tuple[str, ...], dict]]) -> int:
+  """Prints a row for each of `arms`, its names first; returns how many of DROPPED had no room."""
   on = console()
   for dropped in range(len(DROPPED) + 1):
     kept = {k: cell for k, cell in COLUMNS.items() if k not in DROPPED[:dropped]}
-    rows = [(name, *(cell(arm) for cell in kept.values())) for name, arm in s["arms"].items()]
-    shown = table(("arm", *kept), rows, left=("arm", "outcome"), show_lines=True)
+    rows = [(*own, *(cell(arm) for cell in kept.values())) for own, arm in arms]
+    shown = table((*names, *kept), rows, left=(*names, "outcome"), show_lines=True)
     if fits(shown, on):
       break
   on.print(shown)
+  return dropped
+
+
+def _explain(dropped: int, interval: str, file: str) -> None:
+  """Says below such a table what its numbers are and where those are that it lacks."""
   print(
-    "streams in all but latency (median), rewards (a control step, interquartile mean); [95 % "
-    "interval]; more in summary.json"
+    "streams in all but latency (median), rewards (a control step, interquartile mean); "
+    f"[{interval}]; more in {file}"
   )
   if dropped:
     left = ", ".join(name.replace("\n", " ") for name in DROPPED[:dropped])
-    print(f"not shown on a terminal this narrow, but in summary.json: {left}")
-  print(f"files in {out}")
+    print(f"not shown on a terminal this narrow, but in {file}: {left}")
 
 
 def show_detections(rows: list[dict]) -> None:

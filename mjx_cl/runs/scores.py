@@ -1,8 +1,9 @@
 """What the finished parts of a suite say together.
 
-OUT/bench.parquet holds all rows of their runs.parquet with the part in front, OUT/bench.json their
-summaries and what the arms of each say together (`scores`), OUT/recovery.png the Kaplan-Meier
-curves of recovery, OUT/ratio.png recovery against train ratio where a suite has several.
+OUT/bench.parquet holds all rows of their runs.parquet with part and agent in front, OUT/bench.json
+their summaries, what the arms of each say together (`scores`) and, where parts differ in their
+agent alone, what these say together (`agents`), OUT/recovery.png the Kaplan-Meier curves of
+recovery, OUT/ratio.png recovery against train ratio where a suite has several.
 """
 
 import pathlib
@@ -12,12 +13,21 @@ from mjx_cl.adapt.arms import ARMS, ONSET
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.io import folders, tables
 from mjx_cl.render import figures
-from mjx_cl.runs.suite import Part, Suite, standing
+from mjx_cl.runs.suite import Part, Suite, by_agent, standing
+from mjx_cl.runs.summary import over_agents
 from mjx_cl.scoring import ablation, normalised_recovery, survival
 
 HORIZON = 10_000  # control steps after the onset, of the restricted mean time to recovery
 # chunks over which signals must be settled, of the stop rule without its floor
 PATIENCES = (48, 24, 12)
+HEAD = (
+  "env",
+  "fault",
+  "severity",
+  "onset",
+  "steps",
+  "detector",
+)  # what runs of several agents share
 
 
 def scores(folder: pathlib.Path) -> dict:
@@ -102,7 +112,8 @@ def collect(
   Args:
     out: folder of the suite.
     plan: the suite.
-    known: part -> scores, of those that an earlier call has read; filled here.
+    known: part -> scores, of those that an earlier call has read, and what agents say together;
+      filled here.
     kept: parts that count whatever their settings.
   """
   known = {} if known is None else known
@@ -117,6 +128,7 @@ def collect(
       "suite": plan.name,
       "part": part.name,
       "robot": part.config.env,
+      "agent": part.config.agent,
       "severity_asked": part.config.severity,
       "ratio": part.config.adapt.ratio,
     }
@@ -127,6 +139,8 @@ def collect(
     "finished": len(entries),
     "entries": entries,
   }
+  if agents := together(out, [p for p in plan.parts if p.name in there], known):
+    value["agents"] = agents
   with folders.together():
     if rows:
       names = dict.fromkeys(name for row in rows for name in row)
@@ -134,6 +148,23 @@ def collect(
       tables.write_table(out / "bench.parquet", table)
       draw(out, plan, value)
     tables.write_json(out / "bench.json", value)
+  return value
+
+
+def together(out: pathlib.Path, parts: list[Part], known: dict) -> dict[str, dict]:
+  """What finished parts that differ in their agent alone say together, see `over_agents`; arguments
+  as of `collect`.
+  """
+  value = {}
+  for name, own in by_agent(parts).items():
+    key = f"{name} of {', '.join(own)}"
+    if key not in known:
+      rows = {a: tables.read_rows(out / p.name / "runs.parquet") for a, p in own.items()}
+      part = next(iter(own.values()))
+      control_s = tables.read_json(out / part.name / "config.json")["control_s"]
+      head = tables.read_json(out / part.name / "summary.json")
+      known[key] = {k: head[k] for k in HEAD} | over_agents(rows, part.config, control_s)
+    value[name] = known[key]
   return value
 
 

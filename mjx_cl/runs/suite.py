@@ -232,6 +232,37 @@ def pick(
   return chosen[k::n]
 
 
+def of_agents(run: RunConfig, agents: Iterable[str]) -> Suite:
+  """The suite whose parts are `run` with each of the agents.
+
+  Raises:
+    UserError: for an agent named twice, or what `settings.check` refuses.
+  """
+  parts: dict[str, Part] = {}
+  for agent in agents:
+    name = "agent=" + re.sub("[/,]", "-", agent)
+    require(name not in parts, f"name each agent once; got {agent} twice")
+    _check_folder("part", name)
+    parts[name] = Part(name, settings.check(dataclasses.replace(run, agent=agent)))
+  return Suite("agents", f"one run with each of {len(parts)} agents", tuple(parts.values()))
+
+
+def by_agent(parts: Iterable[Part]) -> dict[str, dict[str, Part]]:
+  """Parts of two or more agents that differ in nothing else: name without the agent, the robot's
+  where none is left, -> agent -> part.
+  """
+  groups: dict[tuple[str, str], dict[str, Part]] = {}
+  for part in parts:
+    whose = re.search(r"(?:^|(?<=/)|,)agent=([^,]*),?", part.name)
+    if whose and part.config.agent:
+      name = (part.name[: whose.start()] + "," + part.name[whose.end() :]).strip(",/")
+      name = name.replace("/,", "/")
+      alike = repr(dataclasses.replace(part.config, agent=None))
+      groups.setdefault((name, alike), {})[part.config.agent] = part
+  several = [(name, own) for (name, _), own in groups.items() if len(own) > 1]
+  return {name or next(iter(own.values())).config.env: own for name, own in several}
+
+
 def finished(out: pathlib.Path, part: Part) -> bool:
   """Whether OUT/PART holds this part's results.
 

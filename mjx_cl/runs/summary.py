@@ -1,14 +1,18 @@
-"""summary.json of a run: per arm the aggregates of its rows, each with its interval."""
+"""summary.json of a run: per arm the aggregates of its rows, each with its interval; and those of
+several agents together.
+"""
 
 import collections
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from mjx_cl.config import RunConfig
 from mjx_cl.runs.records import OUTCOMES, Ledger, acts
 from mjx_cl.scoring import intervals
+
+DRAWS = 1000  # of the bootstrap over agents
 
 
 def summary(
@@ -62,21 +66,111 @@ def by_arm(rows: list[dict], config: RunConfig, control_s: float) -> dict:
   """What summary.json says from the rows of runs.parquet alone: `arms`, `later_changes` where there
   are any, and arm `detector` once more at the top.
   """
+  value = _by_change(rows, config, lambda own: summarise(own, config, control_s))
+  return value | value["arms"].get("detector", {})
+
+
+def over_agents(agents: Mapping[str, list[dict]], config: RunConfig, control_s: float) -> dict:
+  """What the runs of several agents say together, all else the same: `arms`, `later_changes` where
+  there are any. Each interval is a hierarchical bootstrap (agents with replacement, then of each
+  its rows), and nowhere narrower than that of `summarise`, which takes all rows as of one agent:
+  few agents differ by chance less than agents do.
+
+  Args:
+    agents: name -> rows of its runs.parquet.
+    config: of the runs, whatever their agent.
+    control_s: seconds of a control step.
+  """
+  rows = [r | {"agent": name} for name, own in agents.items() for r in own]
+  return {
+    "agents": list(agents),
+    **_by_change(rows, config, lambda own: _hierarchical(own, config, control_s)),
+  }
+
+
+def _by_change(rows: list[dict], config: RunConfig, of: Callable[[list[dict]], dict]) -> dict:
+  """`of` the rows of each arm, of the first change and of those after it."""
   first, *later = (
     {
-      arm: summarise(own, config, control_s)
+      arm: of(own)
       for arm in config.arms
       if (own := [r for r in rows if r["arm"] == arm and r["change"] == change])
     }
     for change in range(1 + max(r["change"] for r in rows))
   )
-  return {"arms": first, **({"later_changes": later} if later else {}), **first.get("detector", {})}
+  return {"arms": first, **({"later_changes": later} if later else {})}
+
+
+class _Aggregate(NamedTuple):
+  """An aggregate of rows.
+
+  Attributes:
+    value: None where it is not defined.
+    interval: makes its interval; None: it has none.
+    of: the value counts so many rows; None: it is no count.
+    undefined: what an undefined value counts as among others: inf of a censored time.
+  """
+
+  value: float | None
+  interval: Callable[[], Sequence | None] | None
+  of: int | None = None
+  undefined: float = np.nan
+
+  def comparable(self) -> float:
+    """A count as a share, since what it is out of may differ."""
+    if self.of is not None:
+      return self.value / self.of if self.of else np.nan  # type: ignore[operator]
+    return self.undefined if self.value is None else self.value
+
+
+def _flat(found: Mapping[str, _Aggregate], ends: Callable[[str], Sequence | None]) -> dict:
+  """NAME and NAME_ci of each aggregate; `ends` gives the interval of a name."""
+  out: dict[str, Any] = {}
+  for name, own in found.items():
+    out[name] = own.value
+    if own.interval is not None:
+      out[f"{name}_ci"] = ends(name)
+  return out
+
+
+def _hierarchical(rows: list[dict], config: RunConfig, control_s: float) -> dict:
+  """`summarise` of rows with an `agent`, with the intervals of `over_agents`."""
+  found = _aggregates(rows, config, control_s)
+  groups: dict[str, list[dict]] = {}
+  for r in rows:
+    groups.setdefault(r["agent"], []).append(r)
+  own, random = list(groups.values()), np.random.default_rng(0)
+  drawn: dict[str, list[float]] = {name: [] for name in found}
+  for _ in range(DRAWS):
+    picked = (own[k] for k in random.integers(len(own), size=len(own)))
+    sample = [of[k] for of in picked for k in random.integers(len(of), size=len(of))]
+    values = _aggregates(sample, config, control_s)
+    for name, seen in drawn.items():  # numeric failures are named where there are any
+      seen.append(values[name].comparable() if name in values else 0.0)
+
+  def ends(name: str) -> Sequence | None:
+    narrow = found[name].interval()  # type: ignore[misc]
+    wide = intervals.ends(np.array([drawn[name]]))[0]
+    if narrow is None or wide is None:
+      return None
+    if (of := found[name].of) is not None:
+      wide = [None if x is None else x * of for x in wide]
+    low, high = zip(narrow, wide)
+    return [None if None in pair else pick(pair) for pick, pair in ((min, low), (max, high))]
+
+  return _flat(found, ends)
 
 
 def summarise(rows: list[dict], config: RunConfig, control_s: float) -> dict:
   """Aggregates of one arm. Recovery counts affected streams alone; times are censored medians;
   means are IQM with bootstrap intervals.
   """
+  found = _aggregates(rows, config, control_s)
+  return _flat(found, lambda name: found[name].interval())  # type: ignore[misc]
+
+
+def _aggregates(rows: list[dict], config: RunConfig, control_s: float) -> dict[str, _Aggregate]:
+  """What `summarise` says, by name."""
   affected = [r for r in rows if r["affected"]]
   met = [r for r in rows if r["onset"] is not None and not r.get("adapting_at_onset")]
   watched = [r for r in affected if not r.get("adapting_at_onset")]
@@ -86,77 +180,75 @@ def summarise(rows: list[dict], config: RunConfig, control_s: float) -> dict:
   missed, n = int(np.isinf(latency).sum()), len(rows)
   outcomes = collections.Counter(r["outcome"] for r in rows)
   return {
-    "seeds": n,
-    **_count("affected", len(affected), sum(r["affected"] is not None for r in rows)),
-    **_count("adapting_at_onset", sum(bool(r.get("adapting_at_onset")) for r in rows), n),
-    **_count("alarms", len(met) - missed, len(met)),
-    **_count("false_alarm_streams", sum(bool(r["false_alarms"]) for r in rows), n),
-    **_false_alarms(rows, config.steps, control_s),
-    **_median("latency_median_steps", latency),
-    **_entry(
-      "miss_probability", missed / len(met) if met else None, intervals.wilson(missed, len(met))
+    "seeds": _Aggregate(n, None),
+    "affected": _count(len(affected), sum(r["affected"] is not None for r in rows)),
+    "adapting_at_onset": _count(sum(bool(r.get("adapting_at_onset")) for r in rows), n),
+    "alarms": _count(len(met) - missed, len(met)),
+    "false_alarm_streams": _count(sum(bool(r["false_alarms"]) for r in rows), n),
+    "false_alarms_per_hour": _false_alarms(rows, config.steps, control_s),
+    "latency_median_steps": _median(latency),
+    "miss_probability": _Aggregate(
+      missed / len(met) if met else None, lambda: intervals.wilson(missed, len(met))
     ),
-    **_count("affected_watched", len(watched), len(affected)),
-    **_count(
-      "affected_alarmed_within_500",
-      sum(time(r["latency_steps"]) <= 500 for r in watched),
-      len(watched),
+    "affected_watched": _count(len(watched), len(affected)),
+    "affected_alarmed_within_500": _count(
+      sum(time(r["latency_steps"]) <= 500 for r in watched), len(watched)
     ),
     **{
-      key: value
+      outcome: _count(outcomes[outcome], n)
       for outcome in dict.fromkeys((*OUTCOMES.values(), "adapting"))
       # numeric failures are named where there are any
       if outcomes[outcome] or outcome != "failed"
-      for key, value in _count(outcome, outcomes[outcome], n).items()
     },
-    **_count("recovered", sum(map(np.isfinite, back)), len(affected)),
-    **_count("recovered_within_10000", sum(x <= 10_000 for x in back), len(affected)),
-    **_median("recovery_median_steps", back),
-    **_mean("reward_pre", rows),
-    **_mean("reward_drop", rows),
-    **_mean("reward_final", rows),
-    **_mean("return_lost", rows),
+    "recovered": _count(sum(map(np.isfinite, back)), len(affected)),
+    "recovered_within_10000": _count(sum(x <= 10_000 for x in back), len(affected)),
+    "recovery_median_steps": _median(back),
+    "reward_pre": _mean("reward_pre", rows),
+    "reward_drop": _mean("reward_drop", rows),
+    "reward_final": _mean("reward_final", rows),
+    "return_lost": _mean("return_lost", rows),
     # a ledger: what is rare must count
-    **_mean("return_lost_healthy", rows, "_mean", np.mean),
-    **_mean("adapted_steps", rows, "_mean", np.mean),
-    **_mean("updates", rows, "_mean", np.mean),
-    **_mean("terminations", rows, "_mean", np.mean),
-    **_mean("reward_final", affected, "_affected"),
+    "return_lost_healthy_mean": _mean("return_lost_healthy", rows, np.mean),
+    "adapted_steps_mean": _mean("adapted_steps", rows, np.mean),
+    "updates_mean": _mean("updates", rows, np.mean),
+    "terminations_mean": _mean("terminations", rows, np.mean),
+    "reward_final_affected": _mean("reward_final", affected),
   }
 
 
-def _entry(name: str, value: float | None, interval: Sequence | None) -> dict:
-  return {name: value, f"{name}_ci": interval}
-
-
-def _count(name: str, hits: int, n: int) -> dict:
+def _count(hits: int, n: int) -> _Aggregate:
   """So many of `n` streams."""
-  interval = intervals.wilson(hits, n)
-  return _entry(name, hits, None if interval is None else [x * n for x in interval])
+
+  def ends() -> list[float] | None:
+    interval = intervals.wilson(hits, n)
+    return None if interval is None else [x * n for x in interval]
+
+  return _Aggregate(int(hits), ends, n)
 
 
-def _false_alarms(rows: list[dict], steps: int, control_s: float) -> dict:
+def _false_alarms(rows: list[dict], steps: int, control_s: float) -> _Aggregate:
   """False alarms per hour of healthy robots, of runs of `steps` control steps."""
   healthy = (
     steps if r["onset"] is None else min(r["onset"], steps) for r in rows if not r["change"]
   )
   hours, count = sum(healthy) * control_s / 3600, sum(r["false_alarms"] or 0 for r in rows)
   if not hours:
-    return _entry("false_alarms_per_hour", None, None)
-  interval = [x / hours for x in intervals.poisson(count)]
-  return _entry("false_alarms_per_hour", count / hours, interval)
+    return _Aggregate(None, lambda: None)
+  return _Aggregate(count / hours, lambda: [x / hours for x in intervals.poisson(count)])
 
 
-def _median(name: str, times: list[float]) -> dict:
+def _median(times: list[float]) -> _Aggregate:
   """Median of times [control steps], infinite ones censored."""
   value = intervals.finite(intervals.censored_median(times)) if times else None
-  return _entry(name, value, intervals.interval(times, intervals.censored_median))
+  return _Aggregate(
+    value, lambda: intervals.interval(times, intervals.censored_median), undefined=np.inf
+  )
 
 
 def _mean(
-  name: str, rows: list[dict], suffix: str = "", statistic: Callable[..., Any] = intervals.iqm
-) -> dict:
-  """A mean over the rows in which `name` is known, under its name and the suffix."""
+  name: str, rows: Iterable[dict], statistic: Callable[..., Any] = intervals.iqm
+) -> _Aggregate:
+  """A mean over the rows in which `name` is known."""
   values = [r[name] for r in rows if r[name] is not None]
   value = float(statistic(values)) if values else None
-  return _entry(name + suffix, value, intervals.interval(values, statistic))
+  return _Aggregate(value, lambda: intervals.interval(values, statistic))

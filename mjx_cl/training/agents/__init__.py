@@ -8,6 +8,7 @@ import dataclasses
 import json
 import os
 import pathlib
+import re
 from typing import Any, NamedTuple
 
 import jax
@@ -86,6 +87,24 @@ def of(env: Any, path: str | None = None, **departures: Any) -> Trained:
   )
 
 
+def of_one_recipe(env_name: str) -> list[str]:
+  """Shipped agents of a robot that differ in their training's seed alone: NAME, NAME-2, ..., where
+  NAME is the robot or the one whose agents it takes.
+
+  Raises:
+    UserError: where none ships.
+  """
+  name = _own_name(env_name, getattr(envs.ENVS.data.get(env_name), "agents_of", None))
+  found = [agent for agent in shipped() if re.fullmatch(rf"{re.escape(name)}(-\d+)?", agent)]
+  require(found, f"no agent of {env_name!r} ships; shipped: {', '.join(shipped()) or 'none'}")
+  return found
+
+
+def _own_name(env_name: str, related: str | None) -> str:
+  """The shipped agent that a robot has without a path."""
+  return related if related and env_name not in shipped() else env_name
+
+
 def is_shipped(env: Any) -> bool:
   """Whether there is an agent for this robot without a path."""
   return not {env.spec.name, getattr(env, "agents_of", None)}.isdisjoint(shipped())
@@ -137,7 +156,7 @@ def load(
     FileError: a broken or foreign file.
   """
   related = agents_of or getattr(envs.ENVS.data.get(env_name), "agents_of", None)
-  name = path or (related if related and env_name not in shipped() else env_name)
+  name = path or _own_name(env_name, related)
   folder = pathlib.Path(name)
   if not (folder / "card.json").exists():
     folder = HERE / name
