@@ -12,7 +12,7 @@ from typing import Any
 
 from mjx_cl.cli.flags import Plot, Query, Report
 from mjx_cl.cli.output import emit, say
-from mjx_cl.cli.tables import console, table
+from mjx_cl.cli.tables import print_rows
 from mjx_cl.errors import FileError, require
 from mjx_cl.io import tables
 
@@ -52,9 +52,14 @@ def do_query(args: Query) -> None:
     emit([{n: json_value(x) for n, x in zip(names, r)} for r in rows])
   else:
     for k in range(0, max(1, len(rows)), FIRST):  # a long table takes long to be set
-      console().print(table(names, rows[k : k + FIRST], left=names))
+      print_rows(names, [shown(row) for row in rows[k : k + FIRST]])
   if more:
     say(f"the first {limit:,} rows; --limit takes a number, --json prints all")
+
+
+def shown(row: tuple) -> list[object]:
+  """A row as a reader wants it: numbers to six significant digits; --json has them whole."""
+  return [f"{x:.6g}" if isinstance(x, float) else x for x in row]
 
 
 def json_value(x: Any) -> Any:

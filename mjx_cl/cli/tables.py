@@ -5,6 +5,7 @@ import sys
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any
 
+from rich.cells import cell_len, set_cell_size
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
@@ -58,6 +59,30 @@ def table(
   for row in rows:
     out.add_row(*(Text(str(cell)) for cell in row))
   return out
+
+
+def print_rows(names: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
+  """Prints a table of foreign values, set to the left; what a terminal would obey is escaped. One
+  that fits without a fold is set here, in a fiftieth of the time that rich takes.
+  """
+  on, texts = console(), [[_harmless(str(x)) for x in row] for row in (names, *rows)]
+  widths = [max(map(cell_len, column)) for column in zip(*texts)]
+  if sum(widths) + 3 * len(names) + 1 > on.width or any("\n" in x for row in texts for x in row):
+    on.print(table(texts[0], texts[1:], left=texts[0]))
+    return
+  rule = lambda ends: ends[1].join(ends[3] * (n + 2) for n in widths).join((ends[0], ends[2]))
+  line = lambda row, bar: (
+    f"{bar} {f' {bar} '.join(set_cell_size(x, n) for x, n in zip(row, widths))} {bar}"
+  )
+  head = [rule("┏┳┓━"), line(texts[0], "┃"), rule("┡╇┩━")]
+  print("\n".join([*head, *(line(row, "│") for row in texts[1:]), rule("└┴┘─")]))
+
+
+def _harmless(text: str) -> str:
+  """Text with signs that are not printed written out, but for line breaks."""
+  if text.isprintable():
+    return text
+  return "".join(x if x.isprintable() or x == "\n" else repr(x)[1:-1] for x in text)
 
 
 def console() -> Console:

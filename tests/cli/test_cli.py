@@ -291,6 +291,21 @@ def test_query(mjx, refused, tmp_path):
   assert "no .parquet" in refused(2, "query", tmp_path / "none", "select 1")
 
 
+def test_rows_are_set_as_rich_sets_them(capsys, monkeypatch):
+  names, rows = ["step", "[red]x", ""], [(1, "漢字", None), (-20, "e\u0301[/b]", 0.5), ("", "", "")]
+  on = Console(file=io.StringIO(), width=80)
+  on.print(shown.table(names, rows, left=names))
+  for width, alike in ((80, True), (on.measure(shown.table(names, rows)).maximum - 1, False)):
+    monkeypatch.setenv("COLUMNS", str(width))
+    shown.print_rows(names, rows)
+    assert (capsys.readouterr().out == on.file.getvalue()) == alike  # folds, where it must
+  shown.print_rows(["x"], [["\x1b[31m\r\n\x9b"]])
+  assert [line.strip("│ ") for line in capsys.readouterr().out.splitlines()[3:5]] == [
+    r"\x1b[31m\r",
+    r"\x9b",
+  ]
+
+
 def test_query_prints_the_first_rows_and_says_so(mjx, refused, tmp_path):
   count = 100 * results.FIRST
   store.write_table(tmp_path / "trace.parquet", {"step": np.arange(count)})
