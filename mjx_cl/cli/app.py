@@ -260,7 +260,7 @@ def main(argv: list[str] | None = None) -> int:
     nonlocal command
     command = parse(argv)
     check_filled(command)
-    if not isinstance(command, (Plot, Query, Report)):
+    if not isinstance(command, (List, Plot, Query, Report)):
       shared = isinstance(command, Train) and command.seeds > 0
       runtime.setup(runtime.sharing(command.seeds) if shared else 1)
     # a run locks its own folder, and so does each part of a suite

@@ -25,7 +25,7 @@ from test_run import saved  # noqa: F401  a fixture
 import mjx_cl
 from mjx_cl import detectors, envs, faults
 from mjx_cl.adapt.arms import ARMS
-from mjx_cl.cli import app, results
+from mjx_cl.cli import app, names, registries, results
 from mjx_cl.cli import tables as shown
 from mjx_cl.config import PRESETS, RunConfig
 from mjx_cl.config.sizes import SIZES
@@ -81,7 +81,7 @@ def content(folder):
 # ---- what it prints ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("argv", [["--help"], ["run", "--help"]])
+@pytest.mark.parametrize("argv", [["--help"], ["run", "--help"], ["list"]])
 def test_help_imports_nothing_heavy(argv):
   """Seconds depend on the machine; what makes them many is an import of JAX (2 s) or of what needs
   it.
@@ -97,7 +97,7 @@ def test_help_imports_nothing_heavy(argv):
     for line in process.stderr.splitlines()
     if line.startswith("import time:")
   }
-  assert process.returncode == 0 and "mjx-cl" in process.stdout and "mjx_cl.cli.app" in imported
+  assert process.returncode == 0 and "walker" in process.stdout and "mjx_cl.cli.app" in imported
   assert not imported & {
     "jax",
     "jaxlib",
@@ -166,6 +166,13 @@ def test_version(capsys):
   with pytest.raises(SystemExit) as end:
     app.main(["--version"])
   assert end.value.code == 0 and capsys.readouterr().out == f"mjx-cl {mjx_cl.__version__}\n"
+
+
+def test_the_names_that_ship_are_those_of_the_registries():
+  """`python -m mjx_cl.cli.registries` writes them."""
+  groups = (envs.ENVS.group, faults.FAULTS.group, detectors.DETECTORS.group)
+  assert groups == names.GROUPS
+  assert json.loads(names.FILE.read_text()) == registries.tables(registries.TABLES)
 
 
 def test_list(mjx):

@@ -1,0 +1,52 @@
+"""What the registries hold, name by name. `python -m mjx_cl.cli.registries` writes names.json anew,
+where `mjx-cl list` reads it: an import of JAX takes seconds.
+"""
+
+import inspect
+import json
+from collections.abc import Callable, Iterable, Mapping
+
+from mjx_cl import detectors, envs, faults
+from mjx_cl.adapt.arms import ARMS
+from mjx_cl.cli.names import FILE
+from mjx_cl.config import PRESETS
+from mjx_cl.faults import presets
+from mjx_cl.io import folders
+from mjx_cl.leaderboard import streams
+from mjx_cl.runs import suite
+from mjx_cl.training import agents, needs
+
+
+def first(member: object) -> str:
+  """First paragraph of its docstring."""
+  return " ".join(inspect.cleandoc(str(member.__doc__ or "")).split("\n\n")[0].split())
+
+
+TABLES: dict[str, Callable[[], Mapping[str, str]]] = {
+  "envs": lambda: {k: first(v) for k, v in envs.ENVS.items()},
+  "faults": lambda: {k: faults.about(k) for k in faults.FAULTS},
+  "detectors": lambda: {k: first(v) for k, v in detectors.DETECTORS.items()},
+  "presets": lambda: {k: p.about for k, p in PRESETS.items()},
+  "agents": lambda: dict.fromkeys(agents.shipped(), "shipped"),
+  "arms": lambda: {k: a.about for k, a in ARMS.items()},
+  "fault-presets": lambda: {k: f"{p.about} ({p.source})" for k, p in presets.PRESETS.items()},
+  "schedules": lambda: presets.SCHEDULES,
+  "sizes": needs.table,
+  "suites": streams.about,
+  "benches": suite.shipped,
+}
+
+
+def tables(kinds: Iterable[str]) -> dict[str, dict[str, str]]:
+  """Kind -> name -> a line about it, plug-ins included."""
+  return {kind: dict(TABLES[kind]()) for kind in kinds}
+
+
+def write() -> None:
+  """Writes names.json."""
+  text = json.dumps(tables(TABLES), indent=1, ensure_ascii=False) + "\n"
+  folders.atomic(FILE, lambda file: file.write(text.encode()))
+
+
+if __name__ == "__main__":
+  write()
