@@ -2,6 +2,7 @@
 
   git worktree add ../base 10f2717
   python benchmarks/lives.py [--base ../base] [--rounds 5] [--whole] [--json] [--figure FILE]
+  python benchmarks/lives.py --of results/lives.json --figure docs/lives.png
 
 Chunks of 64 control steps of walkers, as `mjx-cl run walker` lives them. Each version has a process
 of its own that lives through everything once before anything is timed; then they take turns, and
@@ -200,32 +201,40 @@ def price(versions: list[Version], rounds: int) -> list[dict]:
   return rows
 
 
-def draw(shares: list[dict], seconds: list[float], path: pathlib.Path) -> None:
-  """Where the main job's time goes: a bar for each version, newest first."""
+def draw(job: dict, path: pathlib.Path) -> None:
+  """Where the main job's time goes, of its row: a bar for each version, newest on top."""
   import matplotlib
 
   matplotlib.use("Agg")
   import matplotlib.pyplot as plt
 
-  figure, axis = plt.subplots(figsize=(7, 1.2 + 0.6 * len(shares)))
-  kinds = list(dict.fromkeys(k for share in shares for k in share))
-  for i, (share, whole) in enumerate(zip(shares, seconds)):
+  wholes = [x for x in (job["base"], job["value"]) if x is not None]
+  parts = [
+    share | {"other": whole - sum(share.values())}
+    for share, whole in zip(job["seconds"][::-1], wholes)
+  ]
+  figure, axis = plt.subplots(figsize=(7, 1.4 + 0.6 * len(parts)))
+  for i, part in enumerate(parts):
     left = 0.0
-    for k, kind in enumerate(kinds):
-      width = share.get(kind, 0.0) * whole
+    for k, (kind, width) in enumerate(part.items()):
       axis.barh(i, width, left=left, color=f"C{k}", label=kind if not i else None)
+      if width > 20:
+        axis.text(left + width / 2, i, f"{width:.0f}", ha="center", va="center", color="white")
       left += width
-  axis.set_yticks(range(len(shares)), ["now", "before"][: len(shares)])
-  axis.set_xlabel("seconds of the main job, programs cached")
+    axis.text(left + 5, i, f"{left:.0f} s", va="center")
+  axis.set_yticks(range(len(parts)), ["before (10f2717)", "now"][-len(parts) :])
+  axis.set_xlim(0, 1.12 * max(wholes))
+  axis.set_xlabel("seconds of the main job: ten walkers in two arms, 25,000 steps, programs cached")
+  axis.spines[["top", "right"]].set_visible(False)
   axis.legend(
-    ncols=len(kinds),
-    fontsize="x-small",
+    ncols=len(parts[0]),
+    fontsize="small",
     loc="lower center",
     bbox_to_anchor=(0.5, 1.0),
     frameon=False,
   )
   figure.tight_layout()
-  figure.savefig(path, dpi=150)
+  figure.savefig(path, dpi=130)
 
 
 def main() -> None:
@@ -236,11 +245,16 @@ def main() -> None:
   parser.add_argument("--rounds", type=int, default=5)
   parser.add_argument("--whole", action="store_true", help="the main job as well")
   parser.add_argument("--json", action="store_true", help="one JSON value on standard output")
-  parser.add_argument("--figure", type=pathlib.Path, help="draws the main job's shares")
+  parser.add_argument("--figure", type=pathlib.Path, help="draws where the main job's time goes")
+  parser.add_argument("--of", type=pathlib.Path, help="measure nothing: draw from what --json gave")
   parser.add_argument("--serve", action="store_true", help=argparse.SUPPRESS)
   args = parser.parse_args()
   if args.serve:
     return serve()
+  if args.of:
+    (job,) = (r for r in json.loads(args.of.read_text()) if r["name"] == "main job")
+    draw(job, args.figure)
+    return None
   folders = [HERE.parents[1]] + ([args.base.resolve()] if args.base else [])
   versions = [Version(folder) for folder in folders]
   rows = price(versions, args.rounds)
@@ -249,8 +263,11 @@ def main() -> None:
       v.process.stdin.close()
     told = [v.whole() for v in versions]
     rows.append(row("main job", "s", [seconds for seconds, _ in told]))
+    rows[-1]["seconds"] = [
+      {kind: seconds * part for kind, part in share.items()} for seconds, share in told
+    ]
     if args.figure:
-      draw([share for _, share in told], [seconds for seconds, _ in told], args.figure)
+      draw(rows[-1], args.figure)
   for r in rows:
     print(
       f"{r['name']:28s} {r['value']:>9} {r['unit']:10s} base {r['base'] or '-':>9} "
