@@ -2,7 +2,9 @@
 rates of false alarms.
 """
 
-from collections.abc import Iterable
+import math
+import zlib
+from collections.abc import Callable, Iterable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -30,6 +32,7 @@ class Found(NamedTuple):
     score: (T, F), likewise.
     us_per_sample: compute [microseconds], None where not measured.
     curve: [{false_alarms_per_hour, latency_mean_s, detected}].
+    note: how it was brought to the asked rate where no threshold does; None: one does.
   """
 
   threshold: float | None
@@ -41,6 +44,7 @@ class Found(NamedTuple):
   score: np.ndarray
   us_per_sample: float | None
   curve: list[dict]
+  note: str | None = None
 
 
 def examine(one: Entry, data: Data, runner: sweep.Runner, samples: Samples) -> Found:
@@ -72,18 +76,81 @@ def examine(one: Entry, data: Data, runner: sweep.Runner, samples: Samples) -> F
   late_fired, late_score, before, us = runner.faults(np.asarray(levels, np.float32), samples)
   placed = lambda x, unknown: _placed(x, data.fault.onset, len(data.fault.residual.opr), unknown)
   pairs = [(tried[t], placed(f, False)) for t, f in zip(levels, late_fired) if t in tried]
-  fault_fired = placed(late_fired[0], False)
-  fault_fired[: len(before)] |= before
+
+  def faulty(late: np.ndarray, before: np.ndarray) -> np.ndarray:
+    alarms = placed(late, False)
+    alarms[: len(before)] |= before
+    return alarms
+
+  def at(level: float) -> tuple[np.ndarray, np.ndarray]:
+    lanes = [(s, np.full(runner.together, level, np.float32)) for s in range(len(samples.healthy))]
+    own = np.stack([f[0] for f, _ in runner.healthy(lanes, samples)], 1)
+    late, _, before, _ = runner.faults(np.asarray([level], np.float32), samples)
+    return own, faulty(late[0], before)
+
+  fault_fired, fault_score = faulty(late_fired[0], before), placed(late_score[0], np.nan)
+  fired, fault_fired, note = at_rate(
+    data, tried, threshold, counted, (fired, score), (fault_fired, fault_score), at
+  )
   return found(
     data,
     float(np.float32(threshold)) if one.calibrated else None,
     fired,
     score,
     fault_fired,
-    placed(late_score[0], np.nan),
+    fault_score,
     us,
     curve(pairs, data, counted),
+  )._replace(note=note)
+
+
+def at_rate(
+  data: Data,
+  tried: Mapping[float, int],
+  threshold: float,
+  counted: int,
+  healthy: tuple[np.ndarray, np.ndarray],
+  fault: tuple[np.ndarray, np.ndarray],
+  at: Callable[[float], tuple[np.ndarray, np.ndarray]],
+) -> tuple[np.ndarray, np.ndarray, str | None]:
+  """Alarms at the asked rate where the threshold gives fewer: all detectors are compared at one
+  rate, and none gains by a rarer one.
+
+  With a alarms at the threshold, b at the next lower one that was tried and has too many, and n
+  asked for, each alarm of the lower one counts with probability (n - a) / (b - a), a randomised
+  test between two operating points. Where there is no such lower one, alarms are added at random,
+  n - a on the healthy steps that were counted. Draws follow from the robot's name.
+
+  Args:
+    data: streams of the robot.
+    tried: threshold -> alarms.
+    threshold: that was found.
+    counted: healthy steps.
+    healthy: alarms and scores there, (N, S).
+    fault: likewise on fault streams, (T, F).
+    at: threshold -> alarms on both.
+
+  Returns:
+    (alarms, alarms on fault streams, note; None where nothing was changed).
+  """
+  have, wanted = tried.get(threshold, math.inf), math.floor(counted / data.arl0)
+  if have >= wanted:
+    return healthy[0], fault[0], None
+  random = np.random.default_rng(zlib.crc32(data.robot.encode()))
+  lower = [t for t, alarms in tried.items() if t < threshold and alarms > wanted]
+  if not lower:
+    rate = (wanted - have) / counted
+    more = lambda fired, score: fired | (random.random(fired.shape) < rate) & np.isfinite(score)
+    note = f"{have} alarms of {wanted} asked for: the others were drawn at random"
+    return more(*healthy), more(*fault), note
+  share = (wanted - have) / (tried[max(lower)] - have)
+  mix = lambda fired, other: fired | (other & (random.random(fired.shape) < share))
+  others, fault_others = at(max(lower))
+  note = (
+    f"no threshold gives the asked rate: {have} alarms, or {tried[max(lower)]}, of {wanted}; those "
+    f"of the lower one count with probability {share:.3g}"
   )
+  return mix(healthy[0], others), mix(fault[0], fault_others), note
 
 
 def _calibrate(

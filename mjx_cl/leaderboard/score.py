@@ -228,7 +228,8 @@ def _row(
       f"{k}{end}": None for k in ("oracle_delay_steps", "efficiency") for end in ("", "_ci")
     }
   tells = name == ORACLES[1 if oracle.run else 0]  # the row that says why a limit is unknown
-  notes = [n for n in (share["note"], oracle.limits["note"] if tells else None) if n]
+  said = (result.note, share["note"], oracle.limits["note"] if tells else None)
+  notes = [n for n in said if n]
   return {
     "detector": name,
     "reference": reference,

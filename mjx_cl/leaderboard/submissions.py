@@ -13,7 +13,7 @@ from mjx_cl.detectors import python_class as host_lib
 from mjx_cl.detectors.combine import read
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.io import tables
-from mjx_cl.leaderboard.calibration import CURVE, Found, curve, found
+from mjx_cl.leaderboard.calibration import CURVE, Found, at_rate, curve, found
 from mjx_cl.leaderboard.streams import COLUMNS, Data, Streams, StreamSet
 from mjx_cl.scoring import thresholds
 
@@ -57,8 +57,13 @@ def from_scores(scores: dict[int, np.ndarray]) -> Callable[[Data], Found]:
     levels = [threshold] + [thresholds.nearest(tried, counted, a) for a in CURVE if tried]
     alarms = dict(tried)
     points = curve([(alarms[t], crossings(fault, t)) for t in levels if t in alarms], data, counted)
-    fired, fault_fired = crossings(nominal, threshold), crossings(fault, threshold)
-    return found(data, threshold, fired, nominal, fault_fired, fault, None, points)
+    both = lambda level: (crossings(nominal, level), crossings(fault, level))
+    fired, fault_fired = both(threshold)
+    fired, fault_fired, note = at_rate(
+      data, alarms, threshold, counted, (fired, nominal), (fault_fired, fault), both
+    )
+    rated = found(data, threshold, fired, nominal, fault_fired, fault, None, points)
+    return rated._replace(note=note)
 
   return get
 

@@ -772,6 +772,45 @@ def test_a_file_of_scores_is_scored(small, tmp_path):
   )
 
 
+def test_a_rarer_rate_gains_nothing(small, tmp_path, monkeypatch):
+  """Scores in two steps, whose only threshold alarms too seldom, and in three, of which one alarms
+  too seldom and the next too often: where all faults are found at once, fewer false alarms are all
+  that can be gained. Without the rule each gains.
+  """
+  held, rows = small[0], {}
+  quiet = np.concatenate([trailing(held.get("walker", [n]).residual.opr[:, 0]) for n in
+                          held.find("walker", "nominal", "tune").tolist()])  # fmt: skip
+  rare, often = np.nanquantile(quiet, [1 - 2e-4, 1 - 2e-2])
+  forms = {
+    "plain": lambda x: x,
+    "two": lambda x: (x > rare) * 1.0,
+    "three": lambda x: (x > rare) * 1.0 + (x > often),
+  }
+  for name, form in forms.items():
+    store.write_table(tmp_path / "s.parquet", submission(held, lambda x, f=form: f(trailing(x))))
+    scores = submissions.read_submission(tmp_path / "s.parquet", held)
+    for rule in (True, False):
+      with monkeypatch.context() as patch:
+        if not rule:
+          as_it_is = lambda data, tried, threshold, counted, healthy, fault, at: (
+            healthy[0],
+            fault[0],
+            None,
+          )
+          patch.setattr(submissions, "at_rate", as_it_is)
+        board = leaderboard.score(held, [], extra=[("mine", submissions.from_scores(scores))])
+      rows[name, rule] = pick(board, detector="mine", fault="bias")
+  cost = lambda name, rule: np.mean([r["cost_standard"] for r in rows[name, rule]])
+  assert rows["plain", True] == rows["plain", False] and rows["plain", True][0]["note"] is None
+  for name, words in (("two", "drawn at random"), ("three", "no threshold gives")):
+    row = rows[name, True][0]
+    assert words in row["note"] and cost(name, False) > cost("plain", True) >= cost(name, True)
+    assert rows[name, False][0]["arl0_alarms"] < row["arl0_alarms"]
+    # as many as asked for, but for the draws (three standard deviations of a Poisson count)
+    wanted = rows["plain", True][0]["arl0_alarms"]
+    assert abs(row["arl0_alarms"] - wanted) <= 3 * wanted**0.5
+
+
 @pytest.mark.parametrize(
   "spoil, text",
   [
