@@ -1,6 +1,5 @@
 """Result files: JSON, Parquet, suites in TOML, and SQL views over tables."""
 
-import contextlib
 import itertools
 import json
 import math
@@ -250,6 +249,7 @@ def query(
       "autoload_known_extensions": False,
     }
   )
+  working: list[threading.Thread] = []
   try:
     # a path is a pattern to read_parquet; a sign in brackets means itself, so that a folder may be
     # called a[1]
@@ -266,7 +266,7 @@ def query(
     try:
       if sql is None:
         listed = lambda: [_describe(db, name) for name in tables]
-        return ["view", "rows", "columns"], _interruptible(db, listed, timeout_s)
+        return ["view", "rows", "columns"], _interruptible(db, listed, timeout_s, working)
       sql.encode()
       statements = duckdb.extract_statements(sql)
       for kind in (x.type.name for x in statements if x.type != duckdb.StatementType.SELECT):
@@ -274,7 +274,7 @@ def query(
         raise UserError(f"query: results are read-only, and {said} is no select; views: {names}")
       if not statements:
         raise UserError(f"query: no statement; views: {names}")
-      return _interruptible(db, lambda: _answer(db, statements, limit), timeout_s)
+      return _interruptible(db, lambda: _answer(db, statements, limit), timeout_s, working)
     except UserError:
       raise
     except UnicodeEncodeError:
@@ -283,8 +283,18 @@ def query(
       said = (str(e) or type(e).__name__).splitlines()[0]
       raise UserError(f"query: {said}; views: {names}") from None
   finally:
-    with contextlib.suppress(duckdb.Error):  # after a second signal it may be busy still
+    if working and working[0].is_alive():  # a second signal leaves it at work
+      threading.Thread(target=_end, args=(db, working[0]), daemon=True).start()
+    else:
       db.close()
+
+
+def _end(db: duckdb.DuckDBPyConnection, working: threading.Thread) -> None:
+  """Interrupts until the thread at work gives in: between two pages nothing hears it."""
+  while working.is_alive():
+    db.interrupt()
+    working.join(TICK_S)
+  db.close()
 
 
 def _answer(
@@ -300,9 +310,13 @@ def _answer(
 
 
 def _interruptible(
-  db: duckdb.DuckDBPyConnection, answer: Callable[[], Any], timeout_s: float | None
+  db: duckdb.DuckDBPyConnection,
+  answer: Callable[[], Any],
+  timeout_s: float | None,
+  working: list[threading.Thread],
 ) -> Any:
-  """What `answer` gives; it is computed on a thread, since Python notes no signal meanwhile.
+  """What `answer` gives; it is computed on a thread, which `working` gets, since Python notes no
+  signal meanwhile.
 
   Raises:
     UserError: it has not come in time.
@@ -317,14 +331,15 @@ def _interruptible(
       out.append((None, e))
     done.set()
 
-  threading.Thread(target=run, daemon=True).start()
+  working.append(threading.Thread(target=run, daemon=True))
+  working[0].start()
   end = math.inf if timeout_s is None else time.monotonic() + timeout_s
   try:
     while not done.wait(TICK_S):
       if time.monotonic() > end:
         raise UserError(f"query: no answer within {timeout_s:g} s; --timeout gives it longer")
   finally:
-    while not done.is_set():  # again and again: between two pages there is nothing to interrupt
+    while not done.is_set():  # see _end
       db.interrupt()
       done.wait(TICK_S)
   value, wrong = out[0]

@@ -236,7 +236,8 @@ ENDLESS = "select count(*) from range(10000000) a, range(10000000) b where a.ran
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("times", [1, 2])
 def test_a_query_ends_with_a_signal(folder, monkeypatch, number, times):
-  """The last one comes while the first is being acted upon."""
+  """The last one comes while the first is being acted upon; nothing goes on computing afterwards."""
+  before = set(threading.enumerate())
   begun, inner = threading.Event(), tables._answer
   monkeypatch.setattr(tables, "_answer", lambda *given: begun.set() or inner(*given))
 
@@ -254,6 +255,9 @@ def test_a_query_ends_with_a_signal(folder, monkeypatch, number, times):
   finally:
     signal.signal(number, old)
     sender.join()
+  for thread in set(threading.enumerate()) - before:
+    thread.join(60)
+    assert not thread.is_alive()
 
 
 def test_a_query_ends_when_its_time_is_over(folder):
