@@ -11,7 +11,7 @@ import pathlib
 
 import numpy as np
 
-BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#888888"
+from mjx_cl.render.style import BLUE, GREEN, GREY, ORANGE, look
 
 
 def cusum(z: np.ndarray, slack: float = 0.5) -> np.ndarray:
@@ -177,10 +177,11 @@ def main() -> None:
   from matplotlib import pyplot
 
   for name, draw in PICTURES.items():
-    figure, ax = pyplot.subplots(figsize=(7, 3.2), layout="constrained")
-    draw(ax, np.random.default_rng(1))
-    figure.savefig(pathlib.Path(args.out) / f"{name}.png", dpi=110, metadata={"Software": None})
-    pyplot.close(figure)
+    with look():
+      figure, ax = pyplot.subplots(figsize=(7, 3.2), layout="constrained")
+      draw(ax, np.random.default_rng(1))
+      figure.savefig(pathlib.Path(args.out) / f"{name}.png", dpi=110, metadata={"Software": None})
+      pyplot.close(figure)
 
 
 if __name__ == "__main__":

@@ -208,6 +208,8 @@ def draw(job: dict, path: pathlib.Path) -> None:
   matplotlib.use("Agg")
   import matplotlib.pyplot as plt
 
+  from mjx_cl.render.style import nth
+
   wholes = [x for x in (job["base"], job["value"]) if x is not None]
   parts = [
     share | {"other": whole - sum(share.values())}
@@ -217,7 +219,7 @@ def draw(job: dict, path: pathlib.Path) -> None:
   for i, part in enumerate(parts):
     left = 0.0
     for k, (kind, width) in enumerate(part.items()):
-      axis.barh(i, width, left=left, color=f"C{k}", label=kind if not i else None)
+      axis.barh(i, width, left=left, color=nth(k), label=kind if not i else None)
       if width > 20:
         axis.text(left + width / 2, i, f"{width:.0f}", ha="center", va="center", color="white")
       left += width

@@ -382,8 +382,18 @@ def leaderboard(results: pathlib.Path) -> str:
     ),
     shown,
   )
+  dots = fill(
+    "Dots: the score over all faults with its interval, and on each robot (`python benchmarks/pictures.py`). Grey: up to what the likelihood-ratio oracle scores, "
+    "which is told the fault and watches OPR and RPR."
+  )
   return "\n\n".join(
-    [text, "![leaderboard](results/leaderboard.png)", board, *([fill(rest)] if rest else [])]
+    [
+      text,
+      "![each detector's score](results/leaderboard.png)",
+      dots,
+      board,
+      *([fill(rest)] if rest else []),
+    ]
   )
 
 

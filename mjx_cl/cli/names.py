@@ -1,16 +1,26 @@
-"""The command list: names that other commands take. Free of JAX where no plug-in is installed."""
+"""The command list: names that other commands take. Free of JAX where no plug-in is installed:
+`python -m mjx_cl.cli.names` writes anew what it reads.
+"""
 
 import importlib.metadata
 import json
 import pathlib
+from collections.abc import Iterable
 
 from mjx_cl.cli.flags import List
 from mjx_cl.cli.output import emit
 from mjx_cl.errors import choose
-from mjx_cl.io import runtime
+from mjx_cl.io import folders, runtime
 
 FILE = pathlib.Path(__file__).parent / "names.json"  # what registries.tables gives without plug-ins
 GROUPS = ("mjx_cl.envs", "mjx_cl.faults", "mjx_cl.detectors")  # of entry points
+
+
+def _live(kinds: Iterable[str]) -> dict[str, dict[str, str]]:
+  runtime.setup()
+  from mjx_cl.cli import registries  # imports JAX
+
+  return registries.tables(kinds)
 
 
 def do_list(args: List) -> None:
@@ -18,10 +28,7 @@ def do_list(args: List) -> None:
   known = json.loads(FILE.read_text())
   chosen = choose("list", args.what, {"all": list(known)} | {name: [name] for name in known})
   if any(importlib.metadata.entry_points(group=group) for group in GROUPS):
-    runtime.setup()
-    from mjx_cl.cli import registries  # imports JAX
-
-    known = registries.tables(chosen)
+    known = _live(chosen)
   if args.json:
     emit({kind: known[kind] for kind in chosen})
     return
@@ -29,3 +36,13 @@ def do_list(args: List) -> None:
     print(kind)
     for name, about in known[kind].items():
       print(f"  {name:22s} {about}")
+
+
+def write() -> None:
+  """Writes names.json."""
+  text = json.dumps(_live(json.loads(FILE.read_text())), indent=1, ensure_ascii=False) + "\n"
+  folders.atomic(FILE, lambda file: file.write(text.encode()))
+
+
+if __name__ == "__main__":
+  write()

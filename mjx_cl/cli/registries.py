@@ -1,17 +1,12 @@
-"""What the registries hold, name by name. `python -m mjx_cl.cli.registries` writes names.json anew,
-where `mjx-cl list` reads it: an import of JAX takes seconds.
-"""
+"""What the registries hold, name by name."""
 
 import inspect
-import json
 from collections.abc import Callable, Iterable, Mapping
 
 from mjx_cl import detectors, envs, faults
 from mjx_cl.adapt.arms import ARMS
-from mjx_cl.cli.names import FILE
 from mjx_cl.config import PRESETS
 from mjx_cl.faults import presets
-from mjx_cl.io import folders
 from mjx_cl.leaderboard import streams
 from mjx_cl.runs import suite
 from mjx_cl.training import agents, needs
@@ -40,13 +35,3 @@ TABLES: dict[str, Callable[[], Mapping[str, str]]] = {
 def tables(kinds: Iterable[str]) -> dict[str, dict[str, str]]:
   """Kind -> name -> a line about it, plug-ins included."""
   return {kind: dict(TABLES[kind]()) for kind in kinds}
-
-
-def write() -> None:
-  """Writes names.json."""
-  text = json.dumps(tables(TABLES), indent=1, ensure_ascii=False) + "\n"
-  folders.atomic(FILE, lambda file: file.write(text.encode()))
-
-
-if __name__ == "__main__":
-  write()

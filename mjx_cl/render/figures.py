@@ -1,4 +1,4 @@
-"""The figures of results: a run's two panels, a suite's shares not yet recovered and its train
+"""The figures of results: a run's three panels, a suite's shares not yet recovered and its train
 ratios.
 """
 
@@ -13,21 +13,10 @@ from matplotlib.figure import Figure
 
 from mjx_cl.errors import FileError
 from mjx_cl.io import folders, tables
+from mjx_cl.render import style
 from mjx_cl.scoring import survival as estimate
 from mjx_cl.scoring.versus import Variant, profile
 
-UPPER = (("reward", "reward per step"), ("opr", "OPR"), ("rpr", "RPR"))
-LOWER = (
-  ("adv_mag", "advantage magnitude"),
-  ("dyn_loss", "dynamics loss [nats]"),
-  ("value_loss", "value loss [nats]"),
-)
-COLORS = ("#1f5fa8", "#c4472b", "#3b8a4a")
-DASHES = ("--", ":", "-.")  # of arm `none`
-MARKS = (
-  (("start",), "v", "k", "alarm, finetuning starts"),
-  (("stop", "abort"), "^", "w", "finetuning ends"),
-)
 FEW = 3  # seeds that give no interval, see report.few
 
 
@@ -41,26 +30,26 @@ def smooth(values: np.ndarray, width: int) -> np.ndarray:
   return np.where(counts > 0, sums / np.maximum(1, counts), np.nan)
 
 
-def figure(folder: os.PathLike | str, width: int = 500) -> pathlib.Path:
-  """Draws FOLDER/figure.png from its trace, events and config: the paper's two panels, mean and
-  standard deviation over the streams of arm `detector` (or the first arm but `none`), arm `none` in
-  grey, one aborted run dotted.
+def figure(folder: os.PathLike | str, width: int = 1000) -> pathlib.Path:
+  """Draws FOLDER/figure.png from its tables and config, of the robots that the fault costs a tenth
+  of their reward, all where none or where runs.parquet is not there: reward of every arm, when each
+  robot of arm `detector` (or the first that may learn) alarms, learns and is done, and its OPR.
 
   Args:
     folder: of the run.
-    width: steps of the trailing mean that every curve is drawn with.
+    width: steps of the trailing mean of reward; that of an episode hides how each begins. A fifth
+      of it for OPR.
 
   Raises:
     FileError where these are missing, broken or not a run's.
   """
   folder = pathlib.Path(folder)
   try:
-    drawn = _figure(
-      tables.read_table(folder / "trace.parquet"),
-      tables.read_table(folder / "events.parquet"),
-      tables.read_json(folder / "config.json"),
-      width,
-    )
+    trace, events = (tables.read_table(folder / f"{name}.parquet") for name in ("trace", "events"))
+    there = (folder / "runs.parquet").exists()
+    rows = tables.read_rows(folder / "runs.parquet") if there else []
+    with style.look():
+      drawn = _figure(trace, events, rows, tables.read_json(folder / "config.json"), width)
   except (KeyError, ValueError, TypeError) as e:
     raise FileError(
       f"{folder} holds no run that can be drawn: {type(e).__name__}: "
@@ -74,56 +63,59 @@ def _saved(drawn: Figure, path: pathlib.Path, dpi: int = 110) -> pathlib.Path:
   return path
 
 
-def _figure(trace: dict, events: dict, config: dict, width: int) -> Figure:
+def _figure(trace: dict, events: dict, rows: list[dict], config: dict, width: int) -> Figure:
   steps, control_s = int(trace["step"].max()) + 1, config["control_s"]
   arms = list(dict.fromkeys(trace["arm"]))
-  main = "detector" if "detector" in arms else next((arm for arm in arms if arm != "none"), "none")
-  own = [
-    (int(s), k, g)
-    for s, k, a, g in zip(*(events[c] for c in ("step", "kind", "arm", "stream")))
-    if a == main
-  ]
-  aborted = next((stream for _, kind, stream in own if kind == "abort"), None)
-  drawn = Figure(figsize=(10, 7.2), layout="constrained")
-  axes = drawn.subplots(2, 1, sharex=True)
-  for axis, columns in zip(axes, (UPPER, LOWER)):
-    hosts = [axis, axis.twinx(), axis.twinx()]
-    hosts[2].spines["right"].set_position(("axes", 1.09))
-    for host, (column, label), color, dash in zip(hosts, columns, COLORS, DASHES):
-      values = {
-        arm: np.asarray(trace[column][trace["arm"] == arm], float).reshape(-1, steps)
-        for arm in arms
-        if arm in (main, "none")
-      }
-      _curves(host, values, main, width, color, dash)
-      if aborted is not None:  # one run that was given up, on its own
-        curve = smooth(np.asarray(trace[column][trace["stream"] == aborted], float)[None], width)[0]
-        name = f"stream {int(aborted)}, aborted" if column == "reward" else None
-        host.plot(*_thin(curve), color=color, lw=0.7, ls=":", zorder=2, label=name)
-      host.set_ylabel(label, color=color)
-      host.tick_params(axis="y", colors=color)
-    for s in sorted({int(s) for s, k in zip(events["step"], events["kind"]) if k == "onset"}):
-      axis.axvline(s, color="k", lw=1.3)
-    for kinds, marker, face, label in MARKS:
-      at = [s for s, kind, _ in own if kind in kinds]
-      high = [axis.get_ylim()[1] * 0.985] * len(at)
-      # in_layout: an empty line that is not clipped has no extent, and the layout would collapse
-      axis.plot(
-        at, high, marker, color="k", mfc=face, ms=5, clip_on=False, in_layout=False, label=label
-      )
+  main = next((arm for arm in ("detector", *arms) if arm in arms and arm != "none"), "none")
+  shown, which = _affected(trace, rows)
+  drawn = Figure(figsize=(9, 6.4), layout="constrained")
+  axes = drawn.subplots(3, 1, sharex=True, height_ratios=(3, 1.1, 1.7))
+  for arm in reversed(arms):  # the first on top
+    reward = _of(trace, "reward", arm, shown, steps)
+    _lines(axes[0], smooth(reward, width), style.arm(arm), f"arm {arm}", arm in (main, "none"))
+  axes[0].set(ylabel="reward a step", ylim=(0, None) if min(trace["reward"]) >= 0 else None)
+  axes[0].legend(loc="lower right", ncols=min(5, len(arms)))
+  mine = [g for g in shown if trace["arm"][np.flatnonzero(trace["stream"] == g)[0]] == main]
+  _spans(axes[1], events, mine, steps, style.arm(main))
+  axes[1].set_ylabel(f"{main}:\nlearning")
+  brief = max(1, width // 5)
+  opr = smooth(_of(trace, "opr", main, shown, steps), brief)
+  _lines(axes[2], opr, style.arm(main), None, True)
+  axes[2].set(ylabel=f"{main}:\nprediction error (OPR)", xlabel="control step", xlim=(0, steps))
+  for axis in axes:
+    for step, kind in sorted(set(zip(events["step"], events["kind"]))):
+      if kind in ("onset", "repair"):
+        axis.axvline(step, color="k", lw=0.9, ls=":")
+        if axis is axes[0]:
+          axis.text(step, 1.0, f" {kind}", transform=axis.get_xaxis_transform(), va="top")
+  clock = axes[0].secondary_xaxis("top", (lambda x: x * control_s, lambda t: t / control_s))
+  clock.set_xlabel("seconds")
   # a preset has a severity for each of its faults
   severity = "" if config["severity"] is None else f" {config['severity']:g}"
-  axes[0].legend(loc="lower right", fontsize=8, framealpha=0.9)
-  axes[0].set_title(
-    f"{config['env']}: {config['fault']}{severity} at step {config['onset']:,}; "
-    f"{(trace['arm'] == main).sum() // steps} streams, mean and "
-    f"standard deviation\narm {main} in colour"
-    + (", arm none in grey" if "none" in arms and main != "none" else "")
-    + f"; curves are trailing means of {width} steps",
+  drawn.suptitle(
+    f"{config['env']}, {config['fault']}{severity}: {which}\n"
+    f"thin lines: robots; thick: their median; trailing means of {width:,} steps, OPR {brief:,}",
     fontsize=10,
+    x=0.01,
+    ha="left",
   )
-  axes[1].set_xlabel(f"control step ({control_s:g} s)")
   return drawn
+
+
+def _affected(trace: dict, rows: list[dict]) -> tuple[list[int], str]:
+  """Streams of the seeds that the fault costs something, and what these are."""
+  seeds = {r["seed"] for r in rows if r["affected"] and not r["change"]}
+  streams = dict(zip(trace["stream"].tolist(), trace.get("seed", trace["stream"]).tolist()))
+  some = [g for g, seed in streams.items() if seed in seeds]
+  if some:
+    return some, f"the {len(seeds)} of {len(set(streams.values()))} robots that it costs a tenth"
+  return list(streams), "all robots" + (", none of which it costs a tenth" if rows else "")
+
+
+def _of(trace: dict, column: str, arm: str, streams: list[int], steps: int) -> np.ndarray:
+  """A column of an arm's streams, (streams, steps)."""
+  own = (trace["arm"] == arm) & np.isin(trace["stream"], streams)
+  return np.asarray(trace[column][own], float).reshape(-1, steps)
 
 
 def _thin(*curves: np.ndarray) -> list[np.ndarray]:
@@ -132,23 +124,38 @@ def _thin(*curves: np.ndarray) -> list[np.ndarray]:
   return [y[:: max(1, len(steps) // 2000)] for y in (steps, *curves)]
 
 
-def _curves(
-  host: Axes, values: dict[str, np.ndarray], main: str, width: int, color: str, dash: str
-) -> None:
-  """Trailing means of one signal, {arm: (streams, steps)}, and the axis from 0 to above them."""
-  top = 0.0
-  for arm, curves in values.items():
-    curves = smooth(curves, width)
-    with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # no residual yet
-      mean, std = np.nanmean(curves, 0), np.nanstd(curves, 0)
-    if arm == main:
-      host.plot(*_thin(mean), color=color, lw=1.6, zorder=3, ls="-")
-      x, low, high = _thin(mean - std, mean + std)
-      host.fill_between(x, low, high, color=color, alpha=0.14, lw=0)
-    else:
-      host.plot(*_thin(mean), color="0.6", lw=1.0, zorder=1, ls=dash)
-    top = max(top, np.nanmax((mean + std)[min(width, len(mean) - 1) :], initial=0.0))
-  host.set_ylim(0, 1.1 * top if top else 1)
+def _lines(axis: Axes, curves: np.ndarray, color: str, label: str | None, each: bool) -> None:
+  """The median of curves (streams, steps), and each of them where told."""
+  if each:
+    for curve in curves:
+      axis.plot(*_thin(curve), color=color, lw=0.6, alpha=0.35)
+  with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # nothing known yet
+    axis.plot(*_thin(np.nanmedian(curves, 0)), color=color, lw=2.0, label=label)
+
+
+def _spans(axis: Axes, events: dict, streams: list[int], steps: int, color: str) -> None:
+  """A row a stream: bars while it learns, where it alarms, and how learning ends."""
+  rows = {g: k for k, g in enumerate(streams)}
+  marks: dict[str, list[tuple[int, int]]] = {"alarm": [], "stop": [], "abort": [], "end": []}
+  begun: dict[int, int] = {}
+  for step, kind, g in sorted(zip(events["step"], events["kind"], events["stream"])):
+    if g not in rows:
+      continue
+    if kind == "start":
+      begun[g] = step
+    elif kind in ("stop", "abort", "end") and g in begun:
+      axis.barh(rows[g], step - begun[g], left=begun.pop(g), height=0.6, color=color, alpha=0.5)
+    if kind in marks:
+      marks[kind].append((step, rows[g]))
+  for g, step in begun.items():
+    axis.barh(rows[g], steps - step, left=step, height=0.6, color=color, alpha=0.5)
+  for kind, marker in (("alarm", "|"), ("stop", "o"), ("abort", "x"), ("end", "s")):
+    if marks[kind]:
+      name = {"stop": "converged", "abort": "given up", "end": "time over"}.get(kind, kind)
+      axis.plot(*zip(*marks[kind]), marker, color="k", ms=5, mfc="w", label=name)
+  axis.set(yticks=[], ylim=(len(streams) - 0.4, -0.6))
+  if any(marks.values()):
+    axis.legend(loc="upper left", bbox_to_anchor=(0.0, 1.0), ncols=1)
 
 
 def survival(out: os.PathLike | str, parts: list[str], columns: int = 3) -> pathlib.Path | None:
@@ -167,23 +174,29 @@ def survival(out: os.PathLike | str, parts: list[str], columns: int = 3) -> path
       shown.append((part, rows, config))
   if not shown:
     return None
+  with style.look():
+    return _saved(_survival(shown, columns), out / "recovery.png")
+
+
+def _survival(shown: list[tuple[str, list[dict], dict]], columns: int) -> Figure:
+  """A panel for each (part, rows, config)."""
   lines, wide = -(-len(shown) // columns), min(columns, len(shown))
   drawn = Figure(figsize=(4.2 * wide, 3.3 * lines), layout="constrained")
   axes = drawn.subplots(lines, wide, squeeze=False)
   for axis in axes.flat[len(shown) :]:
     axis.set_axis_off()
   for axis, (part, rows, config) in zip(axes.flat, shown):
-    for k, arm in enumerate(config["arms"]):
+    for arm in config["arms"]:
       own = [
         dict(r, affected=bool(r["affected"]) and not r["change"]) for r in rows if r["arm"] == arm
       ]
       if any(r["affected"] for r in own):
-        _share(axis, *estimate.of_runs(own, config["steps"]), arm, f"C{k}")
+        _share(axis, *estimate.of_runs(own, config["steps"]), arm, style.arm(arm))
     axis.set(title=part, xlabel="control steps since onset", ylim=(-0.03, 1.05))
     axis.locator_params(axis="x", nbins=5)
     axis.legend(fontsize=7, title="recovered", title_fontsize=7)
   axes[0, 0].set_ylabel("share not yet recovered")
-  return _saved(drawn, out / "recovery.png")
+  return drawn
 
 
 def _share(axis: Axes, time: np.ndarray, seen: np.ndarray, arm: str, color: str) -> None:
@@ -204,20 +217,25 @@ def versus(found: list[Variant], path: os.PathLike | str) -> pathlib.Path:
   """Draws, for each variant, the share of its streams that keep at least so much of their reward
   before the onset (a performance profile), with 95 % bootstrap intervals over streams.
   """
+  with style.look():
+    return _saved(_versus(found), pathlib.Path(path), 130)
+
+
+def _versus(found: list[Variant]) -> Figure:
   levels = np.linspace(0.0, 1.2, 121)
   drawn = Figure(figsize=(6.4, 4.2), layout="constrained")
   axis = drawn.subplots()
   for k, one in enumerate(found):
     share, (low, high) = profile(one, levels)
-    axis.step(levels, share, where="post", color=f"C{k}", lw=1.6, label=one.name)
-    axis.fill_between(levels, low, high, step="post", color=f"C{k}", alpha=0.12, lw=0)
+    axis.step(levels, share, where="post", color=style.nth(k), lw=1.6, label=one.name)
+    axis.fill_between(levels, low, high, step="post", color=style.nth(k), alpha=0.12, lw=0)
   axis.set(
     xlabel="reward over the last 2,000 steps / reward before the onset",
     ylabel="share of streams with at least that",
     ylim=(-0.03, 1.05),
   )
   axis.legend(fontsize=8)
-  return _saved(drawn, pathlib.Path(path), 130)
+  return drawn
 
 
 def ratios(out: os.PathLike | str, points: list[dict]) -> pathlib.Path | None:
@@ -237,10 +255,15 @@ def ratios(out: os.PathLike | str, points: list[dict]) -> pathlib.Path | None:
   lines = {p["line"]: [q for q in by_ratio if q["line"] == p["line"]] for p in points}
   if not any(len({p["ratio"] for p in own}) > 1 for own in lines.values()):
     return None
+  with style.look():
+    return _saved(_ratios(lines, points), pathlib.Path(out) / "ratio.png")
+
+
+def _ratios(lines: dict[str, list[dict]], points: list[dict]) -> Figure:
   drawn = Figure(figsize=(6, 4), layout="constrained")
   axis = drawn.subplots()
   for k, (line, own) in enumerate(lines.items()):
-    _line(axis, line, own, 1.04 ** (k - (len(lines) - 1) / 2), f"C{k}")
+    _line(axis, line, own, 1.04 ** (k - (len(lines) - 1) / 2), style.nth(k))
   axis.set_title(f"recovered / affected at each point; hollow: {FEW} seeds or fewer", fontsize=9)
   axis.set(
     xscale="log",
@@ -252,7 +275,7 @@ def ratios(out: os.PathLike | str, points: list[dict]) -> pathlib.Path | None:
   axis.set_xticks(ticks, [f"{r:g}" for r in ticks])
   axis.minorticks_off()
   axis.legend(fontsize=8)
-  return _saved(drawn, pathlib.Path(out) / "ratio.png")
+  return drawn
 
 
 def _line(axis: Axes, line: str, own: list[dict[str, Any]], aside: float, color: str) -> None:

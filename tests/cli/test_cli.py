@@ -169,7 +169,7 @@ def test_version(capsys):
 
 
 def test_the_names_that_ship_are_those_of_the_registries():
-  """`python -m mjx_cl.cli.registries` writes them."""
+  """`python -m mjx_cl.cli.names` writes them."""
   groups = (envs.ENVS.group, faults.FAULTS.group, detectors.DETECTORS.group)
   assert groups == names.GROUPS
   assert json.loads(names.FILE.read_text()) == registries.tables(registries.TABLES)

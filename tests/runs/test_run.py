@@ -627,9 +627,7 @@ def test_figure_of_a_run_in_which_little_happened(tmp_path, starts):
     "step": np.tile(np.arange(steps), 2),
     "reward": numbers,
   }
-  trace |= {k: np.full(2 * steps, np.nan) for k in ("opr", "rpr", "adv_mag", "dyn_loss")} | {
-    "value_loss": numbers
-  }
+  trace |= {"opr": np.full(2 * steps, np.nan)}
   tables.write_table(tmp_path / "trace.parquet", trace)
   events = {
     "step": [40] + starts + [80],
