@@ -2,6 +2,7 @@
 scores, and for the latter the streams as plain files.
 """
 
+import math
 import pathlib
 from collections.abc import Callable, Collection
 
@@ -193,23 +194,36 @@ def from_host(
   )
 
   def get(data: Data) -> Found:
-    detector, value = make(1.0), None
+    detector, value, tried = make(1.0), math.inf, dict[float, int]()
     tune, score, fault = (
       host_lib.samples(detector, x.residual) for x in (data.tune, data.score, data.fault)
     )
     for x in (tune, score, fault):
       host_lib.causal(detector, x[:, :TRIED])
+    counted = tune.shape[1] * (len(tune) - data.count_from)
     if threshold_name:
-      target = tune.shape[1] * (len(tune) - data.count_from) / data.arl0
-      alarms = lambda v: int(host_lib.run(make(v), tune)[0][data.count_from :].sum())
-      value = _least(alarms, target, f"--threshold {threshold_name}")
+
+      def alarms(v: float) -> int:
+        tried[v] = int(host_lib.run(make(v), tune)[0][data.count_from :].sum())
+        return tried[v]
+
+      value = _least(alarms, counted / data.arl0, f"--threshold {threshold_name}")
       detector = make(value)
     steps = min(len(tune), len(score))
     healthy = np.concatenate([tune[:steps], score[:steps]], 1)
     fired, healthy_score, _ = host_lib.run(detector, healthy)
     fault_fired, fault_score, seconds = host_lib.run(detector, fault)
     us = seconds / max(1, np.isfinite(fault).sum()) * 1e6
-    return found(data, value, fired, healthy_score, fault_fired, fault_score, us)
+    at = lambda level: (
+      host_lib.run(make(level), healthy)[0],
+      host_lib.run(make(level), fault)[0],
+    )
+    fired, fault_fired, note = at_rate(
+      data, tried, value, counted, (fired, healthy_score), (fault_fired, fault_score), at
+    )
+    threshold = value if threshold_name else None
+    rated = found(data, threshold, fired, healthy_score, fault_fired, fault_score, us)
+    return rated._replace(note=note)
 
   return get
 
