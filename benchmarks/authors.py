@@ -3,7 +3,8 @@
   git clone https://github.com/danijar/dreamerv3 ../dreamerv3
   git -C ../dreamerv3 checkout e3f0224
   python -m venv ../authors
-  ../authors/bin/pip install jax==0.5.3 chex einops elements granular ninjax optax portal ruamel.yaml
+  ../authors/bin/pip install jax==0.5.3 chex einops elements granular ninjax optax portal \\
+    ruamel.yaml
   python benchmarks/authors.py --code ../dreamerv3 --python ../authors/bin/python [--json]
 
 Both: size1m, 24 numbers observed, 6 actions, 16 x 64 replayed records and the one before each,
@@ -164,9 +165,10 @@ def main() -> None:
   if args.json:
     print(json.dumps(value))
   else:
+    low, high = value["ratio_quartiles"]
     print(
       f"theirs {value['theirs_s']:.3f} s, ours {value['ours_s']:.3f} s; theirs over ours, turn by "
-      f"turn: {value['ratio']:.2f} (quartiles {', '.join(f'{x:.2f}' for x in value['ratio_quartiles'])})"
+      f"turn: {value['ratio']:.2f} (quartiles {low:.2f}, {high:.2f})"
     )
 
 

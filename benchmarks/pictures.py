@@ -1,5 +1,5 @@
-"""Pictures of results that are committed: the detectors' board as dots (results/leaderboard.png) and
-what each fault costs each robot that does not adapt (docs/fault_map.png).
+"""Pictures of results that are committed: the detectors' board as dots (results/leaderboard.png)
+and what each fault costs each robot that does not adapt (docs/fault_map.png).
 
 python benchmarks/pictures.py [leaderboard faults]
 """
@@ -23,7 +23,7 @@ DUMMIES = ("never", "always", "periodic", "random", "true onset (oracle)", ORACL
 
 def leaderboard(pyplot) -> pathlib.Path:
   """Score of each detector over all faults with its interval, and on each robot; those that beat
-  never alarming. Grey: up to what the likelihood-ratio oracle of OPR, RPR and surprise scores.
+  never alarming. Grey: up to what the likelihood-ratio oracle of OPR and RPR scores.
   """
   overall = {r["detector"]: r for r in tables.read_rows(RESULTS / "leaderboard_overall.parquet")}
   rows = tables.read_rows(RESULTS / "leaderboard.parquet")

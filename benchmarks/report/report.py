@@ -383,8 +383,9 @@ def leaderboard(results: pathlib.Path) -> str:
     shown,
   )
   dots = fill(
-    "Dots: the score over all faults with its interval, and on each robot (`python benchmarks/pictures.py`). Grey: up to what the likelihood-ratio oracle scores, "
-    "which is told the fault and watches OPR and RPR."
+    "Dots: the score over all faults with its interval, and on each robot "
+    "(`python benchmarks/pictures.py`). Grey: up to what the likelihood-ratio oracle scores, which "
+    "is told the fault and watches OPR and RPR."
   )
   return "\n\n".join(
     [

@@ -18,7 +18,7 @@ from mjx_cl.errors import UserError, require
 from mjx_cl.io import folders, memory
 from mjx_cl.runs import bench, cluster, costs, run, workers
 from mjx_cl.runs.suite import Part, Suite, by_agent, finished, of_agents, pick, standing, suite
-from mjx_cl.training.agents import of_one_recipe
+from mjx_cl.training.agents import numbered
 
 
 def do_run(args: Run) -> None:
@@ -27,7 +27,7 @@ def do_run(args: Run) -> None:
   names = args.agent
   if "all" in names:
     require(len(names) == 1, "--agent: 'all' stands alone")
-    names = tuple(of_one_recipe(args.env))
+    names = tuple(numbered(args.env))
   config = RunConfig(**given | {"agent": names[0] if len(names) == 1 else None})
   if args.quick:
     say(f"note: {quick.said(config)}")

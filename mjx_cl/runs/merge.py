@@ -48,12 +48,7 @@ SEEDS = ("seeds", "first_seed")  # settings that pieces do not share
 SAME = ("physics", "agent_card", "arm_cards", "repeat", "control_s")
 # what `join` takes from summary.json
 SUMMED = (
-  "env",
-  "fault",
-  "severity",
-  "onset",
-  "steps",
-  "detector",
+  *summary.HEAD,
   "invalid_share",
   "wall_s",
   "wall_s_arms",
@@ -286,7 +281,7 @@ def _summary(
     streams = len(config.arms) * config.seeds
     interval = summary.invalid(valid.reshape(streams, -1).T, int(configs[0]["repeat"]))[1]
   value = {
-    **{k: summaries[0][k] for k in SUMMED[:6]},
+    **{k: summaries[0][k] for k in summary.HEAD},
     **summary.by_arm(rows["runs"].to_pylist(), config, envs.make(config.env).spec.control_s),
     "invalid_share": mean(*zip(*invalid)) if invalid else None,
     "invalid_share_ci": interval,

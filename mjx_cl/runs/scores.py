@@ -14,20 +14,12 @@ from mjx_cl.errors import FileError, UserError
 from mjx_cl.io import folders, tables
 from mjx_cl.render import figures
 from mjx_cl.runs.suite import Part, Suite, by_agent, standing
-from mjx_cl.runs.summary import over_agents
+from mjx_cl.runs.summary import HEAD, over_agents
 from mjx_cl.scoring import ablation, normalised_recovery, survival
 
 HORIZON = 10_000  # control steps after the onset, of the restricted mean time to recovery
 # chunks over which signals must be settled, of the stop rule without its floor
 PATIENCES = (48, 24, 12)
-HEAD = (
-  "env",
-  "fault",
-  "severity",
-  "onset",
-  "steps",
-  "detector",
-)  # what runs of several agents share
 
 
 def scores(folder: pathlib.Path) -> dict:

@@ -13,6 +13,8 @@ from mjx_cl.runs.records import OUTCOMES, Ledger, acts
 from mjx_cl.scoring import intervals
 
 DRAWS = 1000  # of the bootstrap over agents
+# of summary.json: what runs have in common that differ in seeds or agent alone
+HEAD = ("env", "fault", "severity", "onset", "steps", "detector")
 
 
 def summary(

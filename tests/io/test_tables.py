@@ -236,7 +236,7 @@ ENDLESS = "select count(*) from range(10000000) a, range(10000000) b where a.ran
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("times", [1, 2])
 def test_a_query_ends_with_a_signal(folder, monkeypatch, number, times):
-  """The last one comes while the first is being acted upon; nothing goes on computing afterwards."""
+  """The last one comes while the first is being acted upon; nothing computes on afterwards."""
   before = set(threading.enumerate())
   begun, inner = threading.Event(), tables._answer
   monkeypatch.setattr(tables, "_answer", lambda *given: begun.set() or inner(*given))

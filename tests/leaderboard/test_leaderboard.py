@@ -707,13 +707,16 @@ def test_a_run_tells_of_thresholds_that_part_no_score():
   )
 
 
+def as_it_is(data, tried, threshold, counted, healthy, fault, at):
+  """In place of calibration.at_rate: the alarms at the threshold, however few."""
+  return healthy[0], fault[0], None
+
+
 def test_a_threshold_used_otherwise_is_found_out_and_all_is_run(small, monkeypatch):
   """Fires a quarter below its threshold: no score lies between two thresholds, yet their alarms
   differ. Recorded OPR is rounded, so that no threshold gives the asked rate: left at that here.
   """
-  monkeypatch.setattr(
-    calibration, "at_rate", lambda data, tried, t, n, healthy, fault, at: (healthy[0], fault[0], "")
-  )
+  monkeypatch.setattr(calibration, "at_rate", as_it_is)
   from mjx_cl.detectors.base import Alarm, Detector
 
   early = lambda t: Detector(lambda: jnp.int32(0), lambda s, x: (s, Alarm(x.opr > t - 0.25, x.opr)))
@@ -795,11 +798,6 @@ def test_a_rarer_rate_gains_nothing(small, tmp_path, monkeypatch):
     for rule in (True, False):
       with monkeypatch.context() as patch:
         if not rule:
-          as_it_is = lambda data, tried, threshold, counted, healthy, fault, at: (
-            healthy[0],
-            fault[0],
-            None,
-          )
           patch.setattr(submissions, "at_rate", as_it_is)
         board = leaderboard.score(held, [], extra=[("mine", submissions.from_scores(scores))])
       rows[name, rule] = pick(board, detector="mine", fault="bias")
@@ -1009,7 +1007,6 @@ class Above:
 
 
 def test_a_plain_python_class_is_calibrated_and_scored(small, monkeypatch):
-  as_it_is = lambda data, tried, t, n, healthy, fault, at: (healthy[0], fault[0], None)
   monkeypatch.setattr(submissions, "at_rate", as_it_is)  # recorded OPR is rounded
   host = lambda value: HostDetector(lambda: Above(value), "above", "opr", False)
   board = leaderboard.score(

@@ -104,13 +104,11 @@ def test_the_bootstrap_is_that_of_agents_and_then_of_their_rows():
   assert got["updates_mean_ci"] == pytest.approx(want, abs=0.25 * np.std(drawn))
 
 
-def test_the_shipped_agents_of_one_recipe():
-  assert (
-    agents.of_one_recipe("car") == agents.of_one_recipe("car_real") == ["car", "car-2", "car-3"]
-  )
-  assert "walker-plain" not in agents.of_one_recipe("walker")
+def test_the_shipped_agents_numbered():
+  assert agents.numbered("car") == agents.numbered("car_real") == ["car", "car-2", "car-3"]
+  assert "walker-plain" not in agents.numbered("walker")
   with pytest.raises(UserError, match="no agent of 'halfcheetah' ships; shipped: car,"):
-    agents.of_one_recipe("halfcheetah")
+    agents.numbered("halfcheetah")
 
 
 @pytest.fixture

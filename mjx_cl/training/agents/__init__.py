@@ -87,9 +87,9 @@ def of(env: Any, path: str | None = None, **departures: Any) -> Trained:
   )
 
 
-def of_one_recipe(env_name: str) -> list[str]:
-  """Shipped agents of a robot that differ in their training's seed alone: NAME, NAME-2, ..., where
-  NAME is the robot or the one whose agents it takes.
+def numbered(env_name: str) -> list[str]:
+  """Shipped agents of a robot, each of a training seed of its own: NAME, NAME-2, ..., where NAME is
+  the robot or the one whose agents it takes.
 
   Raises:
     UserError: where none ships.
