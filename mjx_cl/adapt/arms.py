@@ -60,6 +60,8 @@ class Arm:
       The latent that the robot carries runs on.
     rollback: an adaptation that is aborted leaves the better of two sets of weights, those of
       before it or those that it learnt, see act.Before.
+    guarded: while an adaptation runs the weights of before it and those that learn act by turns,
+      and the better ones stay, see act.Guard.
     breaks: the robot gets the run's faults; False: their severity is 0.
     agent: what is joined to the name of the run's agent, after a hyphen, to give that of the arm's
       own; "": it is the run's.
@@ -71,6 +73,7 @@ class Arm:
   world_only: bool = False
   fresh: bool = False
   rollback: bool = False
+  guarded: bool = False
   breaks: bool = True
   agent: str = ""
 
@@ -125,7 +128,9 @@ def stops(arm: Arm) -> bool:
   that: its stop compares with those of one that never stops.
   """
   return (
-    arm.end is RULE and arm.breaks and not arm.fresh and not arm.world_only and not arm.rollback
+    arm.end is RULE
+    and arm.breaks
+    and not (arm.fresh or arm.world_only or arm.rollback or arm.guarded)
   )
 
 
@@ -137,6 +142,13 @@ ARMS: dict[str, Arm] = {
     ALARM,
     RULE,
     rollback=True,
+  ),
+  "guarded": Arm(
+    "as detector, but the weights of before the finetuning and the new ones act by turns, more often "
+    "those that earn more, which stay in the end",
+    ALARM,
+    RULE,
+    guarded=True,
   ),
   "none": Arm("no adaptation; alarms are logged", NEVER, NO_END),
   "always": Arm("finetuning from the end of the warm-up on, without an end", AT_ONCE, NO_END),

@@ -31,6 +31,8 @@ class Choices(NamedTuple):
       goes without the drawing.
     rollback: bool, an abort may put the weights of before the adaptation back; None: no arm of the
       run does, and LoopState.before is None too.
+    guarded: bool, old and new weights act by turns; None: in no arm of the run, and LoopState.guard
+      is None too.
   """
 
   listens: jax.Array
@@ -40,6 +42,7 @@ class Choices(NamedTuple):
   world_only: jax.Array
   fresh: jax.Array | None
   rollback: jax.Array | None = None
+  guarded: jax.Array | None = None
 
 
 def choices(
@@ -85,4 +88,5 @@ def choices(
     flags(lambda a: a.world_only),
     flags(lambda a: a.fresh) if any(arm.fresh for arm in arms) else None,
     flags(lambda a: a.rollback) if any(arm.rollback for arm in arms) else None,
+    flags(lambda a: a.guarded) if any(arm.guarded for arm in arms) else None,
   )

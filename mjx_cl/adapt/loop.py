@@ -7,6 +7,7 @@ no update.
 
 from __future__ import annotations
 
+import itertools
 import threading
 import time
 from collections.abc import Callable, Hashable
@@ -147,13 +148,16 @@ class Loop:
     shared = same is not None and programs is not None
     self.programs = programs.share((same, repeat), own) if shared and programs else own()
 
-  def init(self, train: TrainState, groups: int, rollback: bool = False) -> LoopState:
+  def init(
+    self, train: TrainState, groups: int, rollback: bool = False, guarded: bool = False
+  ) -> LoopState:
     """State before the first step.
 
     Args:
       train: the shipped agent, the same for every stream.
       groups: streams.
       rollback: an arm of the run goes back, see Before.
+      guarded: an arm of the run is, see Guard.
     """
     a = self.agent
     spread = lambda tree: jax.tree.map(
@@ -176,6 +180,7 @@ class Loop:
       owed=none(),
       executed=jnp.zeros(groups, jnp.int32),
       before=act.Before(params(), none(), none(), jnp.zeros(groups, bool)) if rollback else None,
+      guard=act.unguarded(params(), groups) if guarded else None,
     )
     return strong(state)
 
@@ -279,8 +284,12 @@ class Loop:
     if acceptance is None or config.acceptance is not None:
       acceptance = self.spec.acceptance if config.acceptance is None else config.acceptance
     _, least = self.spec.posture or (0, -jnp.inf)
+    signals = seen.signals
+    if state.guard is not None and choices.guarded is not None:  # the rule judges what learns
+      others = choices.guarded & state.guard.acts & (was == decide.ADAPTING)
+      signals = jnp.where(others[:, None], jnp.nan, signals)
     phase, decision, settled = decide.decide(
-      state.phase, seen.signals, seen.posture, begin, now, choices, acceptance, least, config
+      state.phase, signals, seen.posture, begin, now, choices, acceptance, least, config
     )
     begins = decision == decide.START
 
@@ -294,8 +303,8 @@ class Loop:
     taken = train.updates - counted
     phase, decision = decide.give_up(phase, decision, was, failed, seen.signals)
 
-    train, acting, before, weighed = self._act(
-      state, train, acting, phase, seen, begins, number, taken, choices.rollback, config
+    train, acting, kept, weighed = self._act(
+      state, train, acting, phase, seen, begins, number, taken, choices, config
     )
     # a stream that is done watches again, its reference refitted on the latest rows
     over = (decision == decide.STOP) | (decision == decide.END)
@@ -312,7 +321,7 @@ class Loop:
       phase=phase,
       owed=owed - number,
       executed=executed,
-      before=before,
+      **kept,
     )
     said = (phase.phase, decision, phase.since, executed, failed, *weighed)
     return state, Digest(*seen[:4], settled, *said)
@@ -327,17 +336,33 @@ class Loop:
     begins: jax.Array,
     number: jax.Array,
     taken: jax.Array,
-    rollback: jax.Array | None,
+    choices: Choices,
     config: AdaptConfig,
-  ) -> tuple[TrainState, Any, act.Before | None, tuple[jax.Array, ...]]:
-    """The robot acts by a moving average of what it learns, and keeps it when it is done."""
-    was, before = state.phase.phase, state.before
-    weighed: tuple[jax.Array, ...] = ()
+  ) -> tuple[TrainState, Any, dict[str, Any], tuple[jax.Array, ...]]:
+    """The robot acts by a moving average of what it learns, and keeps it when it is done; of what
+    puts other weights in its place the new `before` and `guard`, and what was weighed.
+    """
+    was, before, guard = state.phase.phase, state.before, state.guard
+    reward = seen.signals[:, decide.SIGNALS.index("reward")]
+    weighed: list[act.Weighed] = []
+    if guard is not None and choices.guarded is not None:
+      acting = act.choose(choices.guarded & guard.learnt, guard.new, acting)
     acting = act.follow(acting, train.params, number, config.average)
-    if before is not None and rollback is not None:
-      reward = seen.signals[:, decide.SIGNALS.index("reward")]
-      acting, before, weighed = act.put_back(
-        acting, before, phase, was, begins, reward, taken, rollback
+    if before is not None and choices.rollback is not None:
+      acting, before, said = act.put_back(
+        acting, before, phase, was, begins, reward, taken, choices.rollback
       )
+      weighed.append(said)
+    if guard is not None and choices.guarded is not None:
+      acting, guard, said = act.take_turns(
+        acting, guard, was, phase, begins, reward, taken, choices.guarded
+      )
+      weighed.append(said)
     kept = act.choose(act.ended(was, phase), acting, train.params)
-    return train._replace(params=kept), acting, before, weighed
+    both = [act.choose(choices.guarded, *weighed[::-1])] if len(weighed) > 1 else weighed
+    return (
+      train._replace(params=kept),
+      acting,
+      {"before": before, "guard": guard},
+      tuple(itertools.chain(*both)),
+    )

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from mjx_cl.adapt.act import Before
+from mjx_cl.adapt.act import Before, Guard
 from mjx_cl.adapt.decide import PhaseState
 from mjx_cl.adapt.watch import Minds, Sight
 from mjx_cl.dreamer.agent import TrainState
@@ -34,6 +34,7 @@ class LoopState(NamedTuple):
     owed: float32, fraction of an update that is due.
     executed: int32, updates taken since the run began.
     before: Before of each stream; None where no arm of the run goes back.
+    guard: Guard of each stream; None where no arm of the run is guarded.
   """
 
   train: TrainState
@@ -46,6 +47,7 @@ class LoopState(NamedTuple):
   owed: jax.Array
   executed: jax.Array
   before: Before | None = None
+  guard: Guard | None = None
 
   @property
   def minds(self) -> Minds:
@@ -85,8 +87,8 @@ class Digest(NamedTuple):
     updates: int32, taken since the run began.
     failed: int32, index into agent.CAUSES of what was at fault in an update, which changed nothing
       and was the stream's last; -1: nothing.
-    back: bool, an abort put the weights of before the adaptation back; None where no arm does.
-    earned: float32, mean reward a step of those, see Before; None likewise.
+    back: bool, the weights of before the adaptation were put back; None where no arm does that.
+    earned: float32, mean reward a step of those, see Before and Guard; None likewise.
     earns: float32, of the weights that have learnt; None likewise.
   """
 

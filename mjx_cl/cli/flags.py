@@ -293,6 +293,9 @@ class Render(FaultConfig):
     fps: Pictures per second, at the robot's own pace.
     view: robot (MuJoCo), top (a car on its track, with its lidar) or auto.
     deterministic: Act by the policy's mean instead of a sample.
+    compare: Side by side, from one seed: the robot whole, with the fault, and with the fault and
+      each of these trained agents. Its width and height are then those of one robot.
+    skip: Control steps before the first picture; --compare alone.
   """
 
   fault: str = "none"
@@ -307,6 +310,8 @@ class Render(FaultConfig):
   view: str = "auto"
   physics: str = "auto"
   deterministic: bool = False
+  compare: tuple[str, ...] | None = None
+  skip: int = 0
   json: bool = False
 
 

@@ -10,8 +10,9 @@ from mjx_cl.cli.output import emit, say
 from mjx_cl.config import FaultConfig
 from mjx_cl.envs import adapters
 from mjx_cl.errors import UserError, require
+from mjx_cl.faults import presets
 from mjx_cl.faults.certificate import faulty
-from mjx_cl.render import pictures
+from mjx_cl.render import compare, pictures
 from mjx_cl.runs import certificate_tables, certify
 from mjx_cl.training import agents
 
@@ -45,27 +46,33 @@ def do_certify(args: Certify) -> None:
 
 
 def do_render(args: Render) -> None:
-  """Films an agent."""
+  """Films an agent, or several side by side."""
   out = args.out or f"{args.env.rpartition(':')[2]}.gif"
-  pictures.check(out, args.steps, args.width, args.height, args.fps, args.seed)
+  require(
+    args.compare is not None or args.skip == 0, "--skip goes with --compare; got it without"
+  )
+  pictures.check(out, args.steps + args.skip, args.width, args.height, args.fps, args.seed)
   env = envs.make(args.env, args.physics)
-  acting: dict[str, Any]
-  acting = {f.name: getattr(args, f.name) for f in dataclasses.fields(FaultConfig)[1:]}
-  acting |= {"seed": args.seed, "deterministic": args.deterministic}
-  if args.agent in ("none", "random"):
-    acting["agent"] = adapters.Puppet(len(env.spec.act), float(args.agent == "random"))
-  elif args.agent is None and not agents.is_shipped(env):
-    raise UserError(
-      f"no agent is shipped for {args.env}; give a folder, or --agent none (stands still), "
-      "--agent random"
-    )
-  else:
-    trained = agents.of(env, args.agent)
-    acting |= {"agent": trained.agent, "params": trained.train.params}
-    acting["repeat"] = trained.repeat
-  size = (args.steps, args.width, args.height, args.fps)
+  fault = {f.name: getattr(args, f.name) for f in dataclasses.fields(FaultConfig)[1:]}
+  acting = {"seed": args.seed, "deterministic": args.deterministic}
+  size = (args.width, args.height, args.fps)
   tell = lambda text: say(f"note: {text}")
-  result = pictures.render(env, out, *size, view=args.view, say=tell, **acting)
+  if args.compare is None:
+    acting |= fault | _acts(env, args.env, args.agent)
+    result = pictures.render(env, out, args.steps, *size, view=args.view, say=tell, **acting)
+  else:
+    panes = _panes(env, args, fault)
+    result = compare.film(
+      panes,
+      out,
+      args.steps,
+      args.skip,
+      *size,
+      view=args.view,
+      weak=args.target or _target(args),
+      say=tell,
+      **acting,
+    )
   if args.json:
     emit({"env": args.env, "agent": args.agent or args.env, "fault": args.fault, **result})
   else:
@@ -73,3 +80,47 @@ def do_render(args: Render) -> None:
       f"{result['file']}: {result['frames']} pictures, {result['fps']:g} a second, drawn by "
       f"{result['drawn_by']}"
     )
+
+
+def _acts(env: Any, name: str, agent: str | None) -> dict[str, Any]:
+  """The arguments of `pictures.act` for an agent as --agent names it."""
+  if agent in ("none", "random"):
+    return {"agent": adapters.Puppet(len(env.spec.act), float(agent == "random"))}
+  if agent is None and not agents.is_shipped(env):
+    raise UserError(
+      f"no agent is shipped for {name}; give a folder, or --agent none (stands still), "
+      "--agent random"
+    )
+  trained = agents.of(env, agent)
+  return {"agent": trained.agent, "params": trained.train.params, "repeat": trained.repeat}
+
+
+def _target(args: Render) -> str | None:
+  """What a preset breaks, where all that it breaks is one thing."""
+  changes = presets.find(args.fault, args.env).changes if presets.named(args.fault) else ()
+  targets = {c.target for c in changes}
+  return targets.pop() if len(targets) == 1 else None
+
+
+def _panes(env: Any, args: Render, fault: dict[str, Any]) -> list[compare.Pane]:
+  """Whole, with the fault, and with it and each agent of --compare."""
+  require(args.fault != "none", "--compare shows what a fault does; name one with --fault")
+  words = " ".join([args.fault, *([args.target] if args.target else [])])
+  if args.severity is not None:
+    words += f" {args.severity:g}"
+  broken = env
+  if presets.named(args.fault):
+    preset = presets.find(args.fault, args.env)
+    if preset.becomes and not preset.then:  # broken from the first step on
+      broken, fault = envs.make(preset.becomes, args.physics), {}
+  own = _acts(env, args.env, args.agent)
+  shown = [
+    compare.Pane("HEALTHY", "as trained", env, own),
+    compare.Pane("BROKEN", words, broken, fault | own),
+  ]
+  return shown + [
+    compare.Pane(
+      "BROKEN, ADAPTED", f"agent {name}", broken, fault | _acts(broken, args.env, name)
+    )
+    for name in args.compare or ()
+  ]

@@ -2,10 +2,11 @@
 
 import contextlib
 import itertools
+import os
 import pathlib
 import shutil
 import subprocess
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
@@ -83,3 +84,25 @@ def write_mp4(path: pathlib.Path, images: Iterable[np.ndarray], fps: float) -> N
     raise FileError(
       f"ffmpeg failed: {words.decode(errors='replace').strip() or process.returncode}"
     )
+
+
+@contextlib.contextmanager
+def written(
+  out: os.PathLike | str,
+) -> Iterator[Callable[[Iterable[np.ndarray], float], None]]:
+  """write(images, fps) for a file that ends in .gif or .mp4: under another name beside it, renamed
+  at the end. FileError at once where it cannot be written.
+  """
+  out = pathlib.Path(out)
+  suffix = out.suffix.lower()
+  tmp = out.with_name(f".{out.stem}.tmp{suffix}")
+  write = write_gif if suffix == ".gif" else write_mp4
+  try:
+    tmp.touch()
+  except OSError as e:
+    raise FileError(f"cannot write {out}: {e.strerror or e}") from None
+  try:
+    yield lambda images, fps: write(tmp, images, fps)
+    os.replace(tmp, out)
+  finally:
+    tmp.unlink(missing_ok=True)

@@ -1,5 +1,6 @@
 """Robots as matplotlib draws them: outlines of their bodies, or a view from above."""
 
+import copy
 import itertools
 from collections.abc import Callable
 from typing import Any
@@ -84,7 +85,7 @@ class Sketch(Canvas):
   def __init__(self, env: Any, width: int, height: int) -> None:
     super().__init__(width, height)
     self.figure.set_facecolor(tuple(SKY[1]))
-    self.env, self.model, self.data = env, env.mj_model, mujoco.MjData(env.mj_model)
+    self.env, self.model, self.data = env, copy.copy(env.mj_model), mujoco.MjData(env.mj_model)
     self.reach, self.planar = reach(self.model), planar(self.model)
     # of the line of sight, as MuJoCo counts
     azimuth, elevation = np.radians((90, 0) if self.planar else (130, -20))

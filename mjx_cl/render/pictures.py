@@ -22,7 +22,7 @@ import numpy as np
 from mjx_cl.config import check_seeds
 from mjx_cl.envs.adapters import Puppet, join, worst
 from mjx_cl.errors import FileError, UserError
-from mjx_cl.render.files import ffmpeg, framed, write_gif, write_mp4
+from mjx_cl.render.files import ffmpeg, framed, written
 from mjx_cl.render.offscreen import Offscreen, gl_library
 from mjx_cl.render.outlines import Plan, Sketch, draw_car
 from mjx_cl.render.scene import Frame
@@ -172,20 +172,11 @@ def render(
   fps = 1.0 / (every * decision_s)
   acted = act(env, steps, repeat=repeat, fault=fault, target=target, **acting)
   label = " ".join(["FAULT", fault] + ([target] if target not in (None, "random") else []))
-  tmp = out.with_name(f".{out.stem}.tmp{out.suffix.lower()}")
-  try:
-    tmp.touch()  # an unwritable place is found before anything is computed
-  except OSError as e:
-    raise FileError(f"cannot write {out}: {e.strerror or e}") from None
-  try:
+  with written(out) as write:
     scene, drawn_by = painter(env, width, height, view, say)
     with contextlib.closing(scene):
       drawn = itertools.islice(acted, 0, None, every)
-      images = (pictured(env, scene, frame, label if fault != "none" else "") for frame in drawn)
-      (write_gif if out.suffix.lower() == ".gif" else write_mp4)(tmp, images, fps)
-    os.replace(tmp, out)
-  finally:
-    tmp.unlink(missing_ok=True)
+      write((pictured(env, scene, frame, label if fault != "none" else "") for frame in drawn), fps)
   return {
     "file": str(out),
     "frames": len(range(0, steps, repeat * every)),

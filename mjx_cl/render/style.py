@@ -15,6 +15,7 @@ ARMS = {
   "none": GREY,
   "oracle": GREEN,
   "rollback": "#CC79A7",
+  "guarded": "#4b0055",
   "always": ORANGE,
   "world-model": "#E69F00",
   "scratch": "#7b4f2c",

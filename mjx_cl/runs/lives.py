@@ -60,6 +60,7 @@ class Lives:
     life: name of each stream's life: equal ones have the same robot, agent and keys.
     keys: of the streams, for all but their robots.
     rollback: an arm goes back, see act.Before.
+    guarded: an arm is, see act.Guard.
     together: all streams are one band from the start; None: on an accelerator.
     ahead: what a first departure needs is compiled beside the first chunks.
   """
@@ -73,11 +74,13 @@ class Lives:
     life: Sequence[Hashable],
     keys: jax.Array,
     rollback: bool = False,
+    guarded: bool = False,
     together: bool | None = None,
     ahead: bool = False,
   ) -> None:
     self.loop, self.keys = loop, keys
-    self.trains, self.rollback, self.streams = list(trains), rollback, len(trains)
+    self.trains, self.streams = list(trains), len(trains)
+    self.extras = {"rollback": rollback, "guarded": guarded}  # of Loop.init
     together = jax.default_backend() != "cpu" if together is None else together
     # streams of a band, and those that share a LoopState
     self.band_size, self.width = (self.streams, self.streams) if together else (BAND, 1)
@@ -92,7 +95,7 @@ class Lives:
     self._live = {Herd: Once(live), Band: Once(live)}
     self._programs = (*self._live.values(), *loop.programs)
     if together:
-      state = loop.init(trains[0], self.streams, rollback)
+      state = loop.init(trains[0], self.streams, **self.extras)
       stack = jax.tree.map(lambda *x: jnp.stack(x), *trains)
       # `before` is written at every start, before it is read
       state = state._replace(train=stack, acting=jax.tree.map(jnp.copy, stack.params))
@@ -246,7 +249,7 @@ class Lives:
     seen, sight = self.loop.watch(herd.minds, was.sight, rows, step, keys)
     phase, digest = jax.block_until_ready(self.loop.rest(was.phase, seen, step))
     herd.frozen[lane] = Frozen(sight, phase)
-    if self.rollback:  # nothing to weigh yet; streams that learn say it too
+    if any(self.extras.values()):  # nothing to weigh yet; streams that learn say it too
       unknown = np.full(1, np.nan, np.float32)
       digest = digest._replace(back=np.zeros(1, bool), earned=unknown, earns=unknown)
     digest = jax.tree.map(np.asarray, digest)
@@ -260,7 +263,7 @@ class Lives:
       fired = digest.fired[:, 0]
       if departs(fired, at, settled.choices, now, self.loop.repeat, self.loop.config):
         own, phase = jax.tree.map(jnp.copy, (sight, was.phase))  # learning uses its state up
-        state = self.loop.init(herd.train, 1, self.rollback)._replace(phase=phase)
+        state = self.loop.init(herd.train, 1, **self.extras)._replace(phase=phase)
         state, new = self.loop.learn(
           state, seen, own, rows, step, settled.choices, keys, settled.acceptance
         )
@@ -319,7 +322,7 @@ class Lives:
       _, rows = self._live[Herd](herd.minds.params, herd.streams)
       rows = jax.tree.map(lambda x: np.asarray(x)[:, :, :1], rows)
       seen, sight = self.loop.watch(herd.minds, frozen.sight, rows, jnp.int32(now), keys)
-      state = self.loop.init(herd.train, 1, self.rollback)._replace(**sight._asdict())
+      state = self.loop.init(herd.train, 1, **self.extras)._replace(**sight._asdict())
       programs.learn.warm(
         state,
         seen,

@@ -159,6 +159,7 @@ class Runner:
       [(id(t), bool(b), seed) for t, b, (_, seed) in zip(trains, self.breaks, self.labels)],
       self.keys,
       any(ARMS[arm].rollback for arm in self.config.arms),
+      any(ARMS[arm].guarded for arm in self.config.arms),
       ahead=learners > 0 and self.chunks > SOON,
     )
 

@@ -17,6 +17,7 @@ import pytest
 import quick
 
 from mjx_cl import envs
+from mjx_cl.adapt import act
 from mjx_cl.adapt import decide as phase_lib
 from mjx_cl.adapt.arms import ARMS, FOREVER
 from mjx_cl.adapt.decide import ABORT_BUDGET, END, ENDED, START, STOP
@@ -44,6 +45,7 @@ FOUR = (
 NAMES = (
   "detector",
   "rollback",
+  "guarded",
   "none",
   "always",
   "periodic",
@@ -82,25 +84,28 @@ def test_choices_of_all_arms():
     "scratch": [1000, 1200],
     "world-model": [],
     "rollback": [],
+    "guarded": [],
     "randomised": [],
     "no-fault": [],
   }
   assert len(drawn) == 1 and 1000 <= drawn[0] <= 1440
   on = lambda field: {name for name, row in rows.items() if getattr(row, field)}
-  assert on("listens") == {"detector", "rollback", "world-model", "no-fault"}
+  assert on("listens") == {"detector", "rollback", "guarded", "world-model", "no-fault"}
   assert (
     on("world_only") == {"world-model"}
     and on("fresh") == {"scratch"}
     and on("rollback") == {"rollback"}
+    and on("guarded") == {"guarded"}
   )
   few = choices([("detector", 0), ("none", 0)], c, 1500)
   assert (
-    few.fresh is None and few.rollback is None and few.at.shape[1] == x.at.shape[1] == WIDTH
+    few.fresh is few.rollback is few.guarded is None and few.at.shape[1] == x.at.shape[1] == WIDTH
   )  # one program
   assert choices(
     [("periodic", 0)], dataclasses.replace(c, period=100, warmup=100), 1500
   ).at.shape == (1, 2 * WIDTH)
-  assert on("rule") == {"detector", "rollback", "oracle", "scratch", "world-model", "no-fault"}
+  heard = {"detector", "rollback", "guarded", "world-model", "no-fault"}
+  assert on("rule") == heard | {"oracle", "scratch"}
   assert {name: int(row.limit) for name, row in rows.items()} == dict.fromkeys(NAMES, 777) | {
     "none": FOREVER,
     "always": FOREVER,
@@ -331,7 +336,7 @@ def story():
   keys = jax.vmap(jax.random.key)(jnp.arange(len(NAMES)))
 
   def begin():
-    state = loop.init(train, len(NAMES), rollback=True)
+    state = loop.init(train, len(NAMES), rollback=True, guarded=True)
     return state._replace(
       detector=state.detector._replace(at=jnp.tile(jnp.array(ALARMS), (len(NAMES), 1)))
     )
@@ -369,6 +374,7 @@ def spans(story):
   return {
     "detector": heard,
     "rollback": heard,
+    "guarded": heard,
     "none": [],
     "always": [(20, 1, None, None)],
     "periodic": [(80, 5, 7, END), (160, 10, 12, END), (240, 15, None, None)],
@@ -520,7 +526,7 @@ def aborted(story):
     chosen = choices(labels, config, STEPS * CHUNKS)
     chosen = chosen._replace(at=chosen.at.at[:count, : len(due)].set(jnp.array(due)))
     keys = jax.vmap(jax.random.key)(jnp.zeros(all_, int))
-    state = loop.init(of(story.begin.train, "detector"), all_, rollback=True)
+    state = loop.init(of(story.begin.train, "detector"), all_, rollback=True, guarded=True)
     state = state._replace(
       train=state.train._replace(updates=jnp.full(all_, 2000, jnp.int32))
     )  # past the warm-up of the learning rate
@@ -614,6 +620,60 @@ def test_a_later_adaptation_goes_back_to_where_it_began(aborted, same):
     and not same(acting[7], acting[1])
     and not same(acting[13], acting[7])
   )
+
+
+def test_old_and_new_weights_act_by_turns(same):
+  """By hand, chunk after chunk, for four streams: the new weights earn less, more, as much, and less
+  in an arm that is not guarded.
+  """
+  new, groups, first, last = np.array([0.2, 0.9, 0.5, 0.2], np.float32), 4, 3, 90
+  flags = lambda on: jnp.full(groups, on)
+  weights = lambda x: {"w": jnp.full((groups, 3), x)}
+  guarded = jnp.array([True, True, True, False])
+  acting, guard, told = weights(1.0), act.unguarded(weights(7.0), groups), []
+  heard = {1: [[] for _ in range(groups)], 0: [[] for _ in range(groups)]}
+  turn = np.zeros(groups, int)  # chunks since the first update
+  for c in range(last + 1):
+    was = flags(phase_lib.ADAPTING if c else phase_lib.NOMINAL)
+    ends = c == last
+    phase = decide_state(flags(phase_lib.CONVERGED if ends else phase_lib.ADAPTING))
+    old_acts = np.asarray(acting["w"][:, 0]) == 1.0
+    reward = np.where(old_acts, 0.5, new).astype(np.float32)
+    # the learner's average moves on with each chunk; what `_act` hands over
+    learnt = c > first
+    held = {"w": jnp.where((guarded & learnt)[:, None], guard.new["w"], acting["w"])}
+    moved = jax.tree.map(lambda x: x + 1.0, held) if c >= first else held
+    acting, guard, weighed = act.take_turns(
+      moved, guard, was, phase, flags(c == 0), jnp.asarray(reward), flags(int(c >= first)), guarded
+    )
+    for g in range(groups):
+      if c and (not learnt or turn[g] % act.TURN >= act.SKIP):
+        heard[int(learnt and not bool(guard_acts[g]))][g].append(reward[g])
+    guard_acts = np.asarray(guard.acts)
+    turn = turn + learnt
+    told.append(np.asarray(acting["w"][:, 0]) == 1.0)
+    mean = lambda side, g: np.mean(heard[side][g][-act.KEPT :]) if heard[side][g] else np.nan
+    if c:
+      for g in range(groups):
+        np.testing.assert_allclose(weighed.earned[g], mean(0, g), rtol=1e-5)
+        np.testing.assert_allclose(weighed.earns[g], mean(1, g), rtol=1e-5)
+  told = np.array(told)[first:last]  # whether the old weights act in chunk first + 1, first + 2, ...
+  turns = told[: len(told) // act.TURN * act.TURN].reshape(-1, act.TURN, groups)
+  assert (turns == turns[:, :1]).all()  # whole turns
+  turns = turns[:, 0]
+  other = np.arange(len(turns)) % 4 == 3
+  assert (turns[:, 1] == other).all() and (turns[:, 2] == other).all() and not turns[:, 3].any()
+  # the worse learner leads until both sides have enough chunks, then the old weights do
+  led = np.flatnonzero(turns[:, 0] != other)
+  assert led[0] > act.KEPT // act.TURN and (np.arange(led[0], len(turns)) == led).all()
+  assert weighed.back.tolist() == [True, False, False, False]
+  assert (np.asarray(acting["w"][:, 0]) == 1.0).tolist() == [True, False, False, False]
+  assert not guard.learnt.any() and not guard.acts.any()
+
+
+def decide_state(phase):
+  """A PhaseState of which act reads the phase alone."""
+  return phase_lib.init(EAGER)._replace(phase=phase)
 
 
 # ---- a run of all arms ---------------------------------------------------------------------------
@@ -733,7 +793,7 @@ def test_events_say_what_started_and_ended_each_arm(lived):
   }
   for name, reasons in want.items():
     assert [r for _, r in events(out, name, "start")] == reasons, name
-  for name in ("detector", "rollback", "world-model", "no-fault"):
+  for name in ("detector", "rollback", "guarded", "world-model", "no-fault"):
     acted = [s for s, r in events(out, name, "alarm") if r.startswith("acted on")]
     assert acted and [r for _, r in events(out, name, "start")] == [
       f"alarm at step {s}" for s in acted

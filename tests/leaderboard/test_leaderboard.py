@@ -991,7 +991,8 @@ def test_the_commands_for_ones_own_detector(late, tmp_path, monkeypatch, mjx, pa
   } == {"car"}
   assert (pathlib.Path(more[more.index("--out") + 1]) / "leaderboard.html").exists()
   (row,) = [r for r in rows if r["detector"] == name and r["fault"] == "bias"]
-  assert row["threshold"] > 0 and 0 < row["arl0_alarms"] <= 16 * 824 / 400
+  wanted = 16 * 824 / 400  # where no threshold gives them, alarms are drawn (3 standard deviations)
+  assert row["threshold"] > 0 and abs(row["arl0_alarms"] - wanted) <= 3 * wanted**0.5
   assert row["miss_probability"] == 0 and row["us_per_sample"] > 0
 
 
