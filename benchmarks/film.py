@@ -1,11 +1,11 @@
-"""The README's moving picture: a walker healthy, broken and adapted, side by side.
+"""Moving pictures of robots healthy, broken and adapted, side by side, from committed agents.
 
-  python benchmarks/film.py                                            # writes docs/film.gif
-  python benchmarks/film.py --agent runs/film/agents/detector-4
+  python benchmarks/film.py                       # docs/film.gif, docs/film_car.gif, ...
+  python benchmarks/film.py walker --learn        # results/film/walker anew: minutes, then its film
 
-Without `--agent` it first lets two walkers break and adapt (`mjx-cl run walker --keep`, minutes)
-and takes what the first has learnt. On another machine they live otherwise, and so does the film.
-All three robots have the same seed; they differ in their right hip and in what they have learnt.
+What the third robot has learnt lies in results/film: the weights alone, rounded to twelve bits of
+mantissa. With `--learn` robots break and adapt (`mjx-cl run`) and the first that learnt something
+is kept; on another machine they live otherwise.
 """
 
 from __future__ import annotations
@@ -14,117 +14,159 @@ import argparse
 import pathlib
 import subprocess
 import sys
+from typing import NamedTuple
 
-SEED, JOINT, SEVERITY, STEP_S = 4, "right_hip", 0.5, 0.025
-DRAWN, SHOWN = (330, 300), (37, 22, 293, 238)  # pixels, and the box of them that is shown
-FIRST, EVERY = 140, 2  # control step of the first picture, steps from one picture to the next
-LATELY = 40  # control steps whose mean reward is shown
-PAPER, INK, GREY, BAR = (255, 255, 255), (32, 36, 44), (120, 126, 136), (228, 230, 234)
-WEAK, FAR, PLAIN = (0.86, 0.16, 0.13, 1), (0.62, 0.64, 0.70, 1), (0.93, 0.94, 0.96, 1)
-PANES = (
-  ("HEALTHY", "as trained", (34, 120, 76)),
-  ("BROKEN", "right hip at half strength", (200, 52, 44)),
-  ("BROKEN, ADAPTED", "same weak hip, after learning", (36, 92, 176)),
-)
+ROOT = pathlib.Path(__file__).resolve().parents[1]
+BITS = 12  # of a mantissa that are kept
 
 
-def learn(out: pathlib.Path) -> pathlib.Path:
-  """Lets two walkers break and adapt; the folder of what the first has learnt."""
-  flags = f"--fault gear --target {JOINT} --severity {SEVERITY} --onset 3000 --steps 16000"
-  flags += f" --first-seed {SEED} --seeds 2 --arm detector --keep --out {out}"
-  subprocess.run([sys.executable, "-m", "mjx_cl", "run", "walker", *flags.split()], check=True)
-  kept = out / "agents" / f"detector-{SEED}"
-  if not kept.is_dir():
-    raise SystemExit(f"film: walker {SEED} has learnt nothing on this machine; give --agent")
-  return kept
+class Film(NamedTuple):
+  """A robot's film.
+
+  Attributes:
+    fault: arguments of `act`; what the second and third robot suffer from the first step on.
+    becomes: environment that these two are; "": the same.
+    words: of the fault, and of what was learnt.
+    weak: what is drawn red.
+    seed: of the robots that are shown.
+    skip: control steps before the first picture.
+    steps: control steps shown.
+    learn: flags of the run that learns.
+    file: below docs.
+  """
+
+  fault: dict
+  becomes: str
+  words: tuple[str, str]
+  weak: str | None
+  seed: int
+  skip: int
+  steps: int
+  learn: str
+  file: str
 
 
-def tint(model, weak: str) -> None:
-  """Plain colours for the walker's parts, the leg on the side `weak` red, the left leg grey."""
-  for geom in range(model.ngeom):
-    name = model.body(model.geom_bodyid[geom]).name
-    if model.geom_bodyid[geom] > 0:
-      model.geom_matid[geom] = -1
-      model.geom_rgba[geom] = WEAK if weak and weak in name else FAR if "left" in name else PLAIN
+FILMS = {
+  "walker": Film(
+    {"fault": "gear", "target": "right_hip", "severity": 0.5},
+    "",
+    ("right hip at half strength", "same weak hip, after learning"),
+    "right_hip",
+    4,
+    140,
+    300,
+    "--fault gear --target right_hip --severity 0.5 --onset 3000 --steps 16000 --first-seed 4",
+    "film.gif",
+  ),
+  "quadruped": Film(
+    {"fault": "quadruped/rh-velocity-third"},
+    "",
+    ("right hind leg at a third of its speed", "same weak leg, after learning"),
+    "RH",
+    4,
+    100,
+    300,
+    "--fault quadruped/rh-velocity-third --onset 3000 --steps 16000 --first-seed 4 --arm oracle",
+    "film_quadruped.gif",
+  ),
+  "car": Film(
+    {},
+    "car_real",
+    ("moved to a harder simulator", "same car, after learning"),
+    None,
+    4,
+    40,
+    240,
+    "--fault car/sim-to-real --onset 3000 --steps 18000 --first-seed 4",
+    "film_car.gif",
+  ),
+}
 
 
-def live(agent: str | None, broken: bool, seed: int, steps: int) -> tuple[list, list[float]]:
-  """Pictures from step FIRST on, and at each the mean reward of the last LATELY steps."""
-  from mjx_cl import envs
-  from mjx_cl.render import pictures as draw
+def learn(robot: str, work: pathlib.Path) -> pathlib.Path:
+  """Lets two robots break and adapt; the folder of what the first has learnt."""
+  arm = "oracle" if "--arm oracle" in FILMS[robot].learn else "detector"
+  flags = FILMS[robot].learn.replace("--arm oracle", "") + f" --seeds 2 --arm {arm} --keep"
+  subprocess.run(
+    [sys.executable, "-m", "mjx_cl", "run", robot, *flags.split(), "--out", str(work)], check=True
+  )
+  kept = sorted(work.glob(f"agents/{arm}-*"))
+  if not kept:
+    raise SystemExit(f"film: no {robot} has learnt anything on this machine; try another seed")
+  return kept[0]
+
+
+def light(folder: pathlib.Path, out: pathlib.Path) -> None:
+  """An agent with what acting needs: rounded weights, no moments."""
+  import jax
+  import numpy as np
+
   from mjx_cl.training import agents
 
-  env = envs.make("walker")
-  found = agents.of(env, agent)
-  scene, _ = draw.painter(env, *DRAWN, view="robot")
-  tint(scene.model, JOINT.partition("_")[0] if broken else "")
-  fault = {"fault": "gear", "target": JOINT, "severity": SEVERITY} if broken else {}
-  pictures, rewards, means = [], [], []
-  acting = draw.act(env, FIRST + steps, seed, found.agent, found.train.params, **fault)
-  for frame in acting:
-    rewards.append(frame.reward)
-    if frame.step >= FIRST and (frame.step - FIRST) % EVERY == 0:
-      pictures.append(scene.picture(frame))
-      means.append(sum(rewards[-LATELY:]) / LATELY)
-  scene.close()
-  return pictures, means
+  def rounded(x):
+    x = np.asarray(x)
+    if x.dtype != np.float32:
+      return x
+    step = np.uint32(1 << (23 - BITS))
+    return ((x.view(np.uint32) + step // 2) & ~(step - np.uint32(1))).view(np.float32)
+
+  trained = agents.load(folder)
+  train = trained.train._replace(
+    params=jax.tree.map(rounded, trained.train.params),
+    slow=jax.tree.map(rounded, trained.train.slow),
+    opt=jax.tree.map(np.zeros_like, trained.train.opt),
+  )
+  agents.save(out, train, trained.card | {"rounded_bits": BITS, "moments": "none"})
 
 
-def page(pictures, means, time_s: float):
-  """One picture of the film: a pane for each robot, its words above, its reward below."""
-  from PIL import Image, ImageDraw, ImageFont
+def draw(robot: str, agent: pathlib.Path, out: pathlib.Path, **changes) -> dict:
+  """Writes a robot's film."""
+  from mjx_cl import envs
+  from mjx_cl.render import compare
+  from mjx_cl.training import agents
 
-  font = ImageFont.load_default
-  width, height = SHOWN[2] - SHOWN[0], SHOWN[3] - SHOWN[1]
-  top, gap = 46, 8
-  bar, foot = top + height + 8, top + height + 35
-  image = Image.new("RGB", (3 * width + 2 * gap, foot + 19), PAPER)
-  draw = ImageDraw.Draw(image)
-  for k, (title, words, colour) in enumerate(PANES):
-    x, room = k * (width + gap), width - 71
-    draw.text((x + 2, 2), title, fill=colour, font=font(19))
-    draw.text((x + 2, 26), words, fill=INK, font=font(14))
-    image.paste(Image.fromarray(pictures[k]).crop(SHOWN), (x, top))
-    draw.rectangle((x, top, x + width - 1, top + height - 1), outline=colour, width=3)
-    draw.text((x + 2, bar), f"{100 * means[k]:.0f} %", fill=colour, font=font(22))
-    draw.rectangle((x + 70, bar + 6, x + 70 + room, bar + 20), fill=BAR)
-    draw.rectangle((x + 70, bar + 6, x + 70 + round(room * means[k]), bar + 20), fill=colour)
-  text = "reward over the last second: 100 % is upright and at 1 m/s or more"
-  draw.text((2, foot), text, fill=GREY, font=font(13))
-  text = f"{time_s:.1f} s"
-  draw.text((image.width - 2 - font(13).getlength(text), foot), text, fill=GREY, font=font(13))
-  return image
+  film = FILMS[robot]
+  env = envs.make(robot)
+  broken = envs.make(film.becomes) if film.becomes else env
+  own, learnt = agents.of(env, None), agents.of(broken, str(agent))
+  acts = lambda trained: {
+    "agent": trained.agent,
+    "params": trained.train.params,
+    "repeat": trained.repeat,
+  }
+  pane = compare.Pane
+  panes = (
+    pane("HEALTHY", "as trained", env, acts(own)),
+    pane("BROKEN", film.words[0], broken, acts(own) | film.fault),
+    pane("BROKEN, ADAPTED", film.words[1], broken, acts(learnt) | film.fault),
+  )
+  options = {"seed": film.seed, "weak": film.weak} | changes
+  return compare.film(panes, out, film.steps, film.skip, **options)
 
 
 def main() -> None:
   parser = argparse.ArgumentParser(
     description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
   )
-  parser.add_argument("--agent", help="folder of a kept agent; default: a run of its own makes one")
-  parser.add_argument("--work", default="runs/film", help="folder of that run")
-  parser.add_argument("--out", default="docs/film.gif")
-  parser.add_argument("--seed", type=int, default=SEED, help="of the robots that are shown")
-  parser.add_argument("--steps", type=int, default=300, help="control steps shown, 0.025 s each")
+  parser.add_argument("robots", nargs="*", metavar="ROBOT", help=f"of {', '.join(FILMS)}")
+  parser.add_argument("--learn", action="store_true", help="first learn anew what is shown")
+  parser.add_argument("--work", default="runs/film", help="folder of those runs")
+  parser.add_argument("--seed", type=int, help="of the robots that are shown")
   args = parser.parse_args()
-  agent = args.agent or str(learn(pathlib.Path(args.work)))
+  if unknown := set(args.robots) - set(FILMS):
+    parser.error(f"no film of {', '.join(sorted(unknown))}; choose from: {', '.join(FILMS)}")
   from mjx_cl.io import runtime
 
   runtime.setup()
-  from PIL import Image
-
-  robots = ((None, False), (None, True), (agent, True))
-  lives = [live(*robot, args.seed, args.steps) for robot in robots]
-  pages = [
-    page([p[i] for p, _ in lives], [m[i] for _, m in lives], i * EVERY * STEP_S)
-    for i in range(len(lives[0][0]))
-  ]
-  plain = {"dither": Image.Dither.NONE}
-  palette = pages[len(pages) // 2].quantize(64, **plain)
-  first, *others = (p.quantize(palette=palette, **plain) for p in pages)
-  times = [round(1000 * EVERY * STEP_S)] * len(others) + [1200]
-  first.save(args.out, save_all=True, append_images=others, duration=times, loop=0, disposal=1)
-  size = pathlib.Path(args.out).stat().st_size
-  print(f"{args.out}: {len(pages)} pictures, {size / 1e6:.2f} MB")
+  for robot in args.robots or FILMS:
+    agent = ROOT / "results/film" / robot
+    if args.learn:
+      light(learn(robot, pathlib.Path(args.work) / robot), agent)
+    changes = {} if args.seed is None else {"seed": args.seed}
+    said = draw(robot, agent, ROOT / "docs" / FILMS[robot].file, **changes)
+    size = pathlib.Path(said["file"]).stat().st_size
+    shares = ", ".join(f"{x / said['reward'][0]:.2f}" for x in said["reward"])
+    print(f"{said['file']}: {said['frames']} pictures, {size / 1e6:.2f} MB, reward {shares}")
 
 
 if __name__ == "__main__":

@@ -144,8 +144,8 @@ ARMS: dict[str, Arm] = {
     rollback=True,
   ),
   "guarded": Arm(
-    "as detector, but the weights of before the finetuning and the new ones act by turns, more often "
-    "those that earn more, which stay in the end",
+    "as detector, but the weights of before the finetuning and the new ones act by turns, more "
+    "often those that earn more, which stay in the end",
     ALARM,
     RULE,
     guarded=True,

@@ -48,9 +48,7 @@ def do_certify(args: Certify) -> None:
 def do_render(args: Render) -> None:
   """Films an agent, or several side by side."""
   out = args.out or f"{args.env.rpartition(':')[2]}.gif"
-  require(
-    args.compare is not None or args.skip == 0, "--skip goes with --compare; got it without"
-  )
+  require(args.compare is not None or args.skip == 0, "--skip goes with --compare; got it without")
   pictures.check(out, args.steps + args.skip, args.width, args.height, args.fps, args.seed)
   env = envs.make(args.env, args.physics)
   fault = {f.name: getattr(args, f.name) for f in dataclasses.fields(FaultConfig)[1:]}
@@ -119,8 +117,6 @@ def _panes(env: Any, args: Render, fault: dict[str, Any]) -> list[compare.Pane]:
     compare.Pane("BROKEN", words, broken, fault | own),
   ]
   return shown + [
-    compare.Pane(
-      "BROKEN, ADAPTED", f"agent {name}", broken, fault | _acts(broken, args.env, name)
-    )
+    compare.Pane("BROKEN", f"agent {name}", broken, fault | _acts(broken, args.env, name))
     for name in args.compare or ()
   ]

@@ -142,7 +142,7 @@ def test_bad_settings_are_refused():
   with pytest.raises(
     UserError,
     match=(
-      "unknown arm 'orcale'; choose from: always, detector, no-fault, none, oracle, "
+      "unknown arm 'orcale'; choose from: always, detector, guarded, no-fault, none, oracle, "
       "oracle-budget, oracle-stop, periodic"
     ),
   ):
@@ -522,7 +522,7 @@ def aborted(story):
 
   def live(names, due, config, chunks, reward, level):
     count, all_ = len(names), len(NAMES)
-    labels = [(name, 0) for name in (*names, "scratch", *["none"] * all_)][:all_]
+    labels = [(name, 0) for name in (*names, "scratch", "guarded", *["none"] * all_)][:all_]
     chosen = choices(labels, config, STEPS * CHUNKS)
     chosen = chosen._replace(at=chosen.at.at[:count, : len(due)].set(jnp.array(due)))
     keys = jax.vmap(jax.random.key)(jnp.zeros(all_, int))
@@ -632,7 +632,7 @@ def test_old_and_new_weights_act_by_turns(same):
   guarded = jnp.array([True, True, True, False])
   acting, guard, told = weights(1.0), act.unguarded(weights(7.0), groups), []
   heard = {1: [[] for _ in range(groups)], 0: [[] for _ in range(groups)]}
-  turn = np.zeros(groups, int)  # chunks since the first update
+  turn, guard_acts = np.zeros(groups, int), np.zeros(groups, bool)  # chunks since the first update
   for c in range(last + 1):
     was = flags(phase_lib.ADAPTING if c else phase_lib.NOMINAL)
     ends = c == last
@@ -657,7 +657,9 @@ def test_old_and_new_weights_act_by_turns(same):
       for g in range(groups):
         np.testing.assert_allclose(weighed.earned[g], mean(0, g), rtol=1e-5)
         np.testing.assert_allclose(weighed.earns[g], mean(1, g), rtol=1e-5)
-  told = np.array(told)[first:last]  # whether the old weights act in chunk first + 1, first + 2, ...
+  told = np.array(told)[
+    first:last
+  ]  # whether the old weights act in chunk first + 1, first + 2, ...
   turns = told[: len(told) // act.TURN * act.TURN].reshape(-1, act.TURN, groups)
   assert (turns == turns[:, :1]).all()  # whole turns
   turns = turns[:, 0]

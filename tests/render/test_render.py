@@ -4,6 +4,7 @@ line for whatever is wrong.
 
 import copy
 import io
+import json
 import os
 import subprocess
 import sys
@@ -20,7 +21,7 @@ from mjx_cl.cli import app, robots
 from mjx_cl.envs import adapters
 from mjx_cl.envs.course import Course
 from mjx_cl.errors import FileError, UserError
-from mjx_cl.render import files, offscreen, outlines
+from mjx_cl.render import compare, files, offscreen, outlines
 from mjx_cl.render import pictures as render
 from mjx_cl.render import scene as scenes
 from mjx_cl.types import EnvState
@@ -373,10 +374,70 @@ def test_a_failure_on_the_way_keeps_the_earlier_file(film, tmp_path, monkeypatch
   def fail(*_, **__):
     raise OSError(28, "No space left on device")
 
-  monkeypatch.setattr(render, "write_gif", fail)
+  monkeypatch.setattr(files, "write_gif", fail)
   with pytest.raises(OSError):
     film(tmp_path / "a.gif")
   assert (tmp_path / "a.gif").read_bytes() == b"earlier" and os.listdir(tmp_path) == ["a.gif"]
+
+
+# ---- side by side ----------------------------------------------------------------------------------
+
+
+def panes(env, **broken):
+  """Two robots that move at random, the second with a fault."""
+  puppet = {"agent": adapters.Puppet(len(env.spec.act), 1.0)}
+  return [
+    compare.Pane("HEALTHY", "whole", env, puppet),
+    compare.Pane("BROKEN", "a word", env, puppet | broken),
+  ]
+
+
+def test_robots_side_by_side_are_those_that_act_alone(short_walker, tmp_path, monkeypatch):
+  """One seed: alike until the onset, where the second's hip dies; what is said of their reward is
+  the mean of what is shown, as `act` gives it.
+  """
+  monkeypatch.setattr(render, "gl_library", lambda: None)
+  dead = {"fault": "gear", "target": "left_hip", "severity": 1.0, "onset": ONSET}
+  shown, skip = 24, 6
+  two = panes(short_walker, **dead)
+  said = compare.film(two, tmp_path / "a.gif", shown, skip, WIDTH, HEIGHT, weak="left_hip", seed=3)
+  film, _ = pictures(tmp_path / "a.gif")
+  assert said["frames"] == len(film) == shown // EVERY and os.listdir(tmp_path) == ["a.gif"]
+  rewards = [
+    np.array([f.reward for f in render.act(short_walker, skip + shown, 3, **pane.acting)])
+    for pane in two
+  ]
+  np.testing.assert_allclose(said["reward"], [r[skip:].mean() for r in rewards], rtol=1e-6)
+  assert film.shape[2] == 2 * WIDTH + compare.GAP
+  first, second = film[..., :WIDTH, :], film[..., WIDTH + compare.GAP :, :]
+  body = (slice(None), slice(compare.TOP + 4, compare.TOP + HEIGHT - 4), slice(4, WIDTH - 4))
+  bodies = [x[body].astype(int) for x in (first, second)]
+  red = [((x[..., 0] > 110) & (x[..., 1] < 60) & (x[..., 2] < 60)).any((1, 2)) for x in bodies]
+  assert not red[0].any() and red[1].all()  # its weak leg
+  plain = lambda x: np.where((x[..., 0] - x[..., 1] > 40)[..., None], 0, x)
+  apart = np.abs(plain(bodies[0]) - plain(bodies[1])).sum((1, 2, 3))
+  assert apart[-1] > 3 * apart[0]
+
+
+def test_which_parts_an_actuator_moves(short_walker):
+  walker, body = short_walker, short_walker.mj_model.body
+  parts = lambda *names: {body(n).id for n in names}
+  assert compare.bodies(walker, "right_knee") == parts("right_leg", "right_foot")
+  assert compare.bodies(walker, "left_leg") == parts("left_thigh", "left_leg", "left_foot")
+  assert compare.bodies(walker, "height") == compare.bodies(walker, None) == set()
+
+
+def test_side_by_side_by_command(mjx, refused, tmp_path, monkeypatch):  # noqa: F811
+  monkeypatch.setattr(render, "gl_library", lambda: None)
+  out, size = str(tmp_path / "a.gif"), ("--steps", "8", "--width", "96", "--height", "96")
+  fault = ("--fault", "car/sim-to-real", "--compare", "car-2")
+  code, text, err = mjx("render", "car", *fault, *size, "--out", out, "--json")
+  said = json.loads(text)
+  assert code == 0 and said["frames"] == len(pictures(out)[0]) and len(said["reward"]) == 3, err
+  say = lambda *flags: refused(2, "render", "walker", "--out", out, *size, *flags)
+  assert "--fault" in say("--compare")
+  assert "--skip goes with --compare" in say("--skip", "3")
+  assert "2 to 6 robots" in say("--fault", "gear", "--compare", *["walker"] * 5)
 
 
 def test_caption_and_badge_stay_inside_the_picture():
