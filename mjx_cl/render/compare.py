@@ -89,9 +89,8 @@ def page(
   foot = TOP + height + 8
   image = Image.new("RGB", (len(panes) * (width + GAP) - GAP, TOP + height + FOOT), PAPER)
   draw = ImageDraw.Draw(image)
-  fits = lambda text, size: next(
-    (f for f in (font(s) for s in range(size, 5, -1)) if draw.textlength(text, f) <= width - 4),
-    font(6),
+  fits = lambda text, size, room=width - 4: next(
+    (f for f in (font(s) for s in range(size, 5, -1)) if draw.textlength(text, f) <= room), font(6)
   )
   for k, pane in enumerate(panes):
     x, room, colour = k * (width + GAP), width - 71, COLOURS[k % len(COLOURS)]
@@ -103,11 +102,11 @@ def page(
     draw.rectangle((x + 70, foot + 6, x + 70 + room, foot + 20), fill=TRACK)
     filled = round(room * min(1.0, max(0.0, shares[k])))
     draw.rectangle((x + 70, foot + 6, x + 70 + filled, foot + 20), fill=colour)
+  clock, size = f"{time_s:.1f} s", font(13)
+  right = image.width - 2 - draw.textlength(clock, size)
+  draw.text((right, foot + 27), clock, fill=FAINT, font=size)
   text = "reward of the last second, in % of the first robot's mean"
-  draw.text((2, foot + 27), text, fill=FAINT, font=font(13))
-  text = f"{time_s:.1f} s"
-  at = (image.width - 2 - font(13).getlength(text), foot + 27)
-  draw.text(at, text, fill=FAINT, font=font(13))
+  draw.text((2, foot + 27), text, fill=FAINT, font=fits(text, 13, right - 12))
   return np.asarray(image)
 
 
