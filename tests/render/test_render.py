@@ -413,7 +413,7 @@ def test_robots_side_by_side_are_those_that_act_alone(short_walker, tmp_path, mo
   body = (slice(None), slice(compare.TOP + 4, compare.TOP + HEIGHT - 4), slice(4, WIDTH - 4))
   bodies = [x[body].astype(int) for x in (first, second)]
   red = [(x[..., 0] - x[..., 1:].max(-1) > 50).any((1, 2)) for x in bodies]
-  assert not red[0].any() and red[1].all()  # its weak leg
+  assert not red[0].any() and red[1].mean() > 0.8  # its weak leg, unless the other hides it
   plain = lambda x: np.where((x[..., 0] - x[..., 1] > 40)[..., None], 0, x)
   apart = np.abs(plain(bodies[0]) - plain(bodies[1])).sum((1, 2, 3))
   assert apart[-1] > 3 * apart[0]
