@@ -77,7 +77,7 @@ FILMS = {
     4,
     40,
     240,
-    "--fault car/sim-to-real --onset 3000 --steps 18000 --first-seed 4",
+    "--fault car/sim-to-real --onset 2000 --steps 14000 --first-seed 4",
     "film_car.gif",
   ),
 }
@@ -96,7 +96,7 @@ def learn(robot: str, work: pathlib.Path) -> pathlib.Path:
   return kept[0]
 
 
-def light(folder: pathlib.Path, out: pathlib.Path) -> None:
+def light(env, folder: pathlib.Path, out: pathlib.Path) -> None:
   """An agent with what acting needs: rounded weights, no moments."""
   import jax
   import numpy as np
@@ -110,7 +110,7 @@ def light(folder: pathlib.Path, out: pathlib.Path) -> None:
     step = np.uint32(1 << (23 - BITS))
     return ((x.view(np.uint32) + step // 2) & ~(step - np.uint32(1))).view(np.float32)
 
-  trained = agents.load(folder)
+  trained = agents.of(env, str(folder))
   train = trained.train._replace(
     params=jax.tree.map(rounded, trained.train.params),
     slow=jax.tree.map(rounded, trained.train.slow),
@@ -158,10 +158,13 @@ def main() -> None:
   from mjx_cl.io import runtime
 
   runtime.setup()
+  from mjx_cl import envs
+
   for robot in args.robots or FILMS:
     agent = ROOT / "results/film" / robot
     if args.learn:
-      light(learn(robot, pathlib.Path(args.work) / robot), agent)
+      env = envs.make(FILMS[robot].becomes or robot)
+      light(env, learn(robot, pathlib.Path(args.work) / robot), agent)
     changes = {} if args.seed is None else {"seed": args.seed}
     said = draw(robot, agent, ROOT / "docs" / FILMS[robot].file, **changes)
     size = pathlib.Path(said["file"]).stat().st_size

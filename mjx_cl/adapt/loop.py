@@ -7,7 +7,6 @@ no update.
 
 from __future__ import annotations
 
-import itertools
 import threading
 import time
 from collections.abc import Callable, Hashable
@@ -343,26 +342,20 @@ class Loop:
     puts other weights in its place the new `before` and `guard`, and what was weighed.
     """
     was, before, guard = state.phase.phase, state.before, state.guard
+    rollback, guarded = choices.rollback, choices.guarded
     reward = seen.signals[:, decide.SIGNALS.index("reward")]
-    weighed: list[act.Weighed] = []
-    if guard is not None and choices.guarded is not None:
-      acting = act.choose(choices.guarded & guard.learnt, guard.new, acting)
+    weighed: tuple[jax.Array, ...] = ()
+    if guard is not None and guarded is not None:
+      acting = act.choose(guarded & guard.learnt, guard.new, acting)
     acting = act.follow(acting, train.params, number, config.average)
-    if before is not None and choices.rollback is not None:
-      acting, before, said = act.put_back(
-        acting, before, phase, was, begins, reward, taken, choices.rollback
+    if before is not None and rollback is not None:
+      acting, before, weighed = act.put_back(
+        acting, before, phase, was, begins, reward, taken, rollback
       )
-      weighed.append(said)
-    if guard is not None and choices.guarded is not None:
+    if guard is not None and guarded is not None:
       acting, guard, said = act.take_turns(
-        acting, guard, was, phase, begins, reward, taken, choices.guarded
+        acting, guard, was, phase, begins, reward, taken, guarded
       )
-      weighed.append(said)
+      weighed = tuple(act.choose(guarded, said, act.Weighed(*weighed))) if weighed else said
     kept = act.choose(act.ended(was, phase), acting, train.params)
-    both = [act.choose(choices.guarded, *weighed[::-1])] if len(weighed) > 1 else weighed
-    return (
-      train._replace(params=kept),
-      acting,
-      {"before": before, "guard": guard},
-      tuple(itertools.chain(*both)),
-    )
+    return train._replace(params=kept), acting, {"before": before, "guard": guard}, weighed

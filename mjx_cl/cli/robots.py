@@ -52,7 +52,7 @@ def do_render(args: Render) -> None:
   pictures.check(out, args.steps + args.skip, args.width, args.height, args.fps, args.seed)
   env = envs.make(args.env, args.physics)
   fault = {f.name: getattr(args, f.name) for f in dataclasses.fields(FaultConfig)[1:]}
-  acting = {"seed": args.seed, "deterministic": args.deterministic}
+  acting: dict[str, Any] = {"seed": args.seed, "deterministic": args.deterministic}
   size = (args.width, args.height, args.fps)
   tell = lambda text: say(f"note: {text}")
   if args.compare is None:

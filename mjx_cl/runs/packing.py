@@ -4,7 +4,6 @@ side, and each learner's replay, which holds most of the memory, as it is.
 
 from __future__ import annotations
 
-import functools
 from typing import Any
 
 import jax
@@ -38,7 +37,7 @@ def like(lives: Lives, who: list[list[int]]) -> dict:
   tree["robots"] = [herd.streams for herd in lives.herds]
   tree["robots"] += [jax.tree.map(spread, lives.robot) for _ in who]
   if who:
-    begin = functools.partial(lives.loop.init, groups=lives.width, **lives.extras)
+    begin = lambda train: lives.loop.init(train, lives.width, **lives.extras)
     state = jax.eval_shape(begin, lives.trains[0])
     number = sum(len(own) for own in who) // lives.width
     tree["replays"] = [state.replay] * number
