@@ -244,7 +244,7 @@ def keep(runner: Runner) -> None:
   """Writes OUT/agents/ARM-SEED for every stream that has learnt: the weights that it acts by at
   the end, and the moments and counters of its learner.
 
-  Of a stream that went back (arm `rollback`) the weights are those of before, moments, slow
+  Of a stream that went back (arms `rollback` and `guarded`) the weights are those of before, moments, slow
   critic and counters those of the learner that was given up. The card is that of the agent it
   began with but for what that scored, and `adapted`: robot and fault it has lived with, arm,
   seed, control steps of the run, updates taken.
