@@ -244,10 +244,10 @@ def keep(runner: Runner) -> None:
   """Writes OUT/agents/ARM-SEED for every stream that has learnt: the weights that it acts by at
   the end, and the moments and counters of its learner.
 
-  Of a stream that went back (arms `rollback` and `guarded`) the weights are those of before, moments, slow
-  critic and counters those of the learner that was given up. The card is that of the agent it
-  began with but for what that scored, and `adapted`: robot and fault it has lived with, arm,
-  seed, control steps of the run, updates taken.
+  Of a stream that went back (arms `rollback`, `guarded`) the weights are those of before, moments,
+  slow critic and counters those of the learner that was given up. The card is that of the agent it
+  began with but for what that scored, and `adapted`: robot and fault it has lived with, arm, seed,
+  control steps of the run, updates taken.
   """
   config, folder = runner.config, runner.out / "agents"
   for g, (arm, seed) in enumerate(runner.labels):
