@@ -1,10 +1,10 @@
 """Moving pictures of robots healthy, broken and adapted, side by side, from committed agents.
 
-  python benchmarks/film.py                       # docs/film.gif, docs/film_car.gif, ...
+  python benchmarks/film.py                       # of each robot in results/film, into docs
   python benchmarks/film.py walker --learn        # results/film/walker anew: minutes, then its film
 
-What the third robot has learnt lies in results/film: the weights alone, rounded to twelve bits of
-mantissa. With `--learn` robots break and adapt (`mjx-cl run`) and the first that learnt something
+What the third robot has learnt lies in results/film: the weights that act alone, rounded to eight
+bits of mantissa. With `--learn` robots break and adapt (`mjx-cl run`) and the first that learnt something
 is kept; on another machine they live otherwise.
 """
 
@@ -17,7 +17,8 @@ import sys
 from typing import NamedTuple
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
-BITS = 12  # of a mantissa that are kept
+BITS = 8  # of a mantissa that are kept
+ACTS = {"enc", "dyn", "pol"}  # what acting needs of an agent
 
 
 class Film(NamedTuple):
@@ -97,7 +98,7 @@ def learn(robot: str, work: pathlib.Path) -> pathlib.Path:
 
 
 def light(env, folder: pathlib.Path, out: pathlib.Path) -> None:
-  """An agent with what acting needs: rounded weights, no moments."""
+  """An agent with what acting needs, rounded; all else is zero."""
   import jax
   import numpy as np
 
@@ -112,11 +113,14 @@ def light(env, folder: pathlib.Path, out: pathlib.Path) -> None:
 
   trained = agents.of(env, str(folder))
   train = trained.train._replace(
-    params=jax.tree.map(rounded, trained.train.params),
-    slow=jax.tree.map(rounded, trained.train.slow),
+    params={
+      name: jax.tree.map(rounded if name in ACTS else np.zeros_like, part)
+      for name, part in trained.train.params.items()
+    },
+    slow=jax.tree.map(np.zeros_like, trained.train.slow),
     opt=jax.tree.map(np.zeros_like, trained.train.opt),
   )
-  agents.save(out, train, trained.card | {"rounded_bits": BITS, "moments": "none"})
+  agents.save(out, train, trained.card | {"rounded_bits": BITS, "holds": sorted(ACTS)})
 
 
 def draw(robot: str, agent: pathlib.Path, out: pathlib.Path, **changes) -> dict:
@@ -160,8 +164,11 @@ def main() -> None:
   runtime.setup()
   from mjx_cl import envs
 
-  for robot in args.robots or FILMS:
-    agent = ROOT / "results/film" / robot
+  home = ROOT / "results/film"
+  for robot in args.robots or [name for name in FILMS if (home / name).is_dir()]:
+    agent = home / robot
+    if not args.learn and not agent.is_dir():
+      raise SystemExit(f"film: no {robot} has learnt yet what is shown; give --learn")
     if args.learn:
       env = envs.make(FILMS[robot].becomes or robot)
       light(env, learn(robot, pathlib.Path(args.work) / robot), agent)
