@@ -416,7 +416,7 @@ RUN = {
   "setting without a name": (["run", "walker", "--set", "=5"], ["name=value", "'=5'"]),
   "arm": (
     ["run", "walker", "--arm", "detektor"],
-    ["detektor", "always, detector, no-fault, none, oracle"],
+    ["detektor", "always, detector, guarded, no-fault, none, oracle"],
   ),
   "arm twice": (["run", "walker", "--arm", "none", "none"], ["once"]),
   "physics": (["run", "walker", "--physics", "warp"], ["warp", "native"]),
