@@ -1,19 +1,20 @@
-"""What a machine with an accelerator trains, lives and times, in slices that can be cut off.
+"""What an accelerator does with the whole loop, in slices that may be cut off.
 
-  python benchmarks/accelerator.py --out runs/accelerator --slice 500 [--preset tiny] [--only STEP]
-  python benchmarks/accelerator.py --out runs/accelerator --report   # the rows so far as a table
+  python benchmarks/accelerator.py --out runs/gpu                 size12m, slices of 8 minutes
+  python benchmarks/accelerator.py --out runs/rehearsal --quick   on any machine, with `tiny`
+  python benchmarks/accelerator.py --table runs/*/rows.json       machines side by side
 
-A slice does what it can in so many seconds and is called again until nothing is left: each step is
-a process of its own, its rows are kept in OUT/rows.json when it ends, a training that is cut off
-goes on from its checkpoint, a run likewise. With `--preset tiny` it is rehearsed on a CPU in
-minutes; rows name the device that gave them, and what has not been measured says so.
+A call works for `--minutes` at most, leaves what it has done in OUT and may be called again until
+it says that all is done: updates of one seed and of several by vmap (timed), a training of several
+seeds in one program (checkpoints), control steps a second of frozen streams (timed), a run with and
+without adaptation in one band of streams (checkpoints). All programs are those of the command line.
+OUT/rows.json: {machine, rows: {name: value}}.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import os
 import pathlib
 import signal
 import subprocess
@@ -21,203 +22,223 @@ import sys
 import time
 
 HERE = pathlib.Path(__file__).resolve()
-SMALL = 30  # seconds that a step must have left to begin
-GRACE = 90  # seconds that a step which is told to stop has for its checkpoint
-STREAMS = {"tiny": (4, 8), "else": (40, 640, 2560)}
-SEEDS = {"tiny": 2, "else": 10}
-STEPS = ("update", "seeds", "lives", "train", "run")
-NAMES = {
-  "update": "an update of the preset's learner, 16 x 64",
-  "seeds": "the same for several seeds in one program, a seed",
-  "lives": "frozen walkers on MJX, acting and predicted, in one program",
-  "train": "training of several seeds by the preset",
-  "run": "the loop with the agent that came out",
+REST_S = 60  # a command that is told to stop has as long to save
+FULL = {
+  "preset": "paper",
+  "sets": ["updates=20000"],
+  "seeds": 4,
+  "streams": [40, 160, 640, 2560],
+  "run": ["--seeds", "40", "--steps", "25000", "--onset", "5000"],
 }
+QUICK = {
+  "preset": "tiny",
+  "sets": ["updates=24", "envs=4", "ratio=8", "capacity=256"],
+  "seeds": 2,
+  "streams": [2, 4],
+  "run": ["--seeds", "2", "--steps", "640", "--onset", "256"],
+}
+UNITS = {"update": "ms", "streams": "control steps/s", "training": "records/s", "run": "s"}
 
 
-def timed(call, rounds: int = 5) -> float:
-  """Median seconds of a call that blocks; the first compiles."""
-  import statistics
-
-  call()
-  seconds = []
-  for _ in range(rounds):
-    begin = time.perf_counter()
-    call()
-    seconds.append(time.perf_counter() - begin)
-  return statistics.median(seconds)
+# ---- one measurement, in a process of its own: an accelerator's memory goes with it --------------
 
 
-def size_of(preset: str) -> str:
-  """Size of a preset's learner."""
+def update(plan: dict, rounds: int) -> dict[str, float]:
+  """Milliseconds of an update of one seed, and per seed of several in one program."""
+  from dreamer_update import Clock, updater
+
   from mjx_cl.config import PRESETS
-
-  return PRESETS[preset].dreamer.size
-
-
-def update(preset: str, out: pathlib.Path) -> list[dict]:
-  """Seconds of an update."""
-  from dreamer_update import updater
-
-  call = updater(size_of(preset))
-  return [{"name": NAMES["update"], "value": timed(call), "unit": "s"}]
-
-
-def seeds(preset: str, out: pathlib.Path) -> list[dict]:
-  """Seconds of an update of each seed, all in one program as `train --seeds` does it here."""
-  from dreamer_update import updater
-
   from mjx_cl.io import runtime
 
-  number = SEEDS.get(preset, SEEDS["else"])
-  call = updater(size_of(preset), seeds=number, how=runtime.seeds_by())
-  return [{"name": f"{NAMES['seeds']} of {number}", "value": timed(call) / number, "unit": "s"}]
-
-
-def lives(preset: str, out: pathlib.Path) -> list[dict]:
-  """Stream-steps a second of frozen walkers."""
-  from recording import live
-
-  from mjx_cl import envs
-  from mjx_cl.training import agents
-
-  env, rows = envs.make("walker", "mjx"), []
-  trained = agents.of(env)
-  for number in STREAMS.get(preset, STREAMS["else"]):
-    act, look = live(env, trained, number, 64)
-    seconds = timed(lambda act=act, look=look: look(act()), 3)
-    rows.append(
-      {
-        "name": f"{NAMES['lives']}: {number}",
-        "value": number * 64 / seconds,
-        "unit": "stream-steps/s",
-      }
-    )
-  return rows
-
-
-def command(out: pathlib.Path, *words: str) -> None:
-  """A command of the package, in this process."""
-  from mjx_cl.cli import app
-
-  resume = ["--resume"] if (out / "config.json").exists() else []
-  code = app.main([*words, "--out", str(out), *resume])
-  if code:
-    raise SystemExit(code)
-
-
-def train(preset: str, out: pathlib.Path) -> list[dict]:
-  """Seconds of a training of several seeds, cut off or not."""
-  number = SEEDS.get(preset, SEEDS["else"])
-  begin = time.time()
-  command(out / "train", "train", "walker", "--preset", preset, "--seeds", str(number))
-  row = {"name": f"{NAMES['train']}, {number} seeds, last slice", "unit": "s"}
-  return [row | {"value": time.time() - begin}]
-
-
-def run(preset: str, out: pathlib.Path) -> list[dict]:
-  """Seconds of a run with the first agent that was trained."""
-  found = sorted((out / "train").rglob("card.json"))
-  if not found:
-    raise SystemExit("accelerator: step `run` needs the agent of step `train`")
-  steps = ("--onset", "500", "--steps", "1500") if preset == "tiny" else ()
-  begin = time.time()
-  command(
-    out / "run",
-    *("run", "walker", "--agent", str(found[0].parent), "--seeds", "2" if steps else "10", *steps),
+  runtime.setup()
+  dreamer, seeds = PRESETS[plan["preset"]].dreamer, plan["seeds"]
+  size, starts, how = dreamer.size, dreamer.last_starts, runtime.seeds_by()
+  times = Clock().measure(
+    {
+      "one seed": updater(size, starts),
+      f"of {seeds} seeds, each": updater(size, starts, seeds=seeds, how=how),
+    },
+    rounds,
   )
-  return [{"name": f"{NAMES['run']}, last slice", "value": time.time() - begin, "unit": "s"}]
+  return {
+    f"update, {size}, {name}": 1e3 * seconds / (seeds if "seeds" in name else 1)
+    for name, seconds in times.items()
+  }
 
 
-def step(name: str, preset: str, out: pathlib.Path) -> None:
-  """Does a step and keeps its rows."""
-  sys.path.insert(0, str(HERE.parent))
+def streams(plan: dict, out: pathlib.Path, count: int, rounds: int) -> dict[str, float]:
+  """Control steps a second of frozen walkers: acting, physics, predictions, detector, signals."""
+  from mjx_cl.config import CHUNK, RunConfig
+  from mjx_cl.io import runtime
+  from mjx_cl.runs.runner import Runner
+
+  runtime.setup()
+  config = RunConfig(
+    env="walker",
+    fault="none",
+    seeds=count,
+    arms=("none",),
+    steps=10**6,
+    agent=str(out / "train/agent"),
+  )
+  runner, times = Runner(config, out / "streams"), []
+  for _ in range(rounds + 2):  # the first two compile
+    begin = time.perf_counter()
+    runner.step()
+    times.append(time.perf_counter() - begin)
+  return {f"streams, {count} frozen": count * CHUNK / sorted(times[2:])[rounds // 2]}
+
+
+# ---- slices --------------------------------------------------------------------------------------
+
+
+def command(words: list[str], out: pathlib.Path, left: float) -> bool:
+  """Runs or resumes a command of mjx-cl for `left` seconds: whether it has come to its end.
+
+  Raises:
+    SystemExit: it failed; its words stand on standard error.
+  """
+  again = ["--resume"] if (out / "config.json").exists() else []
+  process = subprocess.Popen([sys.executable, "-m", "mjx_cl", *words, "--out", str(out), *again])
+  try:
+    status = process.wait(left)
+  except (subprocess.TimeoutExpired, KeyboardInterrupt):
+    process.send_signal(signal.SIGINT)
+    try:
+      process.wait(REST_S)
+    except subprocess.TimeoutExpired:
+      process.kill()  # its last checkpoint holds
+      process.wait()
+    return False
+  if status not in (0, 130):
+    raise SystemExit(f"mjx-cl {words[0]} ended with status {status}")
+  return status == 0
+
+
+def measured(task: str, args: argparse.Namespace, left: float) -> dict[str, float] | None:
+  """Rows of a measurement, None where `left` seconds did not suffice."""
+  words = [sys.executable, str(HERE), "--out", str(args.out), "--task", task]
+  try:
+    done = subprocess.run(
+      words + ["--quick"] * args.quick, timeout=left, stdout=subprocess.PIPE, text=True
+    )
+  except subprocess.TimeoutExpired:
+    return None
+  if done.returncode:
+    raise SystemExit(f"{task} ended with status {done.returncode}")
+  return json.loads(done.stdout.splitlines()[-1])
+
+
+def trained(out: pathlib.Path) -> dict[str, float]:
+  card = json.loads((out / "train/agent/card.json").read_text())
+  seeds = json.loads((out / "train/config.json").read_text())["seeds"]
+  return {f"training, {seeds} seeds": seeds * card["records"] / card["seconds"]}
+
+
+def work(args: argparse.Namespace) -> bool:
+  """Does what is left, in the order of `tasks`, until the time is over: whether all is done."""
+  from mjx_cl.io import tables
+
+  plan, out = QUICK if args.quick else FULL, args.out
+  end = time.monotonic() + 60 * args.minutes
+  file = out / "rows.json"
+  held = json.loads(file.read_text()) if file.exists() else {"done": [], "rows": {}}
+  tasks = ["update", "training", *(f"streams-{n}" for n in plan["streams"]), "run"]
+  for task in tasks:
+    if task in held["done"]:
+      continue
+    left = end - time.monotonic()
+    if left < 5:
+      return False
+    print(f"{task}: {left / 60:.1f} minutes left", file=sys.stderr, flush=True)
+    begin = time.monotonic()
+    if task == "training":
+      seeds, sets = str(plan["seeds"]), plan["sets"]
+      words = ["train", "walker", "--preset", plan["preset"], "--seeds", seeds, "--set", *sets]
+      rows = trained(out) if command(words, out / "train", left) else None
+    elif task == "run":
+      words = ["run", "walker", *plan["run"], "--arm", "oracle", "none"]
+      words += ["--agent", str(out / "train/agent")]
+      spent = held["rows"].get("run, slices", 0.0)
+      whole = command(words, out / "run", left)
+      held["rows"]["run, slices"] = spent + time.monotonic() - begin
+      rows = {} if whole else None
+    else:
+      rows = measured(task, args, left)
+    if rows is not None:
+      held["done"].append(task)
+      held["rows"] |= rows
+    held["machine"] = held.get("machine") or measured("machine", args, 600)["machine"]
+    tables.write_json(file, held)
+    if rows is None:
+      return False
+  return True
+
+
+# ---- in front ------------------------------------------------------------------------------------
+
+
+def table(files: list[pathlib.Path]) -> str:
+  """A Markdown table, a column a machine; what one has not measured says so."""
+  held = [json.loads(file.read_text()) for file in files]
+  names = sorted({name for one in held for name in one["rows"]})
+  lines = [
+    "| | " + " | ".join(one["machine"] for one in held) + " |",
+    "|---" * (len(held) + 1) + "|",
+  ]
+  for name in names:
+    cells = [one["rows"].get(name) for one in held]
+    unit = UNITS[name.split(",")[0]]
+    told = " | ".join("not measured" if x is None else f"{x:,.4g}" for x in cells)
+    lines.append(f"| {name} [{unit}] | {told} |")
+  return "\n".join(lines)
+
+
+def machine() -> dict[str, str]:
+  """The accelerator, or the processor and how many cores of it."""
   from mjx_cl.io import runtime
 
   runtime.setup()
   import jax
 
-  rows = globals()[name](preset, out)
-  device = jax.devices()[0].device_kind
-  rows = [
-    {"step": name, "preset": preset, "device": device, "platform": jax.default_backend()} | r
-    for r in rows
-  ]
-  keep(out, [*kept(out), *rows])
+  device = jax.devices()[0]
+  cpu = runtime.provenance()["machine"]
+  return {
+    "machine": f"{cpu['cores']} cores of {cpu['cpu']}"
+    if device.platform == "cpu"
+    else device.device_kind
+  }
 
 
-def kept(out: pathlib.Path) -> list[dict]:
-  """The rows so far."""
-  path = out / "rows.json"
-  return json.loads(path.read_text()) if path.exists() else []
-
-
-def keep(out: pathlib.Path, rows: list[dict]) -> None:
-  """Writes them: to another name, then renamed."""
-  tmp = out / ".rows.json"
-  tmp.write_text(json.dumps(rows, indent=1) + "\n")
-  os.replace(tmp, out / "rows.json")
-
-
-def report(out: pathlib.Path) -> None:
-  """The rows as a table in Markdown; steps without any say so."""
-  rows = kept(out)
-  print("| | preset | device | value | unit |\n|---|---|---|---|---|")
-  for name in STEPS:
-    own = [r for r in rows if r["step"] == name]
-    for r in own:
-      print(f"| {r['name']} | {r['preset']} | {r['device']} | {r['value']:.4g} | {r['unit']} |")
-    if not own:
-      print(f"| {NAMES[name]} | | | not measured | |")
-
-
-def slice_of(args: argparse.Namespace) -> int:
-  """Does steps until the time is over; 0: nothing is left, 3: something is."""
-  end = time.monotonic() + args.slice
-  done = {r["step"] for r in kept(args.out)}
-  for name in args.only or STEPS:
-    if name in done:
-      continue
-    left = end - time.monotonic() - GRACE
-    if left < SMALL:
-      return 3
-    words = ["--out", str(args.out), "--preset", args.preset, "--step", name]
-    with subprocess.Popen([sys.executable, str(HERE), *words]) as process:
-      try:
-        code = process.wait(left)
-      except subprocess.TimeoutExpired:
-        process.send_signal(signal.SIGINT)
-        try:
-          process.wait(GRACE)
-        except subprocess.TimeoutExpired:
-          process.kill()
-        print(f"accelerator: {name} goes on in the next slice", file=sys.stderr)
-        return 3
-    if code:
-      return code
-  return 0
-
-
-def main() -> None:
+def main() -> int:
   parser = argparse.ArgumentParser(
     description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
   )
   parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("runs/accelerator"))
-  parser.add_argument("--slice", type=float, default=500.0, help="seconds of this call")
-  parser.add_argument("--preset", default="paper", help="of `mjx-cl list presets`")
-  parser.add_argument("--only", nargs="+", choices=STEPS)
-  parser.add_argument("--report", action="store_true", help="prints the rows so far")
-  parser.add_argument("--step", choices=STEPS, help=argparse.SUPPRESS)
+  parser.add_argument("--minutes", type=float, default=8.0, help="of this call, saving apart")
+  parser.add_argument("--quick", action="store_true", help="the rehearsal: preset tiny, two seeds")
+  parser.add_argument("--table", nargs="+", type=pathlib.Path, help="rows.json of several machines")
+  parser.add_argument("--task", help=argparse.SUPPRESS)
   args = parser.parse_args()
-  if args.report:
-    return report(args.out)
-  if args.slice < SMALL + GRACE:
-    parser.error(f"--slice must be at least {SMALL + GRACE} s; got {args.slice:g}")
+  if args.table:
+    print(table(args.table))
+    return 0
+  plan, rounds = QUICK if args.quick else FULL, 3 if args.quick else 10
+  if args.task:
+    kind, _, count = args.task.partition("-")
+    rows = {
+      "machine": machine,
+      "update": lambda: update(plan, rounds),
+      "streams": lambda: streams(plan, args.out, int(count), rounds),
+    }[kind]()
+    print(json.dumps(rows))
+    return 0
   args.out.mkdir(parents=True, exist_ok=True)
-  if args.step:
-    return step(args.step, args.preset, args.out)
-  raise SystemExit(slice_of(args))
+  done = work(args)
+  print(table([args.out / "rows.json"]) if (args.out / "rows.json").exists() else "")
+  print("all is done" if done else "not done: the same command goes on")
+  return 0
 
 
 if __name__ == "__main__":
-  main()
+  sys.exit(main())
