@@ -50,8 +50,8 @@ class Guard(NamedTuple):
   of each turn left out, since the robot comes to them from the other's hands; until both have KEPT
   of them the learner's leads. What acts is what predicts. When the adaptation ends, however it
   does, the side that earned more stays, the learner's where they are equal or nothing is known.
-  The idea is that of a safeguarded policy improvement (Thomas et al. 2015,
-  https://people.cs.umass.edu/~pthomas/papers/Thomas2015b.pdf), here with means in place of bounds.
+  The idea is that of high confidence policy improvement (Thomas, Theocharous and Ghavamzadeh 2015,
+  https://proceedings.mlr.press/v37/thomas15.html), here with means in place of bounds.
 
   Attributes:
     old: the parameters that acted when the adaptation began.

@@ -119,7 +119,8 @@ def at_rate(
   With a alarms at the threshold, b at the next lower one that was tried and has too many, and n
   asked for, each alarm of the lower one counts with probability (n - a) / (b - a), a randomised
   test between two operating points. Where there is no such lower one, alarms are added at random,
-  n - a on the healthy steps that were counted. Draws follow from the robot's name.
+  n - a on the healthy steps that were counted. On those steps n - a are drawn, no more and no
+  fewer. Draws follow from the robot's name.
 
   Args:
     data: streams of the robot.
@@ -138,19 +139,28 @@ def at_rate(
     return healthy[0], fault[0], None
   random = np.random.default_rng(zlib.crc32(data.robot.encode()))
   lower = [t for t, alarms in tried.items() if t < threshold and alarms > wanted]
-  if not lower:
-    rate = (wanted - have) / counted
-    more = lambda fired, score: fired | (random.random(fired.shape) < rate) & np.isfinite(score)
+  if lower:
+    share = (wanted - have) / (tried[max(lower)] - have)
+    more = at(max(lower))
+    note = (
+      f"no threshold gives the asked rate: {have} alarms, or {tried[max(lower)]}, of {wanted}; "
+      f"those of the lower one count with probability {share:.3g}"
+    )
+  else:
+    share = (wanted - have) / counted
+    more = np.isfinite(healthy[1]), np.isfinite(fault[1])
     note = f"{have} alarms of {wanted} asked for: the others were drawn at random"
-    return more(*healthy), more(*fault), note
-  share = (wanted - have) / (tried[max(lower)] - have)
-  mix = lambda fired, other: fired | (other & (random.random(fired.shape) < share))
-  others, fault_others = at(max(lower))
-  note = (
-    f"no threshold gives the asked rate: {have} alarms, or {tried[max(lower)]}, of {wanted}; those "
-    f"of the lower one count with probability {share:.3g}"
+  added, late = (
+    m & ~x & (random.random(m.shape) < share) for m, (x, _) in zip(more, (healthy, fault))
   )
-  return mix(healthy[0], others), mix(fault[0], fault_others), note
+  tune = data.tune.residual.opr.shape[1]
+  seen = thresholds.seeing(healthy[1][:, :tune], data.count_from)
+  block = np.zeros(added.shape, bool)  # the steps that were counted
+  block[data.count_from :, :tune] = seen
+  could = np.flatnonzero(block & more[0] & ~healthy[0])
+  added[block] = False
+  added.flat[random.choice(could, int(min(wanted - have, len(could))), replace=False)] = True
+  return healthy[0] | added, fault[0] | late, note
 
 
 def _calibrate(

@@ -623,8 +623,8 @@ def test_a_later_adaptation_goes_back_to_where_it_began(aborted, same):
 
 
 def test_old_and_new_weights_act_by_turns(same):
-  """By hand, chunk after chunk, for four streams: the new weights earn less, more, as much, and less
-  in an arm that is not guarded.
+  """By hand, chunk after chunk, for four streams: the new weights earn less, more, as much, and
+  less in an arm that is not guarded.
   """
   new, groups, first, last = np.array([0.2, 0.9, 0.5, 0.2], np.float32), 4, 3, 90
   flags = lambda on: jnp.full(groups, on)

@@ -807,9 +807,7 @@ def test_a_rarer_rate_gains_nothing(small, tmp_path, monkeypatch):
     row = rows[name, True][0]
     assert words in row["note"] and cost(name, False) > cost("plain", True) >= cost(name, True)
     assert rows[name, False][0]["arl0_alarms"] < row["arl0_alarms"]
-    # as many as asked for, but for the draws (three standard deviations of a Poisson count)
-    wanted = rows["plain", True][0]["arl0_alarms"]
-    assert abs(row["arl0_alarms"] - wanted) <= 3 * wanted**0.5
+    assert row["arl0_alarms"] == rows["plain", True][0]["arl0_alarms"]  # as many as asked for
 
 
 @pytest.mark.parametrize(
@@ -991,8 +989,7 @@ def test_the_commands_for_ones_own_detector(late, tmp_path, monkeypatch, mjx, pa
   } == {"car"}
   assert (pathlib.Path(more[more.index("--out") + 1]) / "leaderboard.html").exists()
   (row,) = [r for r in rows if r["detector"] == name and r["fault"] == "bias"]
-  wanted = 16 * 824 / 400  # where no threshold gives them, alarms are drawn (3 standard deviations)
-  assert row["threshold"] > 0 and abs(row["arl0_alarms"] - wanted) <= 3 * wanted**0.5
+  assert row["threshold"] > 0 and 0 < row["arl0_alarms"] <= 16 * 824 / 400
   assert row["miss_probability"] == 0 and row["us_per_sample"] > 0
 
 

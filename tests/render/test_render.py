@@ -380,7 +380,7 @@ def test_a_failure_on_the_way_keeps_the_earlier_file(film, tmp_path, monkeypatch
   assert (tmp_path / "a.gif").read_bytes() == b"earlier" and os.listdir(tmp_path) == ["a.gif"]
 
 
-# ---- side by side ----------------------------------------------------------------------------------
+# ---- side by side --------------------------------------------------------------------------------
 
 
 def panes(env, **broken):
