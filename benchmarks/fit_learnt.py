@@ -2,8 +2,8 @@
 
 Healthy streams and tuning faults of the seeds that tune, of each robot; writes
 mjx_cl/detectors/learnt.json. `--left-out` prints instead, for each tuning fault, the score of a fit
-that has not seen it: mean over its streams of 100 2^(-latency / 5 s), 0 where it is missed, at one
-alarm in 10,000 healthy control steps.
+that has not seen it, and of one that has seen it on other seeds: mean over its streams of
+100 2^(-latency / 5 s), 0 where it is missed, at one alarm in 10,000 healthy control steps.
 """
 
 import argparse
@@ -58,7 +58,7 @@ def averages(streams: Streams, fit: learnt.Fit) -> Set:
   x, known = channels(streams)
 
   def step(held: jax.Array, row: tuple) -> tuple[jax.Array, jax.Array]:
-    new = jax.vmap(lambda a, x: learnt.averaged(a, x, fit))(held, row[0])
+    new = jax.vmap(learnt.averaged)(held, (row[0] - fit.mean) / fit.std)
     held = jnp.where(row[1][:, None, None], new, held)
     return held, held
 
@@ -159,14 +159,23 @@ def found(score: np.ndarray, threshold: float, streams: Streams, horizon_s: floa
 
 
 def left_out(fit: learnt.Fit, healthy: Set, faulty: Set, horizon_s: float) -> dict[str, list]:
-  """{tuning fault: scores of the distance, the ratio and both, by fits that have not seen it}."""
-  names, out = np.array(faulty.of.fault), {}
-  for name in dict.fromkeys(names):
-    own = weighed(fit, healthy, faulty, names != name)
+  """{tuning fault: scores of the distance, the ratio and both, by fits that have not seen it, and
+  of both by fits that have, on every other seed}.
+  """
+  names, odd, out = np.array(faulty.of.fault), faulty.of.seed % 2, {}
+
+  def each(use: np.ndarray, at: np.ndarray) -> np.ndarray:
+    own = weighed(fit, healthy, faulty, use)
     quiet, loud = (scores(held, own) for held in (healthy, faulty))
     looks = [(quiet[0], loud[0]), (quiet[1], loud[1]), (quiet.max(0), loud.max(0))]
-    each = [found(b, level(a, ARL0), faulty.of, horizon_s) for a, b in looks]
-    out[name] = [float(x[names == name].mean()) for x in each]
+    return np.stack([found(b, level(a, ARL0), faulty.of, horizon_s)[at] for a, b in looks])
+
+  for name in dict.fromkeys(names):
+    own = names == name
+    unseen = each(~own, own).mean(1).tolist()
+    halves = [own & (odd == half) for half in (0, 1)]
+    seen = np.concatenate([each(~at, at)[2] for at in halves]).mean()
+    out[name] = [*unseen, float(seen)]
   return out
 
 

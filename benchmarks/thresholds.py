@@ -1,9 +1,9 @@
 """Thresholds that `mjx-cl run --detector NAME` takes where none is given: python
-benchmarks/thresholds.py [--board results/leaderboard_100k] [--out FILE]
+benchmarks/thresholds.py [--board FOLDER ...] [--out FILE]
 
-Writes mjx_cl/detectors/thresholds.json from a leaderboard's own files: robot -> name on the board
--> settings, threshold, ARL0 and the alarms that it was counted from. Left out are references, which
-look at nothing, the paper's rule, which has figures of its own (`detectors.PAPER`), and what the
+Writes mjx_cl/detectors/thresholds.json from leaderboards' own files, of which the first that has a
+robot's detector counts: robot -> name on the board -> settings, threshold, ARL0 and the alarms that
+it was counted from. Left out are references, which look at nothing, the paper's rule, which has figures of its own (`detectors.PAPER`), and what the
 board counted fewer than ten alarms of: a detector that no threshold brings to that rate stays
 silent, and one with too few rows has not been measured.
 """
@@ -26,6 +26,8 @@ from mjx_cl.leaderboard import score
 
 FILE = pathlib.Path(detectors.__file__).parent / "thresholds.json"
 LEAST = 10  # alarms
+LATER = [f"results/learnt/{robot}" for robot in ("car", "quadruped", "walker")]
+BOARDS = ["results/leaderboard_100k", *LATER]
 
 
 def collect(folder: pathlib.Path) -> dict:
@@ -74,8 +76,21 @@ def collect(folder: pathlib.Path) -> dict:
   }
 
 
+def joined(folders: list[pathlib.Path]) -> dict:
+  """What the file holds, of several boards."""
+  values, *others = [collect(folder) for folder in folders]
+  for more in others:
+    if more["arl0"] != values["arl0"]:
+      raise FileError(f"boards at ARL0 {values['arl0']:,} and {more['arl0']:,}; give those of one")
+    values["command"] += f"; {more['command']}"
+    for robot, own in more["robots"].items():
+      known = values["robots"].get(robot, {})
+      values["robots"][robot] = dict(sorted((own | known).items()))
+  return values
+
+
 def main(args: argparse.Namespace) -> None:
-  values = collect(pathlib.Path(args.board))
+  values = joined([pathlib.Path(folder) for folder in args.board])
   tables.write_json(pathlib.Path(args.out), values)
   print(
     f"{sum(map(len, values['robots'].values()))} thresholds of {', '.join(values['robots'])} "
@@ -87,8 +102,9 @@ if __name__ == "__main__":
   parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
   parser.add_argument(
     "--board",
-    default="results/leaderboard_100k",
-    help="folder that `mjx-cl leaderboard --out` wrote",
+    nargs="+",
+    default=BOARDS,
+    help="folders that `mjx-cl leaderboard --out` wrote",
   )
   parser.add_argument("--out", default=str(FILE))
   sys.exit(app.attempt(lambda: main(parser.parse_args())))

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from mjx_cl.adapt.act import choose
-from mjx_cl.detectors.base import Detector
+from mjx_cl.detectors.base import Detector, anew
 from mjx_cl.dreamer.agent import Agent
 from mjx_cl.rollout.monitor import History, Monitor, Residual
 from mjx_cl.rollout.scan import Row
@@ -127,6 +127,6 @@ def evaluate(agent: Agent, minds: Minds, rows: Row, keys: jax.Array) -> tuple[ja
 
 def refit(detector: Detector, state: Any, past: Residual, over: jax.Array) -> Any:
   """`state` of the detector, where `over` (groups,): one that has seen the rows `past` alone."""
-  fresh = jax.tree.map(lambda x: jnp.broadcast_to(x, (over.shape[0],) + x.shape), detector.init())
+  fresh = jax.tree.map(lambda x: jnp.broadcast_to(x, (over.shape[0],) + x.shape), anew(detector)())
   fresh, _ = jax.lax.scan(jax.vmap(detector.update), fresh, past)
   return choose(over, fresh, state)

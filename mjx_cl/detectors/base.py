@@ -47,6 +47,8 @@ class Detector(NamedTuple):
     skips: whether a scalar x that is nan leaves the state as it is and has no score; `combine.on`
       then need not compare a long state element by element at every sample.
     members: the detectors of which any fires, whose largest score hides what the others do.
+    anew: () -> state of a detector that is to learn from the next samples what it was told of the
+      healthy robot, after a finetuning has changed the agent; None: init learns that anyway.
 
   Example: _, out = jax.lax.scan(det.update, det.init(), xs)      # out.fired: bool (T,)
   """
@@ -55,6 +57,12 @@ class Detector(NamedTuple):
   update: Callable[[Any, Any], tuple[Any, Alarm]]
   skips: bool = False
   members: tuple["Detector", ...] = ()
+  anew: Callable[[], Any] | None = None
+
+
+def anew(detector: Detector) -> Callable[[], Any]:
+  """What gives the state of a detector after a finetuning, see Detector."""
+  return detector.anew or detector.init
 
 
 def scalar(factory: Callable[..., Detector]) -> Callable[..., Detector]:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Float
 
-from mjx_cl.detectors.base import Alarm, Count, Detector, Flag, demand, keep
+from mjx_cl.detectors.base import Alarm, Count, Detector, Flag, anew, demand, keep
 from mjx_cl.errors import UserError
 from mjx_cl.rollout.monitor import CHANNELS, Residual
 from mjx_cl.types import Array
@@ -62,7 +62,7 @@ def on(channel: str, detector: Detector, log: bool = False) -> Detector:
       new = keep(valid, new, state)
     return new, Alarm(alarm.fired & valid, jnp.where(valid, alarm.score, jnp.nan))
 
-  return Detector(detector.init, update)
+  return Detector(detector.init, update, anew=detector.anew)
 
 
 def any_of(*detectors: Detector) -> Detector:
@@ -77,7 +77,12 @@ def any_of(*detectors: Detector) -> Detector:
       fired, jnp.where(jnp.all(jnp.isnan(scores)), jnp.nan, known)
     )
 
-  return Detector(lambda: tuple(d.init() for d in detectors), update, members=detectors)
+  return Detector(
+    lambda: tuple(d.init() for d in detectors),
+    update,
+    members=detectors,
+    anew=lambda: tuple(anew(d)() for d in detectors),
+  )
 
 
 class RunState(NamedTuple):
@@ -115,7 +120,8 @@ def patience(factory: Callable[..., Detector], k: int, **settings: Any) -> Detec
     run = jnp.where(alarm.score > threshold, jnp.minimum(state.run + 1, k), 0)
     return RunState(inner, jnp.where(jnp.isnan(alarm.score), state.run, run)), alarm
 
-  return Detector(lambda: RunState(first.init(), jnp.int32(0)), update)
+  begin = lambda inner: RunState(inner, jnp.int32(0))
+  return Detector(lambda: begin(first.init()), update, anew=lambda: begin(anew(first)()))
 
 
 class CoolState(NamedTuple):
@@ -143,7 +149,8 @@ def cool_down(detector: Detector, steps: int) -> Detector:
     left = jnp.where(jnp.isnan(alarm.score), state.left, jnp.maximum(state.left - 1, 0))
     return CoolState(inner, jnp.where(fired, steps, left)), Alarm(fired, alarm.score)
 
-  return Detector(lambda: CoolState(detector.init(), jnp.int32(0)), update)
+  begin = lambda inner: CoolState(inner, jnp.int32(0))
+  return Detector(lambda: begin(detector.init()), update, anew=lambda: begin(anew(detector)()))
 
 
 class Sums(NamedTuple):

@@ -14,10 +14,13 @@ from mjx_cl.detectors.base import (
   Detector,
   Number,
   Setting,
+  Warm,
   above,
+  cold,
   demand,
   judged,
   keep,
+  standardise,
   whole,
 )
 from mjx_cl.detectors.multivariate import Rows, pick, split
@@ -29,6 +32,7 @@ CHANNELS = split("learnt", "opr+rpr+reward+surprise+groups")
 RATES = (1 / 8, 1 / 32, 1 / 128)
 MOST_Z, MOST_U = 6.0, 8.0  # deviations beyond which a sample, an average counts as so many
 LOOKS = ("distance", "ratio")
+OWN = 1500  # samples after a finetuning that fit mean and deviation
 ON = "healthy streams and tuning faults of the seeds that tune"
 
 Averages = Float[Array, "rates channels"]
@@ -68,11 +72,22 @@ def fits() -> dict[str, Fit]:
   }
 
 
-def averaged(averages: Averages, x: Rows, fit: Fit) -> Averages:
-  """The averages one sample later."""
-  z = jnp.clip((x - fit.mean) / fit.std, -MOST_Z, MOST_Z)
+class State(NamedTuple):
+  """What the detector remembers.
+
+  Attributes:
+    warm: of the channels: the fit's moments, or those of the stream's own first samples.
+    averages: of the standardised channels.
+  """
+
+  warm: Warm
+  averages: Any
+
+
+def averaged(averages: Averages, z: Rows) -> Averages:
+  """The averages one standardised sample later."""
   rates = jnp.asarray(RATES)[:, None]
-  return averages + rates * (z - averages)
+  return averages + rates * (jnp.clip(z, -MOST_Z, MOST_Z) - averages)
 
 
 def distance(averages: Averages, fit: Fit) -> Number:
@@ -93,7 +108,9 @@ def ratio(averages: Averages, fit: Fit) -> Number:
 
 
 @whole
-def learnt(threshold: Setting = 1.0, looks: str = "both", robot: str | None = None) -> Detector:
+def learnt(
+  threshold: Setting = 1.0, looks: str = "both", warmup: int = 0, robot: str | None = None
+) -> Detector:
   """Exponentially weighted averages of all channels at three rates: how far they are from a healthy
   robot's, and how much they look like faults that were seen before.
 
@@ -109,38 +126,46 @@ def learnt(threshold: Setting = 1.0, looks: str = "both", robot: str | None = No
   knows of no fault; the ratio is sharper on faults that resemble those it has seen. A unit is a
   score that healthy robots pass once in 20,000 control steps.
 
-  The distance is two-sided; the ratio has the direction of the faults that it was fitted on.
+  The distance is two-sided; the ratio has the direction of the faults that it was fitted on. After
+  a finetuning mean and std are those of the next 1,500 samples, since the agent is another.
 
   Args:
     threshold: decision level [units].
     looks: `distance`, `ratio` or `both`.
+    warmup: samples that fit mean and std from the start [control steps]; 0: the fit's.
     robot: whose fit is taken; default, and for a robot without any: the walker's.
 
   Returns:
     Detector over monitor.Residual.
   Blind to: a change of fewer steps than the fastest average takes; whatever a healthy robot does
-  now and then; other agents than the shipped ones, whose healthy residuals differ, need a fit of
-  their own.
+  now and then. Other agents than the shipped ones need a fit of their own, or a `warmup`, which
+  knows their mean and std and no more.
   Reference: Lowry, Woodall, Champ, Rigdon 1992, Technometrics 34, 46-53 (averages of several
   channels); Gong, Lee, Cheng, Xie 2022, arXiv 2210.17312 (a learnt likelihood ratio).
   """
-  demand("learnt", threshold=(threshold, above(threshold, 0), "above 0"))
+  demand(
+    "learnt",
+    threshold=(threshold, above(threshold, 0), "above 0"),
+    warmup=(warmup, warmup == 0 or warmup >= 2, "0, or at least 2"),
+  )
   if looks not in ("both", *LOOKS):
     raise UserError(f"detector 'learnt': looks is both, {' or '.join(LOOKS)}; got {looks!r}")
   fit = fits().get(robot or "walker") or fits()["walker"]
-  use = np.array([looks in ("both", name) for name in LOOKS])
+  use, own = np.array([looks in ("both", name) for name in LOOKS]), warmup or OWN
+  none = lambda: jnp.zeros((len(RATES), len(CHANNELS)))
+  told = lambda: Warm(jnp.int32(own), jnp.asarray(fit.mean), jnp.square(fit.std) * own)
 
-  def init() -> Averages:
-    return jnp.zeros((len(RATES), len(CHANNELS)))
-
-  def update(state: Averages, residual: Residual) -> tuple[Averages, Alarm]:
+  def update(state: State, residual: Residual) -> tuple[State, Alarm]:
     x, known = pick(residual, CHANNELS, log=True)
-    new = keep(known, averaged(state, x, fit), state)
+    warm, z, ready = standardise(state.warm, x, own)
+    known, warm = known & ready, keep(known, warm, state.warm)
+    new = keep(known, averaged(state.averages, z), state.averages)
     both = jnp.stack([distance(new, fit), ratio(new, fit)]) / fit.units
     alarm = judged(jnp.max(both, where=use, initial=-jnp.inf), known, threshold)
-    return jnp.where(alarm.fired, 0.0, new), alarm
+    return State(warm, jnp.where(alarm.fired, 0.0, new)), alarm
 
-  return Detector(init, update)
+  learns = lambda: State(cold(len(CHANNELS)), none())
+  return Detector(learns if warmup else lambda: State(told(), none()), update, anew=learns)
 
 
 # what a board says beside its name

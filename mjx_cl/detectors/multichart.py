@@ -26,7 +26,7 @@ def in_units(detector: Detector, unit: Real, threshold: Setting) -> Detector:
     )
     return new, Alarm(alarm.fired, jnp.where(jnp.isnan(alarm.score), jnp.nan, score))
 
-  return Detector(detector.init, update)
+  return Detector(detector.init, update, anew=detector.anew)
 
 
 @whole

@@ -17,6 +17,8 @@ def register_envs() -> None:
   from gymnasium.envs import registration
 
   for name, robot in ROBOTS.items():
+    if f"mjx_cl/{name}" in registration.registry:  # a second time gymnasium warns
+      continue
     registration.register(
       id=f"mjx_cl/{name}",
       entry_point=f"{ADAPTERS}:make",

@@ -396,9 +396,20 @@ def test_compile_time_names_its_programs(given):
 
 def test_the_thresholds_that_ship_are_those_of_the_board(tmp_path):
   thresholds, root = load("thresholds"), FOLDER.parent
-  assert thresholds.collect(root / "results/leaderboard_100k") == json.loads(
-    thresholds.FILE.read_text()
+  ships = json.loads(thresholds.FILE.read_text())
+  assert thresholds.joined([root / name for name in thresholds.BOARDS]) == ships
+  first, learnt = (
+    thresholds.collect(root / name)["robots"]["car"] for name in thresholds.BOARDS[:2]
   )
+  assert ships["robots"]["car"] == first | learnt and [*learnt] == ["learnt"]
+  (tmp_path / "often").mkdir()
+  about = json.loads((root / "results/learnt/car/leaderboard.json").read_text())
+  text = json.dumps(about | {"arl0_target": 10_000})
+  (tmp_path / "often/leaderboard.json").write_text(text)
+  table = pq.read_table(root / "results/learnt/car/leaderboard.parquet")
+  pq.write_table(table, tmp_path / "often/leaderboard.parquet")
+  with pytest.raises(FileError, match="boards at ARL0 100,000 and 10,000"):
+    thresholds.joined([root / thresholds.BOARDS[0], tmp_path / "often"])
   for name, text, words in (
     (None, "", "is missing"),
     ("leaderboard.json", "{}", "not a leaderboard's"),

@@ -1,13 +1,16 @@
 """Detector `learnt` against a NumPy loop, and its fit against a closed form."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from test_detectors_multivariate import gaussian
 
 from benchmarks import fit_learnt
 from mjx_cl import detectors, envs
-from mjx_cl.detectors import learnt
+from mjx_cl.adapt import watch
+from mjx_cl.detectors import base, learnt
+from mjx_cl.detectors.multivariate import pick
 from mjx_cl.errors import UserError
 from mjx_cl.leaderboard import entries
 from mjx_cl.leaderboard.streams import StreamSet
@@ -87,6 +90,49 @@ def test_a_shift_is_found_and_a_healthy_robot_is_left_alone():
     fired[lift] = np.asarray(out.fired)
   assert not fired[0.0].any()  # independent samples vary less than a robot's
   assert not fired[2.0][:1000].any() and fired[2.0][1000:1200].any()
+
+
+def test_after_a_finetuning_it_learns_mean_and_deviation_anew():
+  """By hand: as if the fit's were those of its first 1,500 samples."""
+  fit = learnt.fits()["walker"]
+  other = fit._replace(mean=fit.mean + 2 * fit.std, std=1.5 * fit.std)  # of a changed agent
+  rows = residuals(2400, other)
+  past, then = (jax.tree.map(lambda x: x[part], rows) for part in (slice(2000), slice(2000, None)))
+  det = detectors.make("learnt", threshold=1.5, robot="walker")
+  two = lambda x: jnp.broadcast_to(jnp.asarray(x), (2, *jnp.shape(x)))
+  begin = jax.tree.map(two, det.init())
+  both = jax.tree.map(lambda x: jnp.stack([x, x], 1), past)
+  state = watch.refit(det, begin, both, jnp.array([True, False]))
+  after = lambda k: jax.lax.scan(det.update, jax.tree.map(lambda x: x[k], state), then)[1]
+  assert not np.asarray(after(0).fired).any() and np.asarray(after(1).fired).any()
+
+  x = np.asarray(jax.vmap(lambda row: pick(row, learnt.CHANNELS, True)[0])(rows), np.float64)[:1500]
+  own = fit._replace(mean=x.mean(0), std=x.std(0))
+  score, fired = by_hand(jax.tree.map(lambda x: x[1500:], rows), own, 1.5, "both")
+  assert not fired.any()
+  np.testing.assert_allclose(after(0).score, score[500:], rtol=2e-3, atol=2e-3)  # as above
+  early = detectors.make("learnt", threshold=1.5, robot="walker", warmup=1500)
+  _, out = jax.lax.scan(early.update, early.init(), rows)
+  assert np.isnan(out.score[:1500]).all()
+  np.testing.assert_allclose(out.score[2000:], after(0).score, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+  "wrapped",
+  [
+    lambda det: detectors.any_of(det, det),
+    lambda det: detectors.cool_down(det, 10),
+    lambda det: detectors.patience(learnt.learnt, 3, robot="walker"),
+  ],
+)
+def test_what_wraps_it_learns_anew_with_it(wrapped):
+  det = wrapped(detectors.make("learnt", robot="walker"))
+  seen = lambda state: [int(x.seen) for x in jax.tree.leaves(state, is_leaf=is_warm) if is_warm(x)]
+  assert set(seen(det.init())) == {learnt.OWN} and set(seen(base.anew(det)())) == {0}
+
+
+def is_warm(x):
+  return isinstance(x, base.Warm)
 
 
 def test_every_robot_that_ships_with_an_agent_has_a_fit():

@@ -366,9 +366,10 @@ def test_made_by_name_it_is_our_robot():
   """One step of both ways equals the adapter's own; gymnasium's checks run on it without a warning."""
   fault = dict(fault="gear", target="left_hip", severity=0.5, onset=7)
   want = adapters.gymnasium_env("walker", **fault)
-  registration.register_envs()
   with warnings.catch_warnings():
     warnings.simplefilter("error")
+    registration.register_envs()
+    registration.register_envs()
     got = gymnasium.make("mjx_cl/Walker-v0", **fault)
     first = got.reset(seed=3)[0]
     after = got.step(np.zeros(6, np.float32))
@@ -380,3 +381,19 @@ def test_made_by_name_it_is_our_robot():
   np.testing.assert_array_equal(many.reset(seed=3)[0][0], first)
   with pytest.raises(UserError, match="mjx-cl render"):
     gymnasium.make("mjx_cl/Walker-v0", render_mode="human")
+
+
+@pytest.mark.parametrize("name", ["Walker-v0", "Car-v0"])
+def test_stable_baselines_checks_it_and_trains_on_it(name):
+  stable = pytest.importorskip("stable_baselines3")
+  checker = pytest.importorskip("stable_baselines3.common.env_checker")
+  registration.register_envs()
+  with warnings.catch_warnings():
+    warnings.simplefilter("error")
+    env = gymnasium.make(f"mjx_cl/{name}", onset=50)
+    checker.check_env(env)
+  learner = stable.PPO("MlpPolicy", env, n_steps=64, batch_size=32, device="cpu", seed=0)
+  before = learner.policy.state_dict()["action_net.weight"].clone()
+  learner.learn(128)
+  assert learner.num_timesteps == 128
+  assert not before.equal(learner.policy.state_dict()["action_net.weight"])

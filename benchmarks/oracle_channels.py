@@ -1,0 +1,123 @@
+"""How much of what the recordings hold detector `learnt` finds: oracles that are told the fault.
+
+  mjx-cl record benchmarks/oracle_channels.toml --out runs/streams-oracle
+  python benchmarks/oracle_channels.py [--tuned runs/streams-oracle] [--robot ROBOT ...] [--out FILE]
+
+For each fault of the board two oracles: the likelihood ratio of OPR and RPR as autoregressions
+(leaderboard/oracle.py), and `learnt`'s averages of all twelve channels with weights fitted to this
+very fault (benchmarks/fit_learnt.py). Both are fitted on seeds 100 to 109 and scored on 0 to 9; the
+better on seeds 105 to 109, fitted on 100 to 104, is the oracle of the fault. Score: mean over
+streams of 100 2^(-latency / 5 s), 0 where missed within 20 s, at one alarm in 10,000 healthy steps
+of seeds 100 to 109.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import pathlib
+import sys
+
+import numpy as np
+
+from benchmarks import fit_learnt
+from mjx_cl.detectors import learnt
+from mjx_cl.io import folders, runtime
+from mjx_cl.leaderboard import oracle
+from mjx_cl.leaderboard.streams import Streams, StreamSet
+from mjx_cl.scoring import autoregression
+
+FROM = 2_000  # control steps at the start of a stream in which nothing counts
+
+
+def after(streams: Streams, use: np.ndarray, horizon: int) -> np.ndarray:
+  """OPR and RPR from the onset on, (horizon, streams, 2)."""
+  x = oracle.channels(streams.residual)
+  own = np.flatnonzero(use)
+  return np.stack([x[(o := streams.onset[s]) : o + horizon, s] for s in own], 1)
+
+
+def pair(normal, healthy, streams, use, horizon):
+  """Scores of the likelihood ratio: (function of streams -> bool (T, S))."""
+  fit = autoregression.fit(normal, after(streams, use, horizon))
+  ratio = lambda x: oracle._ratios(x, [fit])
+  own = ratio(healthy)
+  most = own.shape[1] * (len(own) - FROM) / fit_learnt.ARL0
+  level = oracle._thresholds(own, own.shape[1], FROM, most)[0]
+
+  def fired(other: Streams) -> np.ndarray:
+    r = ratio(oracle.channels(other.residual))
+    return oracle.restarted(r, np.full(r.shape[1], level))[0]
+
+  return fired
+
+
+def whole(fit, healthy, faulty, use):
+  """Likewise of the averages of all channels."""
+  own = fit_learnt.weighed(fit, healthy, faulty, use[None])
+  level = fit_learnt.level(fit_learnt.scores(healthy, own)[1], fit_learnt.ARL0)
+  return lambda held: fit_learnt.scores(held, own)[1] > level
+
+
+def main() -> None:
+  parser = argparse.ArgumentParser(
+    description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+  )
+  parser.add_argument(
+    "--tuned", default="runs/streams-oracle", help="of the suite beside this file"
+  )
+  parser.add_argument("--robot", nargs="*", default=())
+  parser.add_argument("--out", default="results/learnt/oracle.json")
+  given = parser.parse_args()
+  runtime.setup()
+  ships, tuned, rows = StreamSet(None), StreamSet(given.tuned), []
+  horizon_s = ships.suite.horizon_s
+  for robot in given.robot or ships.robots:
+    nominal = ships.get(robot, ships.find(robot, "nominal", "tune"))
+    fit, healthy = fit_learnt.reference(nominal)
+    x = oracle.channels(nominal.residual)
+    each = len(nominal.seed) // len(set(nominal.seed.tolist()))
+    normal = autoregression.Healthy(x[FROM:, ::each], autoregression.ORDER)
+    shipped = learnt.fits()[robot]
+    level = fit_learnt.level(
+      fit_learnt.scores(fit_learnt.averages(nominal, shipped), shipped).max(0), fit_learnt.ARL0
+    )
+    for key in ships.faults(robot):
+      known = tuned.get(robot, tuned.find(robot, "fault", "score", *key))
+      asked = ships.get(robot, ships.find(robot, "fault", "score", *key))
+      horizon = int(horizon_s / known.control_s)
+      of = lambda fired, streams: fit_learnt.found(1.0 * fired, 0.5, streams, horizon_s)
+      all_, half = np.ones(len(known.seed), bool), known.seed < 105
+      held, other = (fit_learnt.averages(s, fit) for s in (known, asked))
+      chosen = []
+      for use in (half, all_):
+        first = pair(normal, x, known, use, horizon)
+        second = whole(fit, healthy, held, use)
+        streams, averages = (known, held) if use is half else (asked, other)
+        out = [of(first(streams), streams), of(second(averages), streams)]
+        chosen.append([float(s[~half].mean() if use is half else s.mean()) for s in out])
+      own = fit_learnt.scores(fit_learnt.averages(asked, shipped), shipped).max(0)
+      row = {
+        "robot": robot,
+        "fault": key[0],
+        "severity": key[1],
+        "learnt": float(of(own > level, asked).mean()),
+        "two_channels": chosen[1][0],
+        "all_channels": chosen[1][1],
+        "oracle": chosen[1][int(np.argmax(chosen[0]))],
+      }
+      rows.append(row)
+      shown = (f"{row[k]:6.1f}" for k in ("learnt", "two_channels", "all_channels", "oracle"))
+      print(f"{robot:10} {key[0]:18} {key[1]:5.2f}", *shown, flush=True)
+  mean = lambda k, robot: float(np.mean([r[k] for r in rows if robot in ("", r["robot"])]))
+  for robot in ["", *dict.fromkeys(r["robot"] for r in rows)]:
+    own, best = mean("learnt", robot), mean("oracle", robot)
+    print(f"{robot or 'all'}: learnt {own:.1f}, oracle {best:.1f}, share {own / best:.2f}")
+  value = {"command": " ".join(["python", *sys.argv]), **runtime.provenance(), "rows": rows}
+  out = pathlib.Path(given.out)
+  out.parent.mkdir(parents=True, exist_ok=True)
+  folders.atomic(out, lambda file: file.write((json.dumps(value) + "\n").encode()))
+
+
+if __name__ == "__main__":
+  main()
