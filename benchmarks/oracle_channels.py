@@ -1,7 +1,7 @@
 """How much of what the recordings hold detector `learnt` finds: oracles that are told the fault.
 
   mjx-cl record benchmarks/oracle_channels.toml --out runs/streams-oracle
-  python benchmarks/oracle_channels.py [--tuned runs/streams-oracle] [--robot ROBOT ...] [--out FILE]
+  python benchmarks/oracle_channels.py [--tuned DIR] [--robot ROBOT ...] [--out FILE]
 
 For each fault of the board two oracles: the likelihood ratio of OPR and RPR as autoregressions
 (leaderboard/oracle.py), and `learnt`'s averages of all twelve channels with weights fitted to this
@@ -38,7 +38,7 @@ def after(streams: Streams, use: np.ndarray, horizon: int) -> np.ndarray:
 
 
 def pair(normal, healthy, streams, use, horizon):
-  """Scores of the likelihood ratio: (function of streams -> bool (T, S))."""
+  """Alarms of the likelihood ratio of OPR and RPR: a function of streams -> bool (T, S)."""
   fit = autoregression.fit(normal, after(streams, use, horizon))
   ratio = lambda x: oracle._ratios(x, [fit])
   own = ratio(healthy)
@@ -53,7 +53,7 @@ def pair(normal, healthy, streams, use, horizon):
 
 
 def whole(fit, healthy, faulty, use):
-  """Likewise of the averages of all channels."""
+  """Alarms of the averages of all channels: a function of fit_learnt.Set -> bool (T, S)."""
   own = fit_learnt.weighed(fit, healthy, faulty, use[None])
   level = fit_learnt.level(fit_learnt.scores(healthy, own)[1], fit_learnt.ARL0)
   return lambda held: fit_learnt.scores(held, own)[1] > level

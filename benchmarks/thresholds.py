@@ -3,9 +3,10 @@ benchmarks/thresholds.py [--board FOLDER ...] [--out FILE]
 
 Writes mjx_cl/detectors/thresholds.json from leaderboards' own files, of which the first that has a
 robot's detector counts: robot -> name on the board -> settings, threshold, ARL0 and the alarms that
-it was counted from. Left out are references, which look at nothing, the paper's rule, which has figures of its own (`detectors.PAPER`), and what the
-board counted fewer than ten alarms of: a detector that no threshold brings to that rate stays
-silent, and one with too few rows has not been measured.
+it was counted from. Left out are references, which look at nothing, the paper's rule, which has
+figures of its own (`detectors.PAPER`), and what the board counted fewer than ten alarms of: a
+detector that no threshold brings to that rate stays silent, and one with too few rows has not been
+measured.
 """
 
 from __future__ import annotations
