@@ -34,6 +34,7 @@ class Film(NamedTuple):
     steps: control steps shown.
     learn: flags of the run that learns.
     file: below docs.
+    look: arguments of `compare.film`.
   """
 
   fault: dict
@@ -45,6 +46,7 @@ class Film(NamedTuple):
   steps: int
   learn: str
   file: str
+  look: dict = {}
 
 
 FILMS = {
@@ -56,7 +58,7 @@ FILMS = {
     4,
     140,
     300,
-    "--fault gear --target right_hip --severity 0.5 --onset 3000 --steps 16000 --arm detector",
+    "--fault gear --target right_hip --severity 0.5 --onset 3000 --steps 16000 --arm detector --first-seed 4",
     "film.gif",
   ),
   "quadruped": Film(
@@ -67,7 +69,7 @@ FILMS = {
     4,
     100,
     300,
-    "--fault quadruped/rh-velocity-third --onset 3000 --steps 16000 --arm oracle",
+    "--fault quadruped/rh-velocity-third --onset 3000 --steps 16000 --arm oracle --first-seed 4",
     "film_quadruped.gif",
   ),
   "car": Film(
@@ -75,18 +77,19 @@ FILMS = {
     "car_real",
     ("moved to a harder simulator", "same car, after learning"),
     None,
-    4,
+    14,
     40,
-    240,
-    "--fault car/sim-to-real --onset 2000 --steps 14000 --arm detector",
+    220,
+    "--fault car/sim-to-real --onset 2000 --steps 30000 --arm detector --first-seed 4",
     "film_car.gif",
+    {"fps": 7, "width": 170, "height": 144},
   ),
 }
 
 
 def learn(robot: str, work: pathlib.Path) -> pathlib.Path:
   """Lets two robots break and adapt; the folder of what the first has learnt."""
-  flags = f"{FILMS[robot].learn} --first-seed {FILMS[robot].seed} --seeds 2 --keep"
+  flags = f"{FILMS[robot].learn} --seeds 2 --keep"
   subprocess.run(
     [sys.executable, "-m", "mjx_cl", "run", robot, *flags.split(), "--out", str(work)], check=True
   )
@@ -143,7 +146,7 @@ def draw(robot: str, agent: pathlib.Path, out: pathlib.Path, **changes) -> dict:
     pane("BROKEN", film.words[0], broken, acts(own) | film.fault),
     pane("BROKEN, ADAPTED", film.words[1], broken, acts(learnt) | film.fault),
   )
-  options = {"seed": film.seed, "weak": film.weak} | changes
+  options = {"seed": film.seed, "weak": film.weak} | film.look | changes
   return compare.film(panes, out, film.steps, film.skip, **options)
 
 

@@ -134,6 +134,8 @@ class TrainConfig:
       `pure` updates; returns are reported without it.
     penalties: Factor on the negative weights of the reward in training, returns included. Where
       effort costs more than a beginner earns, a first stage below 1 keeps it moving.
+    shaping: Weight of the robot's own shaping terms, added to the reward in training, returns
+      included: shows a first stage a way of moving.
     fault: Domain randomisation: each robot draws a target of this fault and a severity at the start
       and whenever one of its episodes has ended. A preset (robot/name) brings its own severities,
       targets and schedules, on the robot's own clock. None: healthy robots.
@@ -160,6 +162,7 @@ class TrainConfig:
   hold: int = 0
   fall_cost: float = 0.0
   penalties: float = 1.0
+  shaping: float = 0.0
   fault: str | None = None
   severity: float = 1.0
 
@@ -189,6 +192,7 @@ class TrainConfig:
       self,
       "fall_cost",
       "penalties",
+      "shaping",
       "demo_noise",
       "clone_weight",
       *given(self, "lr_end"),

@@ -53,6 +53,25 @@ def eased(env: Any, factor: float) -> Any:
   return env
 
 
+def shaped(env: Any, weight: float) -> Any:
+  """The environment whose reward has `weight` times `env.shaping(before, after)` added; itself for
+  0.
+  """
+  if weight == 0.0:
+    return env
+  if not hasattr(env, "shaping"):
+    raise UserError(f"shaping: robot {env.spec.name!r} has no shaping terms")
+  env = copy.copy(env)
+  plain = env.step
+
+  def step(model: Any, state: Any, action: jax.Array) -> Any:
+    after, out = plain(model, state, action)
+    return after, out._replace(reward=out.reward + weight * env.shaping(state, after))
+
+  env.step = step
+  return env
+
+
 def faults_of(
   env: Any, config: TrainConfig
 ) -> tuple[faults.Fault | tuple[faults.Fault, ...], faults.Plan | None, jax.Array | int]:

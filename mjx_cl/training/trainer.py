@@ -23,7 +23,7 @@ from mjx_cl.keys import OfStream
 from mjx_cl.rollout.scan import Rollout, Row, Stream, nest, records, start
 from mjx_cl.training import episodes, needs
 from mjx_cl.training.learn import make_learn, seeds_mesh
-from mjx_cl.training.premises import check, eased, expert, faults_of
+from mjx_cl.training.premises import check, eased, expert, faults_of, shaped
 
 
 class Learner(NamedTuple):
@@ -74,7 +74,7 @@ class Trainer:
     check(env, dreamer, config)
     self.env, self.dreamer, self.config, self.out = env, dreamer, config, pathlib.Path(out)
     self.seeds, self.mesh = seeds, seeds_mesh(seeds)
-    env = eased(env, config.penalties)
+    env = shaped(eased(env, config.penalties), config.shaping)
     self.expert = expert(env, config.demonstrator) if config.demonstrator else None
     self.expert_return = 0.0
     self.phase = "clone" if self.expert else "pure"

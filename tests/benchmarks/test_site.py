@@ -128,3 +128,21 @@ def test_a_tutorial_runs(name, tmp_path):
       assert done.returncode == 0, done.stderr[-2000:]
       ran += 1
   assert ran >= 2
+
+
+def test_the_notebook_runs_and_says_what_it_shows(tmp_path):
+  cells = json.loads((ROOT / "docs/notebook.ipynb").read_text())["cells"]
+  code = [cell for cell in cells if cell["cell_type"] == "code"]
+  shown = "".join(
+    "".join(out["text"]) for cell in code for out in cell["outputs"] if out.get("name") == "stdout"
+  )
+  done = subprocess.run(
+    [sys.executable, "-c", "\n".join("".join(cell["source"]) for cell in code)],
+    cwd=tmp_path, capture_output=True, text=True, env=os.environ | {"MPLBACKEND": "Agg"},
+  )  # fmt: skip
+  assert done.returncode == 0, done.stderr[-2000:]
+  # scores may differ in the last place that is printed, or a little more, on another machine
+  numbers = lambda text: [float(x) for x in re.findall(r"-?\d+(?:\.\d+)?", text)]
+  words = lambda text: re.sub(r"[-\d.\s]+", " ", text)
+  assert words(done.stdout) == words(shown) and "learnt" in shown
+  assert numbers(done.stdout) == pytest.approx(numbers(shown), abs=2, rel=0.02)
