@@ -41,7 +41,7 @@ STANDING = 0.02  # share of commands to stand
 HEADING_GAIN = 0.5  # [1/s]
 AIR_TIME = 0.5  # a swing that lasts longer is rewarded [s]
 REWARD_SCALE = 1.5  # greatest weighted sum of the two tracking terms
-SWING_S, LIFT, HEIGHT = 0.4, 0.08, 0.54  # [s], [m], [m]: the trot that `shaping` asks for
+SWING_S, LIFT, HEIGHT = 0.4, 0.05, 0.55  # [s], [m], [m]: the trot that `shaping` asks for
 SOFT_LIMIT = 0.95  # share of a joint's range that is free of penalty
 
 # reward terms: name, weight before the division by REWARD_SCALE
@@ -387,8 +387,8 @@ class Quadruped:
       (pairs + lift + height) / 3
       pairs   share of four that hold: diagonal feet alike (two pairs), front feet not, hind feet
               not; a foot is up while it has been off the ground for less than 0.4 s
-      lift    mean over feet that are up of min(clearance / 0.08 m, 1)
-      height  exp(-((z of the base - 0.54 m) / 0.05 m)^2)
+      lift    mean over feet that are up of min(clearance / 0.05 m, 1)
+      height  exp(-((z of the base - 0.55 m) / 0.08 m)^2)
 
     pairs and lift are 1 where the command is to stand.
     """
@@ -400,7 +400,7 @@ class Quadruped:
     lf, rf, lh, rh = up
     pairs = ((lf == rh) + (rf == lh) + 1.0 * (lf != rf) + (lh != rh)) / 4
     moving = jnp.sum(before.physics.command**2) > 0.1**2
-    height = jnp.exp(-(((p.qpos[2] - HEIGHT) / 0.05) ** 2))
+    height = jnp.exp(-(((p.qpos[2] - HEIGHT) / 0.08) ** 2))
     return (jnp.where(moving, pairs + lift, 2.0) + height) / 3
 
   def noiseless(self, model: Model, state: EnvState) -> jax.Array:

@@ -14,6 +14,7 @@ distribution of its healthy maxima over blocks, by L-moments (Hosking, Wallis an
 tail that is exponential or heavier: so that it may lie above all that the nominal log has shown.
 """
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -40,14 +41,12 @@ class Scales(NamedTuple):
   joint: np.ndarray
 
 
-def averages(x: np.ndarray, start: np.ndarray | float = 0.0) -> np.ndarray:
-  """(spans, ..., T, C) exponentially weighted averages of x (..., T, C), which begin at `start`."""
-  found = []
+def averages(x: np.ndarray, start: np.ndarray | float = 0.0) -> Iterator[np.ndarray]:
+  """Exponentially weighted averages of x (..., T, C) over each of SPANS, which begin at `start`."""
   for span in SPANS:
     rate = 2 / (span + 1)
     begin = np.broadcast_to(start, (*x.shape[:-2], 1, x.shape[-1])) * (1 - rate)
-    found.append(signal.lfilter([rate], [1, rate - 1], x, -2, begin)[0])
-  return np.stack(found)
+    yield signal.lfilter([rate], [1, rate - 1], x, -2, begin)[0]
 
 
 def logs(residuals: np.ndarray) -> np.ndarray:
@@ -74,30 +73,33 @@ def _shrunk(x: np.ndarray) -> np.ndarray:
 
 def scales(residuals: np.ndarray) -> Scales:
   """Of the nominal log's residuals (2, N, C); nan counts as neither high nor low."""
-  level, energy = averages(_known(residuals[0])), logs(residuals)
-  middle = np.nanmean(energy, 1, keepdims=True)
-  spread = averages(_known(energy, middle), middle)
+  level, joint = [], []
+  for average in averages(_known(residuals[0])):
+    level.append(average.std(0))
+    joint.append(np.linalg.inv(_shrunk(average)))
+  spread = []
+  for one in residuals:
+    energy = logs(one)
+    middle = np.nanmean(energy, 0, keepdims=True)
+    spread.append([(x.mean(0), x.std(0)) for x in averages(_known(energy, middle), middle)])
+  mean, deviation = np.moveaxis(np.array(spread), 2, 0)
   return Scales(
-    np.maximum(level.std(1), 1e-9),
-    np.stack([spread.mean(2).swapaxes(0, 1), np.maximum(spread.std(2).swapaxes(0, 1), 1e-9)]),
-    np.stack([np.linalg.inv(_shrunk(x)) for x in level]),
+    np.maximum(level, 1e-9), np.stack([mean, np.maximum(deviation, 1e-9)]), np.stack(joint)
   )
 
 
 def scores(residuals: np.ndarray, own: Scales) -> dict[str, np.ndarray]:
   """Chart -> (..., T, C), of `joint` (..., T, 1), for residuals (2, ..., T, C)."""
-  level = averages(_known(residuals[0]))
-  along = lambda x: x.reshape(len(SPANS), *[1] * (level.ndim - 2), -1)
-  joint = [((x @ inverse) * x).sum(-1) for x, inverse in zip(level, own.joint)]
-  spread = np.zeros(residuals.shape[1:])
-  for one, mean, deviation in zip(residuals, *own.spread):
-    energy = averages(_known(logs(one), mean[-1]), mean[-1])
-    spread = np.maximum(spread, np.abs((energy - along(mean)) / along(deviation)).max(0))
-  return {
-    "level": np.abs(level / along(own.level)).max(0),
-    "spread": spread,
-    "joint": np.sqrt(np.maximum(np.max(joint, 0), 0))[..., None],
-  }
+  shape = residuals.shape[1:]
+  level, spread, joint = np.zeros(shape), np.zeros(shape), np.zeros(shape[:-1])
+  for x, deviation, inverse in zip(averages(_known(residuals[0])), own.level, own.joint):
+    joint = np.maximum(joint, ((x @ inverse) * x).sum(-1))
+    level = np.maximum(level, np.abs(x / deviation))
+  for one, means, deviations in zip(residuals, *own.spread):
+    energies = averages(_known(logs(one), means[-1]), means[-1])
+    for x, mean, deviation in zip(energies, means, deviations):
+      spread = np.maximum(spread, np.abs((x - mean) / deviation))
+  return {"level": level, "spread": spread, "joint": np.sqrt(joint)[..., None]}
 
 
 class Tail(NamedTuple):

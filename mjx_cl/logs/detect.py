@@ -126,7 +126,7 @@ def detect(
     _samples(log, found, path, logarithm),
     _samples(nominal, found, nominal_path, logarithm),
   )
-  now, before_it = _standardised(xs, past, found, nominal_path, logarithm)
+  middle, spread = _spread(past, found, nominal_path, logarithm)
   warmup = min(1000, len(past) // 3)
   names = _able(names, len(found), len(past), warmup, "all" not in detectors)
   seconds, rate = _clock(log, rate, len(xs))
@@ -138,6 +138,9 @@ def detect(
       ignored=sorted({*log.ignored, *nominal.ignored}),
     )  # fmt: skip
     return judged
+  now, before_it = (
+    np.clip((x - middle) / spread, -FARTHEST, FARTHEST, dtype=np.float64) for x in (xs, past)
+  )
   rows, fired, scores, before = [], {}, {}, {}
   for k, name in enumerate(names):
     tell(f"{k + 1}/{len(names)} {name}")
@@ -179,12 +182,16 @@ def _judged(
       raise UserError(f"{what} must lie in 0..1e9 seconds (or samples); got {value}")
   choose("model", model, dict.fromkeys(healthy.MODELS))
   tell("model of the nominal log")
-  own = verdict.calibrated(past, arl0, model)
+  used, at = healthy.thinned(past)
+  own = verdict.calibrated(used, arl0, model)
   found = verdict.watch(own, xs)
   default = times.samples(10.0, 500) if times.rate else 500
   pause = times.samples(refractory, default)
   scores = charts.scores(own.unseen, own.scales)
-  before = {k: np.any(charts.alarms(x, own.thresholds[k]), 1) for k, x in scores.items()}
+  before = {}
+  for k, score in scores.items():
+    before[k] = np.zeros(len(past), bool)
+    before[k][at[charts.alarms(score, own.thresholds[k]).any(1) & (at >= 0)]] = True
   rows = []
   for name in charts.CHARTS:
     run: Run = None, True, before[name], found.fired[name], found.scores[name]
@@ -193,11 +200,16 @@ def _judged(
     rows.append(row | {"thresholds": dict(zip(labels, own.thresholds[name].tolist()))})
   said = verdict.summary(own, found, names, times, arl0, pause)
   said |= {"arl0": arl0, "rate_hz": times.rate, "detectors": rows}
-  said |= {**_sizes(xs, past, 0), "notes": _said_of(own, names, xs, len(past), arl0)}
+  said |= {**_sizes(xs, past, 0), "notes": _said_of(own, names, found.known, len(used), arl0)}
+  if len(used) < len(past):
+    said["notes"].append(
+      f"of the {len(past):,} nominal samples {int((at >= 0).sum()):,} are used, in {healthy.FOLDS} "
+      "stretches"
+    )
   if inject is not None:
     within = times.samples(inject, 1)
     tell("faults put into the nominal log")
-    found_faults, places = injection.smallest(own, healthy.held(past), names, within)
+    found_faults, places = injection.smallest(own, healthy.held(used), names, within)
     said["inject"] = {"within": within, "places": places, "faults": found_faults}
     if not places:
       said["notes"].append(
@@ -207,7 +219,7 @@ def _judged(
   return Detection(said, xs, past, found.fired, found.scores, before, times.seconds)
 
 
-def _said_of(own: Watch, names: list[str], xs: np.ndarray, rows: int, arl0: float) -> list[str]:
+def _said_of(own: Watch, names: list[str], known: np.ndarray, rows: int, arl0: float) -> list[str]:
   """What a reader must know of the model, one line each."""
   notes = []
   if drifts := [name for name, yes in zip(names, own.model.drifts) if yes]:
@@ -215,9 +227,9 @@ def _said_of(own: Watch, names: list[str], xs: np.ndarray, rows: int, arl0: floa
       f"{', '.join(drifts)}: drifting while healthy, so only changes quicker than "
       f"{own.model.slow} samples are seen there"
     )
-  if blind := int((~healthy.known(xs, own.model.held)).sum()):
+  if blind := int((~known).sum()):
     notes.append(
-      f"{blind:,} of {len(xs):,} samples are not judged: columns are missing there for too long"
+      f"{blind:,} of {len(known):,} samples are not judged: columns are missing there for too long"
     )
   if rows < arl0 * len(names):
     notes.append(
@@ -258,12 +270,13 @@ def _hosts(
   return hosts
 
 
-def _standardised(
-  xs: np.ndarray, past: np.ndarray, names: list[str], path: pathlib.Path | str, logarithm: bool
+def _spread(
+  past: np.ndarray, names: list[str], path: pathlib.Path | str, logarithm: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-  """Both logs in nominal deviations, cut at FARTHEST of them."""
+  """Mean and standard deviation (C,) of the nominal log, refused where nothing can be calibrated."""
   with np.errstate(over="ignore", invalid="ignore"):
-    middle, spread = np.nanmean(past, 0), np.nanstd(past, 0)
+    middle = np.array([np.nanmean(x, dtype=np.float64) for x in past.T])
+    spread = np.array([np.nanstd(x, dtype=np.float64) for x in past.T])
   if not np.isfinite(spread).all():
     raise FileError(
       f"{path}: column {names[int(np.argmin(np.isfinite(spread)))]} holds numbers too large to be "
@@ -274,8 +287,7 @@ def _standardised(
       f"{path}: column {names[int(np.argmin(spread))]} varies too little to be told from a constant"
       + (" once its logarithm is taken" if logarithm else "")
     )
-  cut = lambda x: np.clip((x - middle) / spread, -FARTHEST, FARTHEST)
-  return cut(xs), cut(past)
+  return middle, spread
 
 
 def _able(names: list[str], columns: int, rows: int, warmup: int, asked: bool) -> list[str]:
@@ -295,9 +307,13 @@ def _able(names: list[str], columns: int, rows: int, warmup: int, asked: bool) -
 
 def _samples(log: Log, names: list[str], path: pathlib.Path | str, logarithm: bool) -> np.ndarray:
   """Columns (T, C) of a log, or ln max(x, 1e-9) of them; nan stays, anything else that is not
-  positive has no logarithm and is refused.
+  positive has no logarithm and is refused. The log's own are given up one by one, so that no file
+  is held twice.
   """
-  x = np.stack([log.columns[name] for name in names], 1)
+  kind = np.result_type(*(log.columns[name] for name in names))
+  x = np.empty((len(log.columns[names[0]]), len(names)), kind, order="F")
+  for k, name in enumerate(names):
+    x[:, k] = log.columns.pop(name)
   for name, column in zip(names if logarithm else (), x.T):
     if (column <= 0).any():
       raise FileError(

@@ -28,6 +28,7 @@ SLOW = 1000  # samples of a drifting column's average, a tenth of the nominal lo
 HELD = 3
 FARTHEST = 10.0  # deviations at which a residual is cut
 ROWS = 20_000  # predicted at a time
+MOST = 10_000_000  # samples of all columns of a nominal log that are used
 MODELS = ("ar", "none")
 
 
@@ -66,6 +67,20 @@ def held(x: np.ndarray) -> np.ndarray:
   at = np.maximum.accumulate(at, 0)
   first = np.isfinite(x).argmax(0)
   return np.take_along_axis(x, np.where(at < 0, first, at), 0)
+
+
+def thinned(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+  """A nominal log (N, C) as it is used, and the row of each of its rows, -1 where there is none:
+  all of it, or of one with more than MOST samples the middle of each fold, missing rows between.
+  """
+  rows, columns = x.shape
+  if x.size <= MOST:
+    return x, np.arange(rows)
+  each = MOST // columns // FOLDS
+  apart = np.full(int(usual(x[:each]).max()) + max(*NOW, *BEFORE) + 1, -1)
+  begins = [(share.start + share.stop - each) // 2 for share in folds(rows)]
+  at = np.concatenate([np.r_[begin : begin + each, apart] for begin in begins])
+  return np.where(at[:, None] < 0, np.nan, x[at]).astype(np.float64), at
 
 
 def usual(x: np.ndarray) -> np.ndarray:

@@ -31,13 +31,14 @@ from mjx_cl.logs.clocks import (
 from mjx_cl.logs.mcap_file import read_mcap
 
 LARGE = 2_000_000  # bytes from which a file is given to pyarrow's reader first
+BLOCK = 4_000_000  # bytes of it that are parsed at a time
 
 
 class Log(NamedTuple):
   """What a file holds.
 
   Attributes:
-    columns: name -> float64 (T,), nan = missing; clocks too, but for those of `clocks`.
+    columns: name -> float (T,), nan = missing; clocks too, but for those of `clocks`.
     time: float64 (T,) [s], or None.
     step: float64 (T,), or None.
     ignored: name of a column that holds something else than numbers -> its first such line and
@@ -135,22 +136,31 @@ def _large(path: pathlib.Path | str) -> Log | None:
     names = _header(path, head, [cell.strip() for cell in next(csv.reader([head]))])
     if "," not in head or ";" in first or _number(first.split(",")[0]) is None:
       return None  # units, other signs
-    table = pyarrow.csv.read_csv(
+    parts: list[list] = [[] for _ in names]
+    with pyarrow.csv.open_csv(
       path,
-      read_options=pyarrow.csv.ReadOptions(column_names=names, skip_rows=1),
-      convert_options=pyarrow.csv.ConvertOptions(null_values=["", "nan", "NaN", "NAN"]),
-    )
+      read_options=pyarrow.csv.ReadOptions(column_names=names, skip_rows=1, block_size=BLOCK),
+      convert_options=pyarrow.csv.ConvertOptions(
+        null_values=["", "nan", "NaN", "NAN"],
+        column_types=dict.fromkeys(names, pyarrow.float64()),
+      ),
+    ) as batches:
+      for batch in batches:
+        for part, column in zip(parts, batch.columns):
+          part.append(column)
   except (OSError, ValueError, StopIteration, csv.Error, FileError, pyarrow.ArrowException):
     return None
-  kinds = pyarrow.types
-  for kind in table.schema.types:
-    if not (kinds.is_integer(kind) or kinds.is_floating(kind) or kinds.is_null(kind)):
-      return None
   columns = {}
-  for name, column in zip(names, table.columns):
-    values = column.cast(pyarrow.float64()).to_numpy()
-    columns[name] = np.where(np.isfinite(values), values, np.nan)
+  for name, part in zip(names, parts):
+    columns[name] = _finite(np.concatenate([x.to_numpy(zero_copy_only=False) for x in part]))
+    part.clear()  # a column at a time: no file is held twice
   return _timed(path, columns, {}, {name: name for name in names}, {}, [])
+
+
+def _finite(x: np.ndarray) -> np.ndarray:
+  """X, changed in place: what is not finite is missing."""
+  x[~np.isfinite(x)] = np.nan
+  return x
 
 
 def _timed(
@@ -197,32 +207,34 @@ def _timed(
 
 
 def _parquet(path: pathlib.Path | str) -> Log:
-  """Columns of a Parquet file: numbers, booleans and time stamps."""
+  """Columns of a Parquet file: numbers, booleans and time stamps; those of float32 stay so."""
   try:
-    table = pyarrow.parquet.read_table(path)
+    file = pyarrow.parquet.ParquetFile(path)
+    names = _own_names(path, file.schema_arrow.names)
+    columns: dict[str, np.ndarray] = {}
+    ignored: dict[str, tuple[int, str]] = {}
+    stamps = {}
+    for name, kind in zip(names, file.schema_arrow.types):
+      numeric = (
+        pyarrow.types.is_integer(kind) or pyarrow.types.is_floating(kind)
+        or pyarrow.types.is_decimal(kind) or pyarrow.types.is_boolean(kind)
+      )  # fmt: skip
+      if not numeric and not pyarrow.types.is_timestamp(kind):
+        ignored[name] = 1, f"{kind}"
+        continue
+      column = file.read(columns=[name]).column(name)
+      if not numeric:
+        whole = column.cast(pyarrow.timestamp("ns", kind.tz)).cast(pyarrow.int64())
+        if len(whole) and not whole.null_count:
+          stamps[name] = (whole.to_numpy() - whole[0].as_py()) / 1e9
+        else:
+          ignored[name] = 1, f"{kind}"
+        continue
+      x = column.cast(kind if pyarrow.types.is_float32(kind) else pyarrow.float64()).to_numpy()
+      columns[name] = _finite(np.require(x, requirements="W"))
   except (OSError, pyarrow.ArrowException) as e:
     raise FileError(f"cannot read {path}: {str(e).splitlines()[0][:200]}") from None
-  columns: dict[str, np.ndarray] = {}
-  ignored: dict[str, tuple[int, str]] = {}
-  stamps = {}
-  for name, column in zip(table.column_names, table.columns):
-    kind = column.type
-    if pyarrow.types.is_timestamp(kind):
-      whole = column.cast(pyarrow.timestamp("ns", kind.tz)).cast(pyarrow.int64())
-      x = whole.to_numpy().astype(np.float64) if not whole.null_count else np.array([])
-      if len(x):
-        stamps[name] = (whole.to_numpy() - whole[0].as_py()) / 1e9
-        continue
-    numeric = (
-      pyarrow.types.is_integer(kind) or pyarrow.types.is_floating(kind)
-      or pyarrow.types.is_decimal(kind) or pyarrow.types.is_boolean(kind)
-    )  # fmt: skip
-    if not numeric:
-      ignored[name] = 1, f"{kind}"
-      continue
-    values = column.cast(pyarrow.float64()).to_numpy().astype(np.float64)
-    columns[name] = np.where(np.isfinite(values), values, np.nan)
-  labels = {name: name for name in table.column_names}
+  labels = {name: name for name in names}
   return _timed(path, columns, ignored, labels, stamps, [])
 
 
@@ -278,6 +290,10 @@ def _header(path: pathlib.Path | str, head: str, names: list[str]) -> list[str]:
       )
   if names[0] == "" and len(names) > 1 and "" not in names[1:] and "index" not in names:
     names = ["index", *names[1:]]  # pandas and R write the numbers of the rows there
+  return _own_names(path, names)
+
+
+def _own_names(path: pathlib.Path | str, names: list[str]) -> list[str]:
   if "" in names or len(set(names)) < len(names):
     raise FileError(
       f"{path}: every column needs a name of its own; got {', '.join(map(repr, names))}"

@@ -26,8 +26,8 @@ class Detection(NamedTuple):
   Attributes:
     summary: what detect.json holds; of the charts also verdict, events, false_alarms, model and,
       where faults were put into the nominal log, inject.
-    xs: float64 (T, C), the log as read.
-    past: float64 (N, C), the nominal log as read.
+    xs: float (T, C), the log as read.
+    past: float (N, C), the nominal log as read.
     fired: detector -> bool (T, C).
     scores: detector -> float (T, C).
     before: detector -> bool (N,), nominal alarms of any column.

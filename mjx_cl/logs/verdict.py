@@ -17,6 +17,10 @@ DOUBT = 0.01  # expected number of such events in a healthy log, above which one
 MOST = 4  # columns that an event names
 GAIN = 25.0  # squared deviations that a column has to explain to be named
 SHARE = 0.1  # of what the first column explains, that each of the others has to
+ROWS = 50_000  # of a large log watched at a time
+LARGE = 10_000_000  # samples of all columns from which a log is watched so and kept in 16 bits
+WARM = 40  # longest averages of the rows before that such a part begins with; e^-80 is left of more
+TOP = 6e4  # highest score that is kept in 16 bits
 
 
 class Watch(NamedTuple):
@@ -56,21 +60,57 @@ class Found(NamedTuple):
   Attributes:
     residuals: (2, T, C).
     scores: chart -> (T, C), of `joint` (T, 1).
-    fired: chart -> bool, likewise.
+    fired: chart -> bool, likewise: the score rises above its threshold.
+    above: bool (T,), some score is.
+    known: bool (T,), the sample is judged.
   """
 
   residuals: np.ndarray
   scores: dict[str, np.ndarray]
   fired: dict[str, np.ndarray]
+  above: np.ndarray
+  known: np.ndarray
 
 
 def watch(own: Watch, xs: np.ndarray) -> Found:
   """Of a log (T, C), in which missing samples are nan; nothing is judged where too many are."""
+  return _watch(own, xs) if xs.size <= LARGE else _in_parts(own, xs)
+
+
+def _watch(own: Watch, xs: np.ndarray) -> Found:
   z = healthy.standard(own.model, healthy.held(xs))
   residuals = healthy.judged(healthy.residuals(own.model, z), xs, own.model.held)
   scores = charts.scores(residuals, own.scales)
   fired = {name: charts.alarms(x, own.thresholds[name]) for name, x in scores.items()}
-  return Found(residuals, scores, fired)
+  above = [(x > own.thresholds[name]).any(1) for name, x in scores.items()]
+  known = healthy.known(xs, own.model.held)
+  return Found(residuals, scores, fired, np.any(above, 0), known)
+
+
+def _in_parts(own: Watch, xs: np.ndarray, rows: int = ROWS, kind: Any = np.float16) -> Found:
+  """`watch` of `rows` rows at a time, each with so many before it that no average knows the
+  difference; residuals and scores are kept as `kind`.
+  """
+  warm = WARM * max(SPANS[-1], own.model.slow if own.model.drifts.any() else 0)
+  total, columns = xs.shape
+  size = {name: 1 if name == "joint" else columns for name in CHARTS}
+  found = Found(
+    np.empty((2, total, columns), kind),
+    {name: np.empty((total, n), kind) for name, n in size.items()},
+    {name: np.empty((total, n), bool) for name, n in size.items()},
+    np.empty(total, bool),
+    np.empty(total, bool),
+  )
+  for begin in range(0, total, rows):
+    from_ = max(0, begin - warm)
+    part = _watch(own, np.ascontiguousarray(xs[from_ : begin + rows], np.float64))
+    at, new = slice(begin, begin + rows), slice(begin - from_, None)
+    found.residuals[:, at] = part.residuals[:, new]
+    for name in CHARTS:
+      found.scores[name][at] = np.minimum(part.scores[name][new], TOP)
+      found.fired[name][at] = part.fired[name][new]
+    found.above[at], found.known[at] = part.above[new], part.known[new]
+  return found
 
 
 def cross_validated(own: Watch, arl0: float) -> tuple[int, float]:
@@ -179,15 +219,13 @@ def judge(own: Watch, found: Found, names: list[str], refractory: int) -> list[d
     (events as clear in a healthy log of this length), believed and columns.
   """
   samples = len(found.residuals[0])
-  above = np.zeros(samples, bool)
-  for name, score in found.scores.items():
-    above |= (score > own.thresholds[name]).any(1)
   events = []
-  for at in _events(np.flatnonzero(above), refractory):
+  for at in _events(np.flatnonzero(found.above), refractory):
     within = slice(at[0], at[-1] + 1)
     expected, strongest = np.inf, ("joint", 0)
     for name in CHARTS:
-      rates = own.tails[name].expected(found.scores[name][within], samples).min(0)
+      highest = found.scores[name][within].max(0).astype(float)
+      rates = own.tails[name].expected(highest, samples)
       if rates.min() < expected:
         expected, strongest = float(rates.min()), (name, int(rates.argmin()))
     chart, c = strongest

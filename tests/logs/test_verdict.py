@@ -170,6 +170,64 @@ def test_the_chunks_of_a_prediction_change_nothing(watched, monkeypatch):
   np.testing.assert_allclose(healthy.residuals(own.model, z), want, atol=1e-9)
 
 
+@pytest.mark.parametrize("slow", [False, True])
+def test_a_log_watched_in_parts_gives_the_same(watched, monkeypatch, slow):
+  """Parts that begin and end in a stretch of missing samples too; with a drifting column the part
+  before is longer. Kept in 16 bits it is the same to their precision.
+  """
+  _, own = watched
+  assert own.model.drifts.any()
+  if not slow:
+    own = own._replace(model=own.model._replace(drifts=np.zeros(len(NAMES), bool)))
+  else:
+    own = own._replace(model=own.model._replace(slow=150))
+  x = gait(21_000, 7)
+  x[6900:7100, 0] = np.nan
+  x[15_000:, 1] += 1.0
+  want = verdict._watch(own, x)
+  got = verdict._in_parts(own, x, 7000, np.float64)
+  np.testing.assert_allclose(got.residuals, want.residuals, atol=1e-9)
+  for name in want.scores:
+    np.testing.assert_allclose(got.scores[name], want.scores[name], rtol=1e-6, atol=1e-9)
+    np.testing.assert_array_equal(got.fired[name], want.fired[name])
+  np.testing.assert_array_equal(got.above, want.above)
+  monkeypatch.setattr(verdict, "LARGE", 1000)
+  small = verdict.watch(own, x.astype(np.float32))
+  assert small.residuals.dtype == np.float16
+  events = [
+    [e for e in verdict.judge(own, found, NAMES, 500) if e["believed"]] for found in (want, small)
+  ]
+  assert events[0] and len(events[0]) == len(events[1])
+  for one, other in zip(*events):
+    assert abs(one["begin"] - other["begin"]) <= 5
+    assert [c["column"] for c in one["columns"]] == [c["column"] for c in other["columns"]]
+
+
+def test_a_long_nominal_log_is_used_in_five_stretches(monkeypatch, tmp_path):
+  monkeypatch.setattr(healthy, "MOST", 5000 * len(NAMES))
+  past = gait(12_000, 3)
+  used, at = healthy.thinned(past)
+  assert (at >= 0).sum() == 5000 and len(used) == len(at)
+  np.testing.assert_array_equal(used[at >= 0], past[at[at >= 0]])
+  assert np.isnan(used[at < 0]).all()
+  joints = np.flatnonzero(np.diff(at[at >= 0]) > 1)
+  assert len(joints) == healthy.FOLDS - 1
+  # nothing is judged whose lags reach across a joint
+  own = verdict.calibrated(used, 10_000)
+  firsts = np.flatnonzero((at >= 0) & (np.r_[0, at[:-1]] < 0))
+  assert len(firsts) == healthy.FOLDS - 1
+  assert np.isnan(own.unseen[:, firsts[:, None] + np.arange(16)]).all()
+  assert np.isfinite(own.unseen[:, firsts + 17]).all()
+  now = gait(6000, 8)
+  now[3000:, 1] += 1.0
+  save(tmp_path / "past.csv", past)
+  save(tmp_path / "now.csv", now)
+  said = detect.detect(tmp_path / "now.csv", tmp_path / "past.csv")
+  assert said.summary["verdict"]["changed"] and len(said.before["level"]) == len(past)
+  assert abs(said.summary["verdict"]["begin"] - 3000) <= 5
+  assert any("5,000 are used, in 5 stretches" in note for note in said.summary["notes"])
+
+
 def test_missing_samples_are_neither_high_nor_low(watched):
   """A stretch is not judged, in no column, until the longest lag has passed it; a few here and there
   are held.
