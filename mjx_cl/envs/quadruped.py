@@ -398,7 +398,7 @@ class Quadruped:
     clear = jnp.clip((foot[:, 2] - anymal.FOOT_RADIUS) / LIFT, 0.0, 1.0)
     lift = jnp.sum(jnp.where(up, clear, 0.0)) / jnp.maximum(jnp.sum(up), 1)
     lf, rf, lh, rh = up
-    pairs = ((lf == rh) + (rf == lh) + 1.0 * (lf != rf) + (lh != rh)) / 4
+    pairs = jnp.mean(jnp.array([lf == rh, rf == lh, lf != rf, lh != rh], jnp.float32))
     moving = jnp.sum(before.physics.command**2) > 0.1**2
     height = jnp.exp(-(((p.qpos[2] - HEIGHT) / 0.08) ** 2))
     return (jnp.where(moving, pairs + lift, 2.0) + height) / 3

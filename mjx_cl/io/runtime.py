@@ -17,6 +17,7 @@ import subprocess
 import sys
 from typing import Any
 
+from mjx_cl import BENCHMARK
 from mjx_cl.io import limits
 
 # gc's thresholds where nobody has set others: up to Python 3.11, and from 3.12 on
@@ -186,8 +187,11 @@ PACKAGES = (
 
 
 def provenance() -> dict[str, Any]:
-  """Versions, machine and commit of this process, for config.json; cores: those that it may use."""
+  """Versions, machine and commit of this process, for config.json; cores: those that it may use;
+  benchmark: version of suites, recordings and scores.
+  """
   return {
+    "benchmark": BENCHMARK,
     "versions": {name: _version(name) for name in PACKAGES},
     "python": platform.python_version(),
     "git_commit": _commit(),

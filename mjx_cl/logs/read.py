@@ -154,6 +154,7 @@ def _large(path: pathlib.Path | str) -> Log | None:
   for name, part in zip(names, parts):
     columns[name] = _finite(np.concatenate([x.to_numpy(zero_copy_only=False) for x in part]))
     part.clear()  # a column at a time: no file is held twice
+  pyarrow.default_memory_pool().release_unused()
   return _timed(path, columns, {}, {name: name for name in names}, {}, [])
 
 

@@ -104,7 +104,7 @@ def differing(old: dict, values: dict) -> list[str]:
   if isinstance(old.get("adapt"), dict):
     old = old | {"adapt": {**dataclasses.asdict(AdaptConfig()), **old["adapt"]}}
   defaults = {f.name: f.default for f in dataclasses.fields(RunConfig)}
-  defaults["changes"] = values.get("changes")  # nor did they always exist
+  defaults |= {"changes": values.get("changes"), "benchmark": 1}  # nor did these always exist
   changed = folders.differing(old, values, ("git_commit", "machine", "python"), defaults)
   return changed + ["threshold"] * ("threshold" in old and "threshold" not in values)
 

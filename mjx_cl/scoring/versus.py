@@ -64,6 +64,13 @@ def variants(words: list[str]) -> list[Variant]:
   robots = {str(one.config.get("env")) for one in found}
   if len(robots) > 1:
     raise UserError(f"runs of different robots cannot be compared: {', '.join(sorted(robots))}")
+  # 1 is what a run has that is older than the versions
+  versions = {str(one.config.get("benchmark", 1)) for one in found}
+  if len(versions) > 1:
+    raise UserError(
+      f"runs of versions {', '.join(sorted(versions))} of the benchmark cannot be compared; run the "
+      "older one anew"
+    )
   return found
 
 

@@ -1023,3 +1023,31 @@ def test_parity_of_100_steps_without_contact(pair):
   position, speed = found[-1][:2]
   assert np.median(position) < 2e-4 and position.max() < 6e-4  # measured: 1.3e-5, largest 5.3e-5
   assert np.median(speed) < 6e-5 and speed.max() < 3e-4  # measured: 5.7e-6, largest 2.2e-5
+
+
+def test_shaping_asks_for_a_trot(native):
+  """Against hand sums: which feet are up, how far, how high the base."""
+  env = native.env
+  first = jax.tree.map(lambda x: x[0], native.fresh)
+  moving = first._replace(physics=first.physics._replace(command=jnp.array([0.5, 0.0, 0.0])))
+  still = first._replace(physics=first.physics._replace(command=jnp.zeros(3)))
+
+  def earned(air, height=0.55, before=moving, qpos=None):
+    qpos = pose(height=height)[0] if qpos is None else qpos
+    state = moving._replace(
+      physics=moving.physics._replace(air=jnp.array(air), qpos=jnp.asarray(qpos))
+    )
+    return float(env.shaping(before, state))
+
+  foot = float(anymal.leg_points(jnp.asarray(pose(height=0.55)[0]))[0][0, 2]) - anymal.FOOT_RADIUS
+  lift = min(foot / 0.05, 1.0)
+  assert 0 < lift < 1
+  trot, pace, four = [0.1, 0, 0, 0.1], [0.1, 0, 0.1, 0], [0, 0, 0, 0]  # LF, RF, LH, RH
+  assert earned(trot) == pytest.approx((1 + lift + 1) / 3, abs=1e-5)
+  assert earned(pace) == pytest.approx((0.5 + lift + 1) / 3, abs=1e-5)  # no diagonal is alike
+  assert earned(four) == pytest.approx((0.5 + 0 + 1) / 3, abs=1e-5)  # the diagonals are alike
+  # a foot that is held up counts as none
+  assert earned([0.5, 0, 0, 0.5]) == pytest.approx(earned(four), abs=1e-6)
+  low = earned(four, 0.47)
+  assert low == pytest.approx((0.5 + np.exp(-1.0)) / 3, abs=1e-5)
+  assert earned(four, before=still) == pytest.approx(1.0, abs=1e-5)

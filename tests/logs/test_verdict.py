@@ -203,6 +203,16 @@ def test_a_log_watched_in_parts_gives_the_same(watched, monkeypatch, slow):
     assert [c["column"] for c in one["columns"]] == [c["column"] for c in other["columns"]]
 
 
+def test_what_float32_would_round_stays_float64(monkeypatch):
+  monkeypatch.setattr(verdict, "LARGE", 1000)
+  x = np.random.default_rng(0).normal(size=2000)
+  log = lambda offset: reading.Log(
+    {"a": x + offset, "b": x.copy()}, None, None, {}, (), {}, ()
+  )  # fmt: skip
+  for offset, kind in ((100.0, np.float32), (1e6, np.float64)):
+    assert detect._samples(log(offset), ["a", "b"], "log.csv", False).dtype == kind
+
+
 def test_a_long_nominal_log_is_used_in_five_stretches(monkeypatch, tmp_path):
   monkeypatch.setattr(healthy, "MOST", 5000 * len(NAMES))
   past = gait(12_000, 3)

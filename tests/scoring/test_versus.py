@@ -53,6 +53,17 @@ def test_arms_of_one_run_by_hand(tmp_path):
   assert same["difference"] == 0 and same["difference_ci"] == [0, 0]
 
 
+def test_versions_of_the_benchmark_are_not_mixed(tmp_path, mjx):
+  """A run that says none is of the first."""
+  runs = [run_of(tmp_path / name, {"detector": [1.0, 1.2]}) for name in "abc"]
+  for folder, version in zip(runs[1:], (1, 2)):
+    config = tables.read_json(folder / "config.json")
+    tables.write_json(folder / "config.json", config | {"benchmark": version})
+  assert len(versus.variants([str(runs[0]), str(runs[1])])) == 2
+  code, _, err = mjx(runs[0], runs[2])
+  assert code and "versions 1, 2 of the benchmark cannot be compared" in err
+
+
 def test_less_of_a_loss_is_better(tmp_path):
   run = run_of(tmp_path / "a", {"detector": [1.0, 1.0], "none": [1.0, 1.0]})
   one, two = versus.variants([str(run)])

@@ -780,6 +780,23 @@ def test_penalties_are_eased_and_nothing_else(short_walker, tmp_path):
     make_trainer(short_walker, tmp_path, penalties=0.5)
 
 
+def test_shaping_is_added_to_the_reward_and_to_nothing_else(short_walker, tmp_path):
+  """Of a robot that has terms of its own; others refuse."""
+  robot = envs.make("quadruped")
+  shaped = premises.shaped(robot, 0.5)
+  state, _ = robot.init(robot.model, jax.random.key(0))
+  action = jnp.full(12, 0.1)
+  (after, plain), (other, more) = (e.step(e.model, state, action) for e in (robot, shaped))
+  want = plain.reward + 0.5 * robot.shaping(state, after)
+  assert float(more.reward) == pytest.approx(float(want), abs=1e-6) != float(plain.reward)
+  same = lambda a, b: np.testing.assert_array_equal(np.asarray(a), np.asarray(b))
+  same(other.physics.qpos, after.physics.qpos)
+  same(more.obs, plain.obs)
+  assert premises.shaped(robot, 0.0) is robot
+  with pytest.raises(UserError, match="no shaping terms"):
+    make_trainer(short_walker, tmp_path, shaping=0.5)
+
+
 def test_the_policy_is_held_at_the_start_of_the_pure_phase(short_walker, tmp_path):
   """Without its own gradient for the first `hold` updates; the anchor takes the robots' own actions
   for right, so no random ones may be among them.
