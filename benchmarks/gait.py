@@ -1,8 +1,10 @@
 """How a quadruped walks at each commanded pace: python benchmarks/gait.py [--agent quadruped]
-[--out results/quadruped_agent/gait.json]
+[--fault velocity_limit --target RH --severity 0 0.5 0.7018] [--out gait.json]
 
-Healthy robots are told to walk straight ahead at one pace, 20 s each, from seed 0 on. By pace:
+Robots are told to walk straight ahead at one pace, 20 s each, healthy or with a fault from the start
+on, with a frozen agent. By severity and pace:
 
+  reward              mean of a step, up to the end of an episode
   velocity_error_m_s  mean of |v_xy - command|, the first second left out
   fall_share          robots whose base touches the ground within the 20 s, with Wilson's interval
   base_height_m       mean height of the base's frame (standing in the stance: 0.56)
@@ -48,12 +50,12 @@ def ahead(env, pace: float):
   return env
 
 
-def walk(env, trained, robots: int, seed: int) -> dict[str, np.ndarray]:
+def walk(env, trained, fault, target, severity, robots: int, seed: int) -> dict[str, np.ndarray]:
   """One episode each; arrays (steps, robots, ...), and `alive`, false from a robot's end on."""
-  fault = faults.make("none", env)
+  at = faults.target_index(fault, target)
   rollout = Rollout(env, trained.agent, fault, trained.repeat)
   keys = jnp.stack([jax.random.key(seed + i) for i in range(robots)])[None]
-  streams = nest(lambda k: start(env, trained.agent, fault, k), 0, 0)(keys)
+  streams = nest(lambda k: start(env, trained.agent, fault, k, severity, target=at), 0, 0)(keys)
   params = jax.tree.map(lambda x: x[None], trained.train.params)
 
   @jax.jit
@@ -74,9 +76,11 @@ def walk(env, trained, robots: int, seed: int) -> dict[str, np.ndarray]:
     streams, rows = rollout.chunk(params, streams, 1, drive)
     ended = np.asarray(rows.terminated | rows.truncated).reshape(robots)
     fallen = np.asarray(rows.terminated).reshape(robots) & alive
+    lives = alive
     alive = alive & ~ended
     seen.append({k: np.asarray(v) for k, v in look(streams.env).items()})
-    seen[-1] |= {"alive": alive, "fallen": fallen}
+    reward = np.asarray(rows.reward).reshape(robots)
+    seen[-1] |= {"alive": alive, "fallen": fallen, "reward": reward, "lives": lives}
   return {k: np.stack([row[k] for row in seen]) for k in seen[0]}
 
 
@@ -109,6 +113,7 @@ def summary(seen: dict[str, np.ndarray]) -> dict[str, object]:
       )  # fmt: skip
   return {
     "robots": int(moving.sum()),
+    "reward": float(seen["reward"][seen["lives"] & moving].mean()),
     "velocity_error_m_s": float(seen["error"][keep].mean()),
     "fall_share": float(fell.sum() / moving.sum()),
     "fall_share_ci": intervals.wilson(int(fell.sum()), int(moving.sum())),
@@ -122,21 +127,32 @@ def summary(seen: dict[str, np.ndarray]) -> dict[str, object]:
 def main(args) -> None:
   env = envs.make("quadruped")
   trained = agents.of(env, args.agent)
-  paces = []
-  for pace in PACES:
-    row = {"pace_m_s": pace} | summary(walk(ahead(env, pace), trained, args.robots, args.seed))
-    paces.append(row)
-    print({k: v if isinstance(v, int) else np.round(v, 3).tolist() for k, v in row.items()})
+  fault, rows = faults.make(args.fault, env), []
+  for severity in args.severity:
+    for pace in PACES:
+      seen = walk(
+        ahead(env, pace), trained, fault, args.target, severity, args.robots, args.seed
+      )  # fmt: skip
+      rows.append({"severity": severity, "pace_m_s": pace} | summary(seen))
+      print({k: v if isinstance(v, int) else np.round(v, 3).tolist() for k, v in rows[-1].items()})
   if args.out:
     tables.write_json(
       args.out,
-      {"command": " ".join(["python", *sys.argv]), "paces": paces, **runtime.provenance()},
+      {
+        "command": " ".join(["python", *sys.argv]),
+        "agent": trained.card.get("command", args.agent),
+        "paces": rows,
+        **runtime.provenance(),
+      },
     )
 
 
 if __name__ == "__main__":
   parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
   parser.add_argument("--agent", default="quadruped")
+  parser.add_argument("--fault", default="none")
+  parser.add_argument("--target")
+  parser.add_argument("--severity", type=float, nargs="+", default=[0.0])
   parser.add_argument("--robots", type=int, default=24)
   parser.add_argument("--seed", type=int, default=0)
   parser.add_argument("--out")

@@ -6,9 +6,9 @@ that tune. A log holds what the robot sees and does, observation and action, a c
 nominal log is of healthy robots of other seeds, a life after the other. The first 2.5 s of an
 episode are missing in every log, since a robot that is dropped on its feet is no fault. The charts
 are set to one false alarm in as many samples as the board's detectors, all three together; what
-they give, alarms within 10 s as one, is counted on healthy robots of still other seeds. Found: an alarm within 5 s of the
-onset. Beside it the same share of detectors that watch the world model's residuals, of the same
-faults on seeds 0 to 9 (results/leaderboard.parquet).
+they give, alarms within 10 s as one, is counted on healthy robots of still other seeds. Found: an
+alarm within 5 s of the onset. Beside it the same share of detectors that watch the world model's
+residuals, of the same faults on seeds 0 to 9 (results/leaderboard.parquet).
 """
 
 from __future__ import annotations

@@ -1567,6 +1567,63 @@ def two_agents(results: pathlib.Path) -> str:
   )
 
 
+def raw_logs(results: pathlib.Path) -> str:
+  """What `detect` finds in raw logs, beside detectors of the world model's residuals."""
+  rows, shown = [], ("learnt", "multichart", "cusum")
+  for own in load(results / "raw_logs.json")["robots"]:
+    rows.append(
+      (
+        f"`{own['robot']}`",
+        number(own["columns"]),
+        number(own["streams"]),
+        f"{percent(own['found'])} {percents(own['found_ci'])}",
+        f"1 in {number(own['false_alarm_in'])} ({own['false_alarms']} seen)",
+        *(percent(own["board"][name]) for name in shown),
+      )
+    )
+  head = ("robot", "columns", "faulty logs", "`detect` finds [%]", "its false alarms, in samples")
+  return grid((*head, *(f"`{name}` [%]" for name in shown)), rows)
+
+
+def long_logs(results: pathlib.Path) -> str:
+  """Time and memory of `detect` on an hour at 1 kHz."""
+  rows = [
+    (
+      one["kind"],
+      number(one["file_gb"], 1),
+      number(one["wall_s"]),
+      number(one["peak_gb"] * 1e9 / 2**30, 1),
+    )
+    for one in load(results / "long_log.json")["logs"]
+  ]
+  return grid(("file", "size [GB]", "time [s]", "most memory [GiB]"), rows)
+
+
+def gait(results: pathlib.Path) -> str:
+  """How the quadruped's agents walk at each pace."""
+  rows = []
+  for folder, name in (("quadruped_agent", "quadruped"), ("quadruped_trot_agent", "quadruped-trot")):
+    for own in load(results / folder / "gait.json")["paces"]:
+      rows.append(
+        (
+          f"`{name}`",
+          number(own["pace_m_s"], 2),
+          number(own["reward"], 2),
+          number(own["velocity_error_m_s"], 2),
+          f"{percent(own['fall_share'])} {percents(own['fall_share_ci'])}",
+          number(own["base_height_m"], 2),
+          number(100 * own["lift_m"], 1),
+          number(own["diagonal"], 2),
+          number(own["lateral"], 2),
+        )
+      )
+  head = (
+    "agent", "pace [m/s]", "reward a step", "off the pace [m/s]", "fall in 20 s [%]",
+    "height of the base [m]", "lift of a foot [cm]", "diagonal feet", "feet of a side",
+  )  # fmt: skip
+  return grid(head, rows)
+
+
 def gradient(results: pathlib.Path) -> str:
   """What the imagined policy gradient promises, and what the robot earns along it."""
   agents_ = load(results / "policy_gradient.json")["agents"]
@@ -1765,6 +1822,9 @@ BLOCKS = {
   "in-loop": in_loop,
   "two-agents": two_agents,
   "gradient": gradient,
+  "raw-logs": raw_logs,
+  "long-logs": long_logs,
+  "gait": gait,
   "quadruped": quadruped,
   "ppo": ppo,
 }

@@ -100,6 +100,9 @@ SOURCES = {
   ),
   "two-agents": ("walker_gear/summary.json", "walker_plain/summary.json"),
   "gradient": ("policy_gradient.json",),
+  "raw-logs": ("raw_logs.json",),
+  "long-logs": ("long_log.json",),
+  "gait": ("quadruped_agent/gait.json", "quadruped_trot_agent/gait.json"),
   "quadruped": (
     "quadruped_agent/finetuning/none/config.json",
     *(f"quadruped_agent/finetuning/{run}/curve.json" for run in ("none", "expert")),
