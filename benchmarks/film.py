@@ -35,6 +35,8 @@ class Film(NamedTuple):
     learn: flags of the run that learns.
     file: below docs.
     look: arguments of `compare.film`.
+    env: robot of all three; "": that of the film's name.
+    agent: of the first two; None: the shipped one.
   """
 
   fault: dict
@@ -47,6 +49,8 @@ class Film(NamedTuple):
   learn: str
   file: str
   look: dict = {}
+  env: str = ""
+  agent: str | None = None
 
 
 FILMS = {
@@ -62,15 +66,19 @@ FILMS = {
     "film.gif",
   ),
   "quadruped": Film(
-    {"fault": "quadruped/rh-velocity-third"},
+    {"fault": "velocity_limit", "target": "RH", "severity": 0.7018},
     "",
     ("right hind leg at a third of its speed", "same weak leg, after learning"),
     "RH",
-    4,
+    100,
     100,
     300,
-    "--fault quadruped/rh-velocity-third --onset 3000 --steps 16000 --arm oracle --first-seed 4",
+    "--fault velocity_limit --target RH --severity 0.7018 --onset 2000 --steps 16000 "
+    "--arm oracle --first-seed 100 --agent quadruped-trot",
     "film_quadruped.gif",
+    {"fps": 10, "width": 200, "height": 168},
+    f"{ROOT / 'benchmarks/steady.py'}:Steady",
+    "quadruped-trot",
   ),
   "car": Film(
     {},
@@ -91,7 +99,9 @@ def learn(robot: str, work: pathlib.Path) -> pathlib.Path:
   """Lets two robots break and adapt; the folder of what the first has learnt."""
   flags = f"{FILMS[robot].learn} --seeds 2 --keep"
   subprocess.run(
-    [sys.executable, "-m", "mjx_cl", "run", robot, *flags.split(), "--out", str(work)], check=True
+    [sys.executable, "-m", "mjx_cl", "run", FILMS[robot].env or robot, *flags.split()]
+    + ["--out", str(work)],
+    check=True,
   )
   kept = sorted(work.glob("agents/*-*"))
   if not kept:
@@ -132,9 +142,9 @@ def draw(robot: str, agent: pathlib.Path, out: pathlib.Path, **changes) -> dict:
   from mjx_cl.training import agents
 
   film = FILMS[robot]
-  env = envs.make(robot)
+  env = envs.make(film.env or robot)
   broken = envs.make(film.becomes) if film.becomes else env
-  own, learnt = agents.of(env, None), agents.of(broken, str(agent))
+  own, learnt = agents.of(env, film.agent), agents.of(broken, str(agent))
   acts = lambda trained: {
     "agent": trained.agent,
     "params": trained.train.params,
@@ -172,7 +182,7 @@ def main() -> None:
     if not args.learn and not agent.is_dir():
       raise SystemExit(f"film: no {robot} has learnt yet what is shown; give --learn")
     if args.learn:
-      env = envs.make(FILMS[robot].becomes or robot)
+      env = envs.make(FILMS[robot].becomes or FILMS[robot].env or robot)
       light(env, learn(robot, pathlib.Path(args.work) / robot), agent)
     changes = {} if args.seed is None else {"seed": args.seed}
     said = draw(robot, agent, ROOT / "docs" / FILMS[robot].file, **changes)

@@ -44,7 +44,7 @@ from mjx_cl.cli.flags import (
 )
 from mjx_cl.cli.output import apart, printable, say
 from mjx_cl.config import FaultConfig, quick
-from mjx_cl.errors import FileError, PluginError, UserError
+from mjx_cl.errors import FileError, PluginError, UserError, choose
 from mjx_cl.io import folders, interrupt, limits, plugins, runtime
 from mjx_cl.io.interrupt import Interruptible, Lasting
 
@@ -104,6 +104,8 @@ def parse(argv: list[str] | None) -> Any:
       word.encode()
     except UnicodeEncodeError:  # result files say how they were made, as UTF-8
       raise UserError(f"an argument is no UTF-8 text: {word}") from None
+  if argv and not argv[0].startswith("-"):
+    choose("command", argv[0], {kind.__name__.lower(): kind for kind in COMMANDS})
   about = "Robots that notice a fault, adapt to it and know when they are done."
   command = read(Command, argv, prog="mjx-cl", args=argv or ["--help"], description=about)
   return quickly(command, argv[1:]) if isinstance(command, Run) and command.quick else command
@@ -142,9 +144,25 @@ def read(kind: Any, argv: list[str], **how: Any) -> Any:
       for line in lines
       if line and not re.match(r"^[╭╰─]", line) and not line.startswith("For full helptext")
     ]
-    raise UserError(
-      re.sub(r"\s+", " ", " ".join(words)) or "wrong arguments; see mjx-cl --help"
-    ) from None
+    said = re.sub(r"\s+", " ", " ".join(words))
+    raise UserError(_mistake(said, argv) or "wrong arguments; see mjx-cl --help") from None
+
+
+def _mistake(said: str, argv: list[str]) -> str:
+  """What tyro says of a mistake, without its excerpts of the help."""
+  command = " ".join(["mjx-cl", *(word for word in argv[:1] if not word.startswith("-"))])
+  if found := re.match(
+    r"Unrecognized options: (.*?)(?: Available .*)?(?: Perhaps you meant: (--[\w.-]+).*)?$", said
+  ):
+    words = found[1].split(", ")
+    flags = [word for word in words if word.startswith("-")] or words
+    meant = f"; did you mean {found[2]}?" if found[2] and len(flags) == 1 else ""
+    return f"unknown argument of {command}: {', '.join(flags)}{meant}; see {command} --help"
+  if re.match(r"Missing from ", said) and (
+    flags := re.findall(r"(--[\w.-]+) [^()]*\(required\)", said)
+  ):
+    return f"{command} needs {', '.join(flags)}; see {command} --help"
+  return said
 
 
 def attempt(do: Callable[[], object], again: Callable[[], str] = lambda: "") -> int:

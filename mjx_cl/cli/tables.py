@@ -246,7 +246,9 @@ def show_verdict(summary: dict) -> None:
       f"healthy log of this length: {chance}"
     )
   if not believed:
-    print("no change that a healthy log of this length would not show as well")
+    names = summary["columns"]
+    which = ", ".join(names) if len(names) <= 8 else f"{len(names)} columns"
+    print(f"no change in {which} that a healthy log of this length would not show as well")
   if doubted:
     print(f"{doubted} more alarm{'s' * (doubted > 1)} of a kind that a healthy log shows as well")
   alarms = summary["false_alarms"]

@@ -3,6 +3,7 @@ of a file, path/to/file.py:Name.
 """
 
 import collections
+import difflib
 import functools
 import hashlib
 import importlib
@@ -170,7 +171,11 @@ def find(source: str, kind: str) -> Callable:
     raise PluginError(f"{kind} {source}: importing {where} failed: {line(e)}") from None
   found = getattr(module, name, None)
   if not callable(found):
-    raise UserError(f"{kind} {source}: {where} has nothing of the name {name!r} that can be called")
+    like = difflib.get_close_matches(name, [k for k, v in vars(module).items() if callable(v)], 1)
+    meant = f"; did you mean {like[0]!r}?" if like else ""
+    raise UserError(
+      f"{kind} {source}: {where} has nothing of the name {name!r} that can be called{meant}"
+    )
   return found
 
 

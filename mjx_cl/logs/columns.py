@@ -1,5 +1,6 @@
 """Which columns of a log can be watched."""
 
+import difflib
 import pathlib
 
 import numpy as np
@@ -141,7 +142,9 @@ def _left_out(
   for (one, at), (other, _) in zip(files, files[::-1]):
     for name in other.labels:
       if name not in one.labels:
-        reasons.setdefault(name, f"missing in {at}")
+        like = difflib.get_close_matches(name, [n for n in one.labels if n not in other.labels], 1)
+        has = f", which has {like[0]}" if like else ""
+        reasons.setdefault(name, f"missing in {at}{has}")
   for one, at in files:
     for name, (line, cell) in one.ignored.items():
       reasons.setdefault(name, f"line {line} of {at} holds {cell!r}")

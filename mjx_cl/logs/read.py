@@ -31,6 +31,7 @@ from mjx_cl.logs.clocks import (
 from mjx_cl.logs.mcap_file import read_mcap
 
 LARGE = 2_000_000  # bytes from which a file is given to pyarrow's reader first
+STRAY = 0.01  # share of a column's cells that may be no numbers, and are missing then
 BLOCK = 4_000_000  # bytes of it that are parsed at a time
 
 
@@ -63,12 +64,13 @@ def read(path: pathlib.Path | str) -> Log:
 
   The separator is the comma, or where the header has none the semicolon or the tabulator; then
   numbers may have a decimal comma, if most that have a fraction do: one sign for the whole file, a
-  cell with the other is no number. A second row without a number above columns of numbers is taken
-  for units. A column `time` [s] or `step` tells when samples were taken and is not watched; a
+  cell with the other is no number. A column with no more than STRAY of such cells has them missing
+  and is noted, one with more is left out. A second row without a number above columns of numbers is
+  taken for units. A column `time` [s] or `step` tells when samples were taken and is not watched; a
   column of seconds by another name (`time_s`, `seconds`) is taken as `time` if there is none and it
-  rises throughout. A first column without a name, among others, is called `index`. A column with a
-  cell that is no number is left out. Where nothing else tells times, a column of time stamps does:
-  ISO 8601, or seconds, ms, us or ns since 1970; gaps and repeated ones are noted.
+  rises throughout. A first column without a name, among others, is called `index`. Where nothing
+  else tells times, a column of time stamps does: ISO 8601, or seconds, ms, us or ns since 1970;
+  gaps and repeated ones are noted.
   """
   with contextlib.suppress(OSError):  # whoever opens it says what is wrong
     mode = os.stat(path).st_mode
@@ -109,11 +111,15 @@ def read(path: pathlib.Path | str) -> Log:
   for name, column in zip(names, zip(*(row for _, row in cells)) if cells else [()] * len(names)):
     values: Any = [_number(cell, comma) for cell in column]
     if None in values:
-      first = values.index(None)
-      ignored[name] = cells[first][0], column[first]
-    else:
-      values = np.array(values, np.float64)
-      columns[name] = np.where(np.isfinite(values), values, np.nan)
+      first, wrong = values.index(None), values.count(None)
+      if wrong > STRAY * len(values):
+        ignored[name] = cells[first][0], column[first]
+        continue
+      notes.append(
+        f"{path}: {wrong} cell{'s' * (wrong > 1)} of column {name} hold{'s' * (wrong == 1)} no "
+        f"number, the first {column[first]!r} in line {cells[first][0]}; read as missing"
+      )
+    columns[name] = _finite(np.array(values, np.float64))
   stamps = {}
   for k, name in enumerate(names):
     if name in ignored:
@@ -180,7 +186,8 @@ def _timed(
   for name in clocks:
     told[told_by_name(name, labels[name])] = at = columns.pop(name)
     if len(at) and not throughout(at):
-      raise FileError(f"{path}: column {name} must rise from row to row and have no gap")
+      why = "".join(f"; {note}" for note in notes if f" column {name} " in note)
+      raise FileError(f"{path}: column {name} must rise from row to row and have no gap{why}")
   seconds = (
     {name: x for name, x in columns.items() if of_seconds(labels[name])}
     if "time" not in told

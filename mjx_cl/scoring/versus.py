@@ -68,8 +68,8 @@ def variants(words: list[str]) -> list[Variant]:
   versions = {str(one.config.get("benchmark", 1)) for one in found}
   if len(versions) > 1:
     raise UserError(
-      f"runs of versions {', '.join(sorted(versions))} of the benchmark cannot be compared; run the "
-      "older one anew"
+      f"runs of versions {', '.join(sorted(versions))} of the benchmark cannot be compared; run "
+      "the older one anew"
     )
   return found
 

@@ -355,7 +355,7 @@ def test_a_clock_is_known_by_its_even_steps(tmp_path):
 def test_each_column_left_out_is_said(tmp_path):
   flat, words = np.full(300, 3.0), ["walk"] * 299 + ["run"]
   broken = [f"{x:.3g}" for x in noise(300)]
-  broken[120] = "oops"
+  broken[120:124] = ["oops"] * 4  # more than a hundredth
   same = {"a": noise(300), "mode": words}
   nan, few = np.full(300, np.nan), np.where(np.arange(300) < 99, noise(300), np.nan)
   found, notes = chosen(

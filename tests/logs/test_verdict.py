@@ -478,6 +478,28 @@ def test_a_parquet_log_is_the_csv_log(tmp_path, logs):
     detect.detect(logs[0], logs[2], model="tree")
 
 
+def test_a_stray_cell_is_a_missing_sample(logs, tmp_path):
+  """The fault in the very column that holds it is found all the same; a verdict names its columns."""
+  lines = pathlib.Path(logs[0]).read_text().splitlines()
+  cells = lines[500].split(",")
+  at = 1 + NAMES.index("hip_encoder")
+  lines[500] = ",".join([*cells[:at], "ERR", *cells[at + 1 :]])
+  path = tmp_path / "stray.csv"
+  path.write_text("\n".join(lines) + "\n")
+  got = read(path)
+  assert np.flatnonzero(np.isnan(got.columns["hip_encoder"])).tolist() == [499] and not got.ignored
+  assert any(
+    "1 cell of column hip_encoder holds no number, the first 'ERR' in line 501" in n
+    for n in got.notes
+  )
+  said = detect.detect(path, logs[2]).summary["verdict"]
+  assert said["changed"] and "hip_encoder" in [c["column"] for c in said["columns"]]
+  lines[10] = ",".join(["abc", *lines[10].split(",")[1:]])
+  path.write_text("\n".join(lines) + "\n")
+  with pytest.raises(FileError, match="column time must rise.*'abc' in line 11"):
+    read(path)
+
+
 @pytest.mark.parametrize("change", ["none", "text", "missing", "short row"])
 def test_a_large_file_is_read_as_a_small_one(tmp_path, monkeypatch, change):
   """By pyarrow's reader where it can be, with the same columns, or the same error."""
