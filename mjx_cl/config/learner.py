@@ -27,6 +27,8 @@ class DreamerConfig:
     lam: Lambda of the returns, in [0, 1].
     lr: Learning rate.
     policy_lr: Factor on the policy's steps; below 1 the world model keeps ahead of the policy.
+    model_lr: Factor on the steps of encoder, dynamics and decoder; 0: they stay, so that the heads
+      learn another reward and nothing moves the latents that the policy reads.
     anchor: Weight of -log policy(a | s) for the actions that the robot itself took, in replayed
       states; holds the policy where learning moves the latents that it reads. 0: off.
     min_std: Least deviation of the policy's actions.
@@ -54,6 +56,7 @@ class DreamerConfig:
   lam: float = 0.95
   lr: float = 4e-5
   policy_lr: float = 1.0
+  model_lr: float = 1.0
   anchor: float = 0.0
   min_std: float = 0.1
   max_std: float = 1.0
@@ -97,7 +100,9 @@ class DreamerConfig:
       f"last_starts must be 0, or lie in 2..length={self.length}; got {self.last_starts}",
     )
     positive(self, "agc", "range_rate", "slow_rate")
-    not_below_0(self, "anchor", "warmup", "entropy", "free_nats", "rep_scale", "repval_scale")
+    not_below_0(
+      self, "anchor", "model_lr", "warmup", "entropy", "free_nats", "rep_scale", "repval_scale"
+    )
     fraction(self, "lam")
     require(self.bins % 2, f"bins must be odd; got {self.bins}")
 

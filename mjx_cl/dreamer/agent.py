@@ -265,6 +265,9 @@ class Agent(Networks):
     )
     steps, opt = self.optimizer.update(grads, state.opt, state.params)
     steps = jax.tree.map(lambda x: weights.lr * x, steps)
+    if c.model_lr != 1.0:
+      model = ("enc", "dyn", "dec")
+      steps |= {k: jax.tree.map(lambda x: c.model_lr * x, steps[k]) for k in model}
     if c.policy_lr != 1.0:
       steps = {**steps, "pol": jax.tree.map(lambda x: c.policy_lr * x, steps["pol"])}
     params = optax.apply_updates(state.params, steps)

@@ -580,6 +580,23 @@ def test_policy_lr_scales_the_steps_of_the_policy_alone(plain):
   assert gap(rest(quarter.params), rest(full.params)) < 1e-6
 
 
+def test_model_lr_of_zero_leaves_the_model_and_the_heads_learn(plain):
+  agent, update, state = plain
+  still = Agent(replace(agent.config, model_lr=0.0), agent.obs_size, agent.act_size)
+  state, _, _ = update(state, make_batch(), KEY)
+  full, _, _ = update(state, make_batch(1), KEY)
+  heads, _, _ = quick.jit(still.update)(
+    state, make_batch(1), KEY, jax.tree.map(jnp.float32, Weights())
+  )
+  for name in ("enc", "dyn", "dec"):
+    assert (
+      gap(heads.params[name], state.params[name]) == 0 < gap(full.params[name], state.params[name])
+    )
+  rest = lambda tree: {k: v for k, v in tree.items() if k not in ("enc", "dyn", "dec")}
+  assert gap(rest(heads.params), rest(full.params)) < 1e-6  # float32 rounding of gains near 1
+  assert gap(heads.params["rew"], state.params["rew"]) > 1e-6
+
+
 def trained(update, state, steps=3, **kwargs):
   for i in range(steps):
     state, metrics, _ = update(state, make_batch(i), jax.random.fold_in(KEY, i), **kwargs)
