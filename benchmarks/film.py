@@ -2,6 +2,7 @@
 
   python benchmarks/film.py                       # of each robot in results/film, into docs
   python benchmarks/film.py walker --learn        # results/film/walker anew: minutes, then its film
+  python benchmarks/film.py gaits                 # how the two quadrupeds walk
 
 What the third robot has learnt lies in results/film: the weights that act alone, rounded to eight
 bits of mantissa. With `--learn` robots break and adapt (`mjx-cl run`) and the first that learnt
@@ -35,8 +36,6 @@ class Film(NamedTuple):
     learn: flags of the run that learns.
     file: below docs.
     look: arguments of `compare.film`.
-    env: robot of all three; "": that of the film's name.
-    agent: of the first two; None: the shipped one.
   """
 
   fault: dict
@@ -49,8 +48,6 @@ class Film(NamedTuple):
   learn: str
   file: str
   look: dict = {}
-  env: str = ""
-  agent: str | None = None
 
 
 FILMS = {
@@ -64,21 +61,6 @@ FILMS = {
     300,
     "--fault gear --target right_hip --severity 0.5 --onset 3000 --steps 16000 --arm detector --first-seed 4",
     "film.gif",
-  ),
-  "quadruped": Film(
-    {"fault": "velocity_limit", "target": "RH", "severity": 0.7018},
-    "",
-    ("right hind leg at a third of its speed", "same weak leg, after learning"),
-    "RH",
-    100,
-    100,
-    300,
-    "--fault velocity_limit --target RH --severity 0.7018 --onset 2000 --steps 16000 "
-    "--arm oracle --first-seed 100 --agent quadruped-trot",
-    "film_quadruped.gif",
-    {"fps": 10, "width": 200, "height": 168},
-    f"{ROOT / 'benchmarks/steady.py'}:Steady",
-    "quadruped-trot",
   ),
   "car": Film(
     {},
@@ -99,9 +81,7 @@ def learn(robot: str, work: pathlib.Path) -> pathlib.Path:
   """Lets two robots break and adapt; the folder of what the first has learnt."""
   flags = f"{FILMS[robot].learn} --seeds 2 --keep"
   subprocess.run(
-    [sys.executable, "-m", "mjx_cl", "run", FILMS[robot].env or robot, *flags.split()]
-    + ["--out", str(work)],
-    check=True,
+    [sys.executable, "-m", "mjx_cl", "run", robot, *flags.split(), "--out", str(work)], check=True
   )
   kept = sorted(work.glob("agents/*-*"))
   if not kept:
@@ -142,9 +122,9 @@ def draw(robot: str, agent: pathlib.Path, out: pathlib.Path, **changes) -> dict:
   from mjx_cl.training import agents
 
   film = FILMS[robot]
-  env = envs.make(film.env or robot)
+  env = envs.make(robot)
   broken = envs.make(film.becomes) if film.becomes else env
-  own, learnt = agents.of(env, film.agent), agents.of(broken, str(agent))
+  own, learnt = agents.of(env, None), agents.of(broken, str(agent))
   acts = lambda trained: {
     "agent": trained.agent,
     "params": trained.train.params,
@@ -160,29 +140,48 @@ def draw(robot: str, agent: pathlib.Path, out: pathlib.Path, **changes) -> dict:
   return compare.film(panes, out, film.steps, film.skip, **options)
 
 
+def gaits(out: pathlib.Path) -> dict:
+  """Writes how the two quadrupeds walk, told 0.9 m/s, on healthy legs."""
+  from mjx_cl import envs
+  from mjx_cl.render import compare
+  from mjx_cl.training import agents
+
+  env, panes = envs.make(f"{ROOT / 'benchmarks/steady.py'}:Steady"), []
+  for name, words in (("quadruped", "shuffles"), ("quadruped-trot", "trots")):
+    own = agents.of(env, name)
+    acts = {"agent": own.agent, "params": own.train.params, "repeat": own.repeat}
+    panes.append(compare.Pane(name, words, env, acts))
+  return compare.film(panes, out, 300, 100, seed=4, fps=12.5, width=240, height=200)
+
+
 def main() -> None:
   parser = argparse.ArgumentParser(
     description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
   )
-  parser.add_argument("robots", nargs="*", metavar="ROBOT", help=f"of {', '.join(FILMS)}")
+  parser.add_argument("robots", nargs="*", metavar="ROBOT", help=f"of {', '.join(FILMS)}, gaits")
   parser.add_argument("--learn", action="store_true", help="first learn anew what is shown")
   parser.add_argument("--work", default="runs/film", help="folder of those runs")
   parser.add_argument("--seed", type=int, help="of the robots that are shown")
   args = parser.parse_args()
-  if unknown := set(args.robots) - set(FILMS):
-    parser.error(f"no film of {', '.join(sorted(unknown))}; choose from: {', '.join(FILMS)}")
+  if unknown := set(args.robots) - {*FILMS, "gaits"}:
+    parser.error(f"no film of {', '.join(sorted(unknown))}; choose from: {', '.join(FILMS)}, gaits")
   from mjx_cl.io import runtime
 
   runtime.setup()
   from mjx_cl import envs
 
+  if "gaits" in args.robots:
+    print(gaits(ROOT / "docs/film_gaits.gif"))
+    args.robots.remove("gaits")
+    if not args.robots:
+      return
   home = ROOT / "results/film"
   for robot in args.robots or [name for name in FILMS if (home / name).is_dir()]:
     agent = home / robot
     if not args.learn and not agent.is_dir():
       raise SystemExit(f"film: no {robot} has learnt yet what is shown; give --learn")
     if args.learn:
-      env = envs.make(FILMS[robot].becomes or FILMS[robot].env or robot)
+      env = envs.make(FILMS[robot].becomes or robot)
       light(env, learn(robot, pathlib.Path(args.work) / robot), agent)
     changes = {} if args.seed is None else {"seed": args.seed}
     said = draw(robot, agent, ROOT / "docs" / FILMS[robot].file, **changes)

@@ -33,6 +33,7 @@ def test_short_examples_run(block, tmp_path):
 
 def test_the_first_screen_is_short_and_light():
   assert len(README.split()) <= 1200 and len(re.findall(r"\d[\d,.]*", README)) <= 120
+  assert sum(p.stat().st_size for p in (ROOT / "docs").glob("*.gif")) <= 4.1e6
   assert (ROOT / "docs/film.gif").stat().st_size <= 2e6 and "](docs/film.gif)" in README
 
 
