@@ -14,7 +14,7 @@ class UserError(Exception):
 
 
 class PluginError(UserError):
-  """What goes wrong inside a robot, fault or detector of another package: exit code 1."""
+  """What goes wrong inside a robot, fault, detector or arm of another package: exit code 1."""
 
   exit_code = 1
 

@@ -1,7 +1,8 @@
-"""What is compared: arms of a run. `ARMS` is the one table; a new arm is a line in it.
+"""What is compared: arms of a run. `ARMS` is the one table; a new arm is a line in it, or comes by
+the entry points `mjx_cl.methods` or as FILE.py:make, see `Arms`.
 
-An arm is a set of choices and holds no code of its own: what starts adaptation, what ends it, what
-learns, which weights it starts from, and whether the robot breaks at all. `choices` turns the
+An arm is a set of choices: what starts adaptation, what ends it, the method (what learns, and which
+weights act), which weights it starts from, and whether the robot breaks at all. `choices` turns the
 arms of a run into arrays over its streams, so that one compiled program serves any mix of them.
 Free of JAX, as config.
 """
@@ -10,9 +11,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 from mjx_cl.config import FOREVER, AdaptConfig
-from mjx_cl.errors import UserError
+from mjx_cl.errors import PluginError, UserError
+from mjx_cl.io import plugins
 
 
 @dataclass(frozen=True)
@@ -55,13 +58,9 @@ class Arm:
     about: one line for `mjx-cl list arms`.
     trigger: what starts an adaptation.
     end: what ends it.
-    world_only: the world model learns; actor, critic and all that belongs to them stay as they are.
+    method: a name in methods.METHODS, or a methods.Method of one's own.
     fresh: parameters, moments and counters are drawn anew from the stream's seed at every start.
       The latent that the robot carries runs on.
-    rollback: an adaptation that is aborted leaves the better of two sets of weights, those of
-      before it or those that it learnt, see act.Before.
-    guarded: while an adaptation runs the weights of before it and those that learn act by turns,
-      and the better ones stay, see act.Guard.
     breaks: the robot gets the run's faults; False: their severity is 0.
     agent: what is joined to the name of the run's agent, after a hyphen, to give that of the arm's
       own; "": it is the run's.
@@ -70,10 +69,8 @@ class Arm:
   about: str
   trigger: Trigger
   end: End
-  world_only: bool = False
+  method: Any = "paper"
   fresh: bool = False
-  rollback: bool = False
-  guarded: bool = False
   breaks: bool = True
   agent: str = ""
 
@@ -127,28 +124,65 @@ def stops(arm: Arm) -> bool:
   """The arm goes on from the shipped agent, all of it learns and is kept, and the stop rule ends
   that: its stop compares with those of one that never stops.
   """
-  return (
-    arm.end is RULE
-    and arm.breaks
-    and not (arm.fresh or arm.world_only or arm.rollback or arm.guarded)
-  )
+  return arm.end is RULE and arm.breaks and arm.method == "paper" and not arm.fresh
 
 
-ARMS: dict[str, Arm] = {
+class Arms(plugins.Registry):
+  """A Registry of arms. What a package or a file adds is a function without arguments that gives an
+  Arm; it is called once.
+
+  Raises:
+    PluginError: it fails, or gives something else.
+  """
+
+  def __init__(self, group: str, kind: str, own: dict[str, Arm]) -> None:
+    super().__init__(group, kind, own)
+    self.made: dict[tuple[str, Any], Arm] = {}
+
+  def __getitem__(self, name: str) -> Arm:
+    found = super().__getitem__(name)
+    if isinstance(found, Arm):
+      return found
+    if (name, found) not in self.made:
+      try:
+        arm = found()
+      except Exception as e:
+        if plugins.of_user(e) or isinstance(e, UserError):
+          raise
+        raise PluginError(f"arm {name!r} cannot be made: {plugins.line(e, 1)}") from e
+      if not isinstance(arm, Arm):
+        raise PluginError(f"arm {name!r}: {found} must give a mjx_cl.adapt.arms.Arm; got {arm!r}")
+      self.made[name, found] = arm
+    return self.made[name, found]
+
+
+_SHIPPED: dict[str, Arm] = {
   "detector": Arm("finetuning starts on the detector's alarm", ALARM, RULE),
   "rollback": Arm(
     "as detector, but an aborted finetuning goes back to the weights of before it, where these "
     "earned more after the alarm",
     ALARM,
     RULE,
-    rollback=True,
+    method="rollback",
   ),
   "guarded": Arm(
     "as detector, but the weights of before the finetuning and the new ones act by turns, more "
     "often those that earn more, which stay in the end",
     ALARM,
     RULE,
-    guarded=True,
+    method="guarded",
+  ),
+  "staged": Arm(
+    "as detector, but first the world model learns, then the critic with it, then the actor",
+    ALARM,
+    RULE,
+    method="staged",
+  ),
+  "calm": Arm(
+    "as detector, but the robot does not explore while it learns; its dreams do",
+    ALARM,
+    RULE,
+    method="calm",
   ),
   "none": Arm("no adaptation; alarms are logged", NEVER, NO_END),
   "always": Arm("finetuning from the end of the warm-up on, without an end", AT_ONCE, NO_END),
@@ -189,7 +223,7 @@ ARMS: dict[str, Arm] = {
     "as detector, but the world model alone learns; actor and critic stay",
     ALARM,
     RULE,
-    world_only=True,
+    method="world-model",
   ),
   "randomised": Arm(
     "no adaptation, an agent that was trained on randomised faults: ROBOT-randomised, or "
@@ -202,3 +236,5 @@ ARMS: dict[str, Arm] = {
     "as detector, on a robot that never breaks: what false alarms cost", ALARM, RULE, breaks=False
   ),
 }
+
+ARMS = Arms("mjx_cl.methods", "arm", _SHIPPED)

@@ -3,18 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mjx_cl.adapt import methods
 from mjx_cl.adapt.arms import ARMS
 from mjx_cl.config import FOREVER, AdaptConfig
 from mjx_cl.errors import choose
 
 # Choices.at is padded to a multiple of it: arms with up to eight starts share a program
 WIDTH = 8
+
+
+@jax.tree_util.register_static
+@dataclass(frozen=True)
+class Methods:
+  """The methods of a run, which are part of its program; the paper's is the first.
+
+  Attributes:
+    all: of them.
+  """
+
+  all: tuple[methods.Method, ...] = (methods.PAPER,)
 
 
 class Choices(NamedTuple):
@@ -26,23 +40,19 @@ class Choices(NamedTuple):
       of WIDTH.
     rule: bool, stop and abort rules are in force.
     limit: int32, most control steps of one adaptation.
-    world_only: bool, actor and critic keep what they are.
+    method: int32, which of `methods` is the stream's.
+    methods: of the run.
     fresh: bool, every start draws new parameters; None: no arm of the run does, and the program
       goes without the drawing.
-    rollback: bool, an abort may put the weights of before the adaptation back; None: no arm of the
-      run does, and LoopState.before is None too.
-    guarded: bool, old and new weights act by turns; None: in no arm of the run, and LoopState.guard
-      is None too.
   """
 
   listens: jax.Array
   at: jax.Array
   rule: jax.Array
   limit: jax.Array
-  world_only: jax.Array
+  method: jax.Array
+  methods: Methods
   fresh: jax.Array | None
-  rollback: jax.Array | None = None
-  guarded: jax.Array | None = None
 
 
 def choices(
@@ -75,6 +85,7 @@ def choices(
   padded = np.full((len(arms), width), FOREVER, np.int32)
   for row, own in zip(padded, at):
     row[: len(own)] = [step if step < steps else FOREVER for step in own]
+  own = methods.used(tuple(arm for arm, _ in labels))
   flags = lambda get: jnp.asarray([get(arm) for arm in arms], bool)
   limits = [
     min(arm.end.limit(config), (stops or {})[seed]) if arm.end.told else arm.end.limit(config)
@@ -85,8 +96,7 @@ def choices(
     jnp.asarray(padded),
     flags(lambda a: a.end.rule),
     jnp.asarray(limits, jnp.int32),
-    flags(lambda a: a.world_only),
+    jnp.asarray([own.index(methods.of(arm)) for arm in arms], jnp.int32),
+    Methods(own),
     flags(lambda a: a.fresh) if any(arm.fresh for arm in arms) else None,
-    flags(lambda a: a.rollback) if any(arm.rollback for arm in arms) else None,
-    flags(lambda a: a.guarded) if any(arm.guarded for arm in arms) else None,
   )

@@ -18,11 +18,10 @@ import jax
 import jax.numpy as jnp
 
 from mjx_cl.adapt.choices import Choices
+from mjx_cl.adapt.phases import ABORTED, ADAPTING, CONVERGED, ENDED, NOMINAL
 from mjx_cl.adapt.settling import SIGNALS, settled
 from mjx_cl.config import AdaptConfig
 
-NOMINAL, ADAPTING, CONVERGED, ABORTED, ENDED = range(5)
-PHASES = ("nominal", "adapting", "converged", "aborted", "ended")
 # decisions of a chunk; the last is taken of numbers that fail, see `give_up`
 NOTHING, START, STOP, ABORT_BELOW, ABORT_HOPELESS, ABORT_BUDGET, END, ABORT_NUMERIC = range(8)
 DECISIONS = (

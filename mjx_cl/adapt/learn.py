@@ -9,16 +9,16 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from mjx_cl.adapt.act import choose
+from mjx_cl.adapt.methods import Method
 from mjx_cl.adapt.state import LoopState
+from mjx_cl.adapt.trees import choose, put, take
 from mjx_cl.config import AdaptConfig
 from mjx_cl.dreamer import replay as replay_lib
 from mjx_cl.dreamer.agent import Agent, TrainState, culprit
 from mjx_cl.dreamer.replay import Replay
+from mjx_cl.dreamer.state import Record
 from mjx_cl.keys import OfAdaptation
 from mjx_cl.rollout.scan import Row, records
-
-BEHAVIOUR = {"pol", "val", "slow", "range"}  # of a TrainState: what is no world model
 
 
 def fill(
@@ -106,13 +106,28 @@ def learn(
   replay: Replay,
   keys: jax.Array,
   number: jax.Array,
-  world_only: jax.Array,
+  methods: tuple[Method, ...],
+  which: jax.Array,
+  memory: tuple[Any, ...],
 ) -> tuple[TrainState, Replay, jax.Array]:
   """`number` (groups,) updates for each stream. Nested loops with their own trip counts: the
   carry is changed in place, so a stream without an update costs neither arithmetic nor a copy
   (`vmap` would compute all, `lax.map` would copy all). All streams lie in one replay, of which an
   update reads and writes its own windows: taken out of it, a stream's would be copied twice for
   each update.
+
+  Args:
+    agent: the learner.
+    train: TrainState of the streams.
+    replay: of the streams.
+    keys: of the streams.
+    number: int32 (groups,), updates that are due.
+    methods: of the run.
+    which: int32 (groups,), which of them is the stream's.
+    memory: of each method, leading (groups,).
+
+  Returns:
+    (train', replay', int32 (groups,): what was at fault, see agent.culprit).
   """
   c = agent.config
   # (groups, 1, ..) -> (groups, ..)
@@ -127,14 +142,12 @@ def learn(
       i, train, replay, _ = state
       key_sample, key_update = jax.random.split(jax.random.fold_in(keys[g], i))
       replay, data, address = replay_lib.sample(replay, key_sample, c.batch, c.length + 1, only=g)
-      before = take(train, g)
-      learnt, metrics, latents = agent.update(before, data, key_update)
-      return (
-        i + 1,
-        put(train, g, keep_behaviour(world_only[g], before, learnt)),
-        replay_lib.refresh(replay, address, latents),
-        culprit(metrics),
+      own = tuple(take(kept, g) for kept in memory)
+      learnt, latents, bad = _update(
+        agent, methods, which[g], own, take(train, g), data, key_update
       )
+      replay = replay_lib.refresh(replay, address, latents)
+      return i + 1, put(train, g, learnt), replay, bad
 
     train, replay, failed = state
     more = lambda state: (state[0] < number[g]) & (state[-1] < 0)
@@ -150,26 +163,32 @@ def learn(
   return train, apart, failed
 
 
-def take(tree: Any, g: jax.Array) -> Any:
-  """Entry g of every leaf."""
-  return jax.tree.map(lambda x: jax.lax.dynamic_index_in_dim(x, g, keepdims=False), tree)
+def _update(
+  agent: Agent,
+  methods: tuple[Method, ...],
+  which: jax.Array,
+  memory: tuple[Any, ...],
+  before: TrainState,
+  data: Record,
+  key: jax.Array,
+) -> tuple[TrainState, tuple[jax.Array, jax.Array], jax.Array]:
+  """One update of one stream by method `which` (): (state', latents, what is at fault)."""
 
+  def by(method: Method | None, own: Any) -> tuple[TrainState, Any, jax.Array]:
+    if method is None or method.update is None:
+      learnt, metrics, latents = agent.update(before, data, key)
+    else:
+      learnt, metrics, latents = method.update(agent, own, before, data, key)
+    return learnt, latents, culprit(metrics)
 
-def put(tree: Any, g: jax.Array, value: Any) -> Any:
-  """`tree` with `value` as entry g of every leaf."""
-  return jax.tree.map(lambda x, v: jax.lax.dynamic_update_index_in_dim(x, v, g, 0), tree, value)
-
-
-def keep_behaviour(keep: jax.Array, before: TrainState, after: TrainState) -> TrainState:
-  """`after`, where `keep` (): with actor, critic, slow critic, range of the returns, and the
-  moments of actor and critic as `before`.
-
-  Zero gradients alone would not do: momentum moves what has none. The value loss on replay still
-  shapes the features, as in every arm.
-  """
-
-  def one(path: tuple[Any, ...], old: jax.Array, new: jax.Array) -> jax.Array:
-    names = {getattr(part, "key", getattr(part, "name", None)) for part in path}
-    return jnp.where(keep, old, new) if names & BEHAVIOUR else new
-
-  return jax.tree_util.tree_map_with_path(one, before, after)
+  ways: list[Any] = [lambda: by(None, ())]  # methods without an update of their own share one
+  way = jnp.zeros(len(methods), jnp.int32)
+  for i, (method, own) in enumerate(zip(methods, memory)):
+    if method.update is not None:
+      way = way.at[i].set(len(ways))
+      ways.append(lambda method=method, own=own: by(method, own))
+  learnt, latents, bad = jax.lax.switch(way[which], ways) if len(ways) > 1 else ways[0]()
+  for i, (method, own) in enumerate(zip(methods, memory)):
+    if method.keep is not None:
+      learnt = choose(which == i, method.keep(own, before, learnt), learnt)
+  return learnt, latents, bad

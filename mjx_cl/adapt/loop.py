@@ -7,6 +7,7 @@ no update.
 
 from __future__ import annotations
 
+import functools
 import threading
 import time
 from collections.abc import Callable, Hashable
@@ -15,9 +16,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from mjx_cl.adapt import act, decide, learn, watch
+from mjx_cl.adapt import decide, learn, methods, watch
 from mjx_cl.adapt.choices import WIDTH, Choices, choices
 from mjx_cl.adapt.state import Digest, Frozen, LoopState
+from mjx_cl.adapt.trees import choose
 from mjx_cl.adapt.watch import Minds, Sight, Watched
 from mjx_cl.config import AdaptConfig
 from mjx_cl.detectors.base import Detector
@@ -148,15 +150,17 @@ class Loop:
     self.programs = programs.share((same, repeat), own) if shared and programs else own()
 
   def init(
-    self, train: TrainState, groups: int, rollback: bool = False, guarded: bool = False
+    self,
+    train: TrainState,
+    groups: int,
+    own: tuple[methods.Method, ...] = (methods.PAPER,),
   ) -> LoopState:
     """State before the first step.
 
     Args:
       train: the shipped agent, the same for every stream.
       groups: streams.
-      rollback: an arm of the run goes back, see Before.
-      guarded: an arm of the run is, see Guard.
+      own: methods of the run, as in Choices.
     """
     a = self.agent
     spread = lambda tree: jax.tree.map(
@@ -178,8 +182,7 @@ class Loop:
       past=unknown((max(1, self.config.refit // self.repeat), groups), a.obs_size),
       owed=none(),
       executed=jnp.zeros(groups, jnp.int32),
-      before=act.Before(params(), none(), none(), jnp.zeros(groups, bool)) if rollback else None,
-      guard=act.unguarded(params(), groups) if guarded else None,
+      memory=tuple(jax.vmap(functools.partial(methods.remember, m))(params()) for m in own),
     )
     return strong(state)
 
@@ -284,9 +287,11 @@ class Loop:
       acceptance = self.spec.acceptance if config.acceptance is None else config.acceptance
     _, least = self.spec.posture or (0, -jnp.inf)
     signals = seen.signals
-    if state.guard is not None and choices.guarded is not None:  # the rule judges what learns
-      others = choices.guarded & state.guard.acts & (was == decide.ADAPTING)
-      signals = jnp.where(others[:, None], jnp.nan, signals)
+    own = choices.methods.all
+    for i, (method, memory) in enumerate(zip(own, state.memory)):
+      if method.hides is not None:  # the rule judges what learns
+        others = (choices.method == i) & jax.vmap(method.hides)(memory)
+        signals = jnp.where((others & (was == decide.ADAPTING))[:, None], jnp.nan, signals)
     phase, decision, settled = decide.decide(
       state.phase, signals, seen.posture, begin, now, choices, acceptance, least, config
     )
@@ -298,18 +303,34 @@ class Loop:
     number = jnp.floor(owed + 1e-6).astype(jnp.int32)
     train, acting = learn.begin(agent, state, keys, begins, choices.fresh, config.fresh_moments)
     counted = train.updates
-    train, replay, failed = learn.learn(agent, train, replay, draws, number, choices.world_only)
+    train, replay, failed = learn.learn(
+      agent, train, replay, draws, number, own, choices.method, state.memory
+    )
     taken = train.updates - counted
     phase, decision = decide.give_up(phase, decision, was, failed, seen.signals)
 
-    train, acting, kept, weighed = self._act(
-      state, train, acting, phase, seen, begins, number, taken, choices, config
+    over = (was == decide.ADAPTING) & (phase.phase != decide.ADAPTING)
+    view = methods.View(
+      was,
+      phase.phase,
+      begins,
+      over,
+      seen.signals[:, decide.SIGNALS.index("reward")],
+      jnp.nanmean(phase.ring[:, :, decide.SIGNALS.index("reward")], 1),
+      seen.signals,
+      taken,
+      jnp.where(number > 0, config.average, 0.0),
+      acting,
+      train.params,
     )
+    acting, memory, weighed = _act(own, choices.method, state.memory, view)
+    # the robot keeps what it acts by when it is done
+    train = train._replace(params=choose(over, acting, train.params))
     # a stream that is done watches again, its reference refitted on the latest rows
-    over = (decision == decide.STOP) | (decision == decide.END)
+    done = (decision == decide.STOP) | (decision == decide.END)
     refit = lambda d, p, s: watch.refit(self.detector, d, p, s)
     detector = jax.lax.cond(
-      jnp.any(over), refit, lambda d, p, s: d, state.detector, state.past, over
+      jnp.any(done), refit, lambda d, p, s: d, state.detector, state.past, done
     )
     executed = state.executed + taken
     state = state._replace(
@@ -320,42 +341,36 @@ class Loop:
       phase=phase,
       owed=owed - number,
       executed=executed,
-      **kept,
+      memory=memory,
     )
     said = (phase.phase, decision, phase.since, executed, failed, *weighed)
     return state, Digest(*seen[:4], settled, *said)
 
-  def _act(
-    self,
-    state: LoopState,
-    train: TrainState,
-    acting: Any,
-    phase: decide.PhaseState,
-    seen: Watched,
-    begins: jax.Array,
-    number: jax.Array,
-    taken: jax.Array,
-    choices: Choices,
-    config: AdaptConfig,
-  ) -> tuple[TrainState, Any, dict[str, Any], tuple[jax.Array, ...]]:
-    """The robot acts by a moving average of what it learns, and keeps it when it is done; of what
-    puts other weights in its place the new `before` and `guard`, and what was weighed.
-    """
-    was, before, guard = state.phase.phase, state.before, state.guard
-    rollback, guarded = choices.rollback, choices.guarded
-    reward = seen.signals[:, decide.SIGNALS.index("reward")]
-    weighed: tuple[jax.Array, ...] = ()
-    if guard is not None and guarded is not None:
-      acting = act.choose(guarded & guard.learnt, guard.new, acting)
-    acting = act.follow(acting, train.params, number, config.average)
-    if before is not None and rollback is not None:
-      acting, before, weighed = act.put_back(
-        acting, before, phase, was, begins, reward, taken, rollback
-      )
-    if guard is not None and guarded is not None:
-      acting, guard, said = act.take_turns(
-        acting, guard, was, phase, begins, reward, taken, guarded
-      )
-      weighed = tuple(act.choose(guarded, said, act.Weighed(*weighed))) if weighed else said
-    kept = act.choose(act.ended(was, phase), acting, train.params)
-    return train._replace(params=kept), acting, {"before": before, "guard": guard}, weighed
+
+def _act(
+  own: tuple[methods.Method, ...], which: jax.Array, memory: tuple[Any, ...], view: methods.View
+) -> tuple[Any, tuple[Any, ...], tuple[jax.Array, ...]]:
+  """What acts in the chunk to come by each stream's method, the memories of all, and what was
+  weighed where a method of the run weighs; leading (groups,).
+  """
+  answers = []
+  for method, kept in zip(own, memory):
+    act = lambda memory, view, method=method: _whole(method.act(memory, view))
+    said = jax.vmap(act)(kept, view)
+    same = lambda new, old: jnp.asarray(new, old.dtype)
+    answers.append(said._replace(memory=jax.tree.map(same, said.memory, kept)))
+  chosen: Any = answers[0]._replace(memory=())
+  for i, said in enumerate(answers[1:], 1):
+    chosen = choose(which == i, said._replace(memory=()), chosen)
+  weighed = (chosen.back, chosen.earned, chosen.earns)
+  weighs = any(method.weighs for method in own)
+  return chosen.params, tuple(a.memory for a in answers), weighed if weighs else ()
+
+
+def _whole(acts: methods.Acts) -> methods.Acts:
+  """With arrays in place of the defaults."""
+  return acts._replace(
+    back=jnp.asarray(acts.back, bool),
+    earned=jnp.asarray(acts.earned, jnp.float32),
+    earns=jnp.asarray(acts.earns, jnp.float32),
+  )

@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from mjx_cl.adapt.act import Before, Guard
 from mjx_cl.adapt.decide import PhaseState
 from mjx_cl.adapt.watch import Minds, Sight
 from mjx_cl.dreamer.agent import TrainState
@@ -33,8 +32,7 @@ class LoopState(NamedTuple):
     past: Residual of the last `refit` rows, leading (refit, groups).
     owed: float32, fraction of an update that is due.
     executed: int32, updates taken since the run began.
-    before: Before of each stream; None where no arm of the run goes back.
-    guard: Guard of each stream; None where no arm of the run is guarded.
+    memory: of each method of the run, see Choices.methods.
   """
 
   train: TrainState
@@ -46,8 +44,7 @@ class LoopState(NamedTuple):
   past: Residual
   owed: jax.Array
   executed: jax.Array
-  before: Before | None = None
-  guard: Guard | None = None
+  memory: tuple[Any, ...] = ((),)
 
   @property
   def minds(self) -> Minds:
@@ -81,14 +78,15 @@ class Digest(NamedTuple):
     fired: bool, alarms, of each row.
     signals: float32 (groups, 6), in the order of decide.SIGNALS.
     settled: bool (groups, 6), which of them have settled.
-    phase: int32, index into decide.PHASES after the chunk.
+    phase: int32, index into phases.PHASES after the chunk.
     decision: int32, index into decide.REASONS.
     since: int32, control step that the last adaptation counts from.
     updates: int32, taken since the run began.
     failed: int32, index into agent.CAUSES of what was at fault in an update, which changed nothing
       and was the stream's last; -1: nothing.
-    back: bool, the weights of before the adaptation were put back; None where no arm does that.
-    earned: float32, mean reward a step of those, see Before and Guard; None likewise.
+    back: bool, the weights of before the adaptation were put back; None where no method of
+      the run does that.
+    earned: float32, mean reward a step of those, see Acts; None likewise.
     earns: float32, of the weights that have learnt; None likewise.
   """
 

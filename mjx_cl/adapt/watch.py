@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from mjx_cl.adapt.act import choose
+from mjx_cl.adapt.trees import choose
 from mjx_cl.detectors.base import Detector, anew
 from mjx_cl.dreamer.agent import Agent
 from mjx_cl.rollout.monitor import History, Monitor, Residual

@@ -8,7 +8,7 @@ from rich.live import Live
 from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as Bar
 
-from mjx_cl.adapt.decide import PHASES
+from mjx_cl.adapt.phases import PHASES
 from mjx_cl.cli.output import clock, say
 from mjx_cl.cli.tables import table
 from mjx_cl.runs.runner import Progress

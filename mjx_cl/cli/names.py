@@ -5,6 +5,8 @@
 import importlib.metadata
 import json
 import pathlib
+import shutil
+import textwrap
 from collections.abc import Iterable
 
 from mjx_cl.cli.flags import List
@@ -13,7 +15,7 @@ from mjx_cl.errors import choose
 from mjx_cl.io import folders, runtime
 
 FILE = pathlib.Path(__file__).parent / "names.json"  # what registries.tables gives without plug-ins
-GROUPS = ("mjx_cl.envs", "mjx_cl.faults", "mjx_cl.detectors")  # of entry points
+GROUPS = ("mjx_cl.envs", "mjx_cl.faults", "mjx_cl.detectors", "mjx_cl.methods")  # of entry points
 
 
 def _live(kinds: Iterable[str]) -> dict[str, dict[str, str]]:
@@ -32,10 +34,12 @@ def do_list(args: List) -> None:
   if args.json:
     emit({kind: known[kind] for kind in chosen})
     return
+  wide = max(60, shutil.get_terminal_size((100, 24)).columns)
   for kind in chosen:
     print(kind)
     for name, about in known[kind].items():
-      print(f"  {name:22s} {about}")
+      line = f"  {name:22s} {about}"
+      print(textwrap.fill(line, wide, subsequent_indent=" " * 25, break_on_hyphens=False))
 
 
 def write() -> None:

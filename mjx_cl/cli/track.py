@@ -9,7 +9,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
-from mjx_cl.adapt.decide import PHASES
+from mjx_cl.adapt.phases import PHASES
 from mjx_cl.errors import UserError, choose
 from mjx_cl.runs.runner import Progress
 

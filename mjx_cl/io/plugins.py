@@ -1,5 +1,5 @@
-"""Tables that others add to: robots, faults and detectors, by entry points of their packages or out
-of a file, path/to/file.py:Name.
+"""Tables that others add to: robots, faults, detectors and arms, by entry points of their packages
+or out of a file, path/to/file.py:Name.
 """
 
 import collections

@@ -16,6 +16,8 @@ ARMS = {
   "oracle": GREEN,
   "rollback": "#CC79A7",
   "guarded": "#4b0055",
+  "staged": "#a6761d",
+  "calm": "#1b9e9e",
   "always": ORANGE,
   "world-model": "#E69F00",
   "scratch": "#7b4f2c",

@@ -70,14 +70,19 @@ def threshold_of(config: RunConfig) -> detectors.Threshold | None:
 def identity(config: RunConfig) -> dict:
   """What makes a run what it is, as config.json holds it: its settings, `changes`, what a preset's
   name stood for when it began, the `threshold` that its detector takes from the board,
-  `oracle_stops` that its arms are told, and the SHA-256 of the `files` that robot, fault or
-  detector stand in.
+  `oracle_stops` that its arms are told, and the SHA-256 of the `files` that robot, fault,
+  detector or arm stand in.
   """
   config = check(config)  # one that was built by hand may lack what follows from the others
   found, told = threshold_of(config), stop_rule.told(config)
   sources = {
     name: plugins.file_of(name)
-    for name in (config.env, config.detector, *(change.fault for change in changes(config)))
+    for name in (
+      config.env,
+      config.detector,
+      *(change.fault for change in changes(config)),
+      *config.arms,
+    )
   }
   files = {
     name: hashlib.sha256(path.read_bytes()).hexdigest()

@@ -24,6 +24,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mjx_cl.adapt import methods
 from mjx_cl.adapt.loop import Loop, Once
 from mjx_cl.adapt.state import ROWS, Digest, Frozen, LoopState, cut, glue
 from mjx_cl.adapt.watch import Minds
@@ -59,8 +60,7 @@ class Lives:
     trains: the agent of each stream.
     life: name of each stream's life: equal ones have the same robot, agent and keys.
     keys: of the streams, for all but their robots.
-    rollback: an arm goes back, see act.Before.
-    guarded: an arm is, see act.Guard.
+    ways: methods of the arms, as in Choices.
     together: all streams are one band from the start; None: on an accelerator.
     ahead: what a first departure needs is compiled beside the first chunks.
   """
@@ -73,14 +73,13 @@ class Lives:
     trains: Sequence[TrainState],
     life: Sequence[Hashable],
     keys: jax.Array,
-    rollback: bool = False,
-    guarded: bool = False,
+    ways: tuple[methods.Method, ...] = (methods.PAPER,),
     together: bool | None = None,
     ahead: bool = False,
   ) -> None:
     self.loop, self.keys = loop, keys
     self.trains, self.streams = list(trains), len(trains)
-    self.extras = {"rollback": rollback, "guarded": guarded}  # of Loop.init
+    self.methods = ways
     together = jax.default_backend() != "cpu" if together is None else together
     # streams of a band, and those that share a LoopState
     self.band_size, self.width = (self.streams, self.streams) if together else (BAND, 1)
@@ -95,9 +94,9 @@ class Lives:
     self._live = {Herd: Once(live), Band: Once(live)}
     self._programs = (*self._live.values(), *loop.programs)
     if together:
-      state = loop.init(trains[0], self.streams, **self.extras)
+      state = loop.init(trains[0], self.streams, self.methods)
       stack = jax.tree.map(lambda *x: jnp.stack(x), *trains)
-      # `before` is written at every start, before it is read
+      # memories are written at every start, before they are read
       state = state._replace(train=stack, acting=jax.tree.map(jnp.copy, stack.params))
       self.settle_down([Band(list(range(self.streams)), streams, [state])])
     else:
@@ -249,7 +248,9 @@ class Lives:
     seen, sight = self.loop.watch(herd.minds, was.sight, rows, step, keys)
     phase, digest = jax.block_until_ready(self.loop.rest(was.phase, seen, step))
     herd.frozen[lane] = Frozen(sight, phase)
-    if any(self.extras.values()):  # nothing to weigh yet; streams that learn say it too
+    if any(
+      method.weighs for method in self.methods
+    ):  # nothing to weigh yet; streams that learn say it too
       unknown = np.full(1, np.nan, np.float32)
       digest = digest._replace(back=np.zeros(1, bool), earned=unknown, earns=unknown)
     digest = jax.tree.map(np.asarray, digest)
@@ -263,7 +264,7 @@ class Lives:
       fired = digest.fired[:, 0]
       if departs(fired, at, settled.choices, now, self.loop.repeat, self.loop.config):
         own, phase = jax.tree.map(jnp.copy, (sight, was.phase))  # learning uses its state up
-        state = self.loop.init(herd.train, 1, **self.extras)._replace(phase=phase)
+        state = self.loop.init(herd.train, 1, self.methods)._replace(phase=phase)
         state, new = self.loop.learn(
           state, seen, own, rows, step, settled.choices, keys, settled.acceptance
         )
@@ -287,7 +288,8 @@ class Lives:
     )
     band.loops[k] = jax.block_until_ready(state)
     digest = jax.tree.map(np.asarray, digest)
-    if (digest.decision > 0).any() or (digest.updates != taken).any():
+    learning = (digest.decision > 0).any() or (digest.updates != taken).any()
+    if learning or any(method.act is not methods.average for method in self.methods):
       band.acting = None  # in every other chunk weights are what they were
     one = lambda i: Digest(
       *(cut(v, slice(i, i + 1), int(name in ROWS)) for name, v in digest._asdict().items())
@@ -322,7 +324,7 @@ class Lives:
       _, rows = self._live[Herd](herd.minds.params, herd.streams)
       rows = jax.tree.map(lambda x: np.asarray(x)[:, :, :1], rows)
       seen, sight = self.loop.watch(herd.minds, frozen.sight, rows, jnp.int32(now), keys)
-      state = self.loop.init(herd.train, 1, **self.extras)._replace(**sight._asdict())
+      state = self.loop.init(herd.train, 1, self.methods)._replace(**sight._asdict())
       programs.learn.warm(
         state,
         seen,

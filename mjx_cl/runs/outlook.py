@@ -113,7 +113,7 @@ class Standing(NamedTuple):
   """How a stream stands.
 
   Attributes:
-    phase: of decide.PHASES.
+    phase: of phases.PHASES.
     since: control step at which its newest finetuning began, -1: none yet.
   """
 

@@ -37,7 +37,7 @@ def like(lives: Lives, who: list[list[int]]) -> dict:
   tree["robots"] = [herd.streams for herd in lives.herds]
   tree["robots"] += [jax.tree.map(spread, lives.robot) for _ in who]
   if who:
-    begin = lambda train: lives.loop.init(train, lives.width, **lives.extras)
+    begin = lambda train: lives.loop.init(train, lives.width, lives.methods)
     state = jax.eval_shape(begin, lives.trains[0])
     number = sum(len(own) for own in who) // lives.width
     tree["replays"] = [state.replay] * number

@@ -12,6 +12,7 @@ import numpy as np
 
 from mjx_cl.adapt import decide as phase_lib
 from mjx_cl.adapt.arms import ARMS, FOREVER, NEVER
+from mjx_cl.adapt.phases import PHASES
 from mjx_cl.config import RunConfig
 from mjx_cl.faults.presets import Change
 from mjx_cl.rollout.monitor import watched
@@ -125,7 +126,7 @@ class Ledger(NamedTuple):
       "fault": np.repeat(np.asarray(self.names), steps),
       "step": np.tile(np.arange(steps, dtype=np.int32), groups),
       "episode": flat(trace["episode"]),
-      "phase": np.asarray(phase_lib.PHASES)[flat(trace["phase"])],
+      "phase": np.asarray(PHASES)[flat(trace["phase"])],
       "fault_active": flat(trace["severity"] > 0),
       "severity": flat(trace["severity"]),
       "reward": flat(trace["reward"]),
@@ -227,7 +228,7 @@ class Ledger(NamedTuple):
       elif decisions[step // self.chunk_steps] == phase_lib.START:
         why = "an alarm before it was"  # the phase changes at the end of the chunk
       else:
-        why = f"phase {phase_lib.PHASES[trace['phase'][step, g]]}"
+        why = f"phase {PHASES[trace['phase'][step, g]]}"
       yield Event(step, "alarm", f"logged, not acted on: {why}{false}", why)
 
   def _decisions(self, g: int, trace: dict[str, np.ndarray]) -> Iterator[Event]:

@@ -11,6 +11,7 @@ Lives, weights and scratch are flat in the steps of the run; a replay is not, no
 
 from typing import NamedTuple
 
+from mjx_cl.adapt import methods
 from mjx_cl.adapt.arms import ARMS
 from mjx_cl.config import CHUNK, DreamerConfig, RunConfig
 from mjx_cl.io import memory, runtime
@@ -81,7 +82,7 @@ def of(config: RunConfig, spec: Spec, trained: DreamerConfig, repeat: int = 1) -
   # rows hold latents in full, records in half precision
   rows = 2 * one.record * CHUNK * HERD * min(-(-lives // HERD), MANY * len(runtime.cores()))
   residual = 4 * (2 * len(spec.obs) + 8)
-  copies = 2 + any(arm.rollback for arm in arms) + 2 * any(arm.guarded for arm in arms)
+  copies = 2 + sum(method.copies for method in methods.used(config.arms))
   at_once = min(learners, len(runtime.cores()))
   size = params / 4 / 640_867 * (config.adapt.batch or trained.batch) * trained.length / (4 * 64)
   scratch = int(at_once * SCRATCH * size / memory.GROWTH)

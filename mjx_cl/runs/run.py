@@ -16,6 +16,7 @@ without adaptation shares its past.
 """
 
 import pathlib
+import re
 import shutil
 import time
 from collections.abc import Callable, Iterable
@@ -242,7 +243,8 @@ def ledger_of(runner: Runner) -> Ledger:
 
 def keep(runner: Runner) -> None:
   """Writes OUT/agents/ARM-SEED for every stream that has learnt: the weights that it acts by at
-  the end, and the moments and counters of its learner.
+  the end, and the moments and counters of its learner. In ARM whatever is no letter, digit, point,
+  hyphen or underscore is an underscore.
 
   Of a stream that went back (arms `rollback`, `guarded`) the weights are those of before, moments,
   slow critic and counters those of the learner that was given up. The card is that of the agent it
@@ -267,7 +269,9 @@ def keep(runner: Runner) -> None:
     }
     card = {k: v for k, v in card.items() if k not in ("eval", "demonstrator_return")}
     try:
-      agents.save(folder / f"{arm}-{seed}", runner.lives.learnt(g), card)
+      agents.save(
+        folder / f"{re.sub(r'[^A-Za-z0-9_.-]+', '_', arm)}-{seed}", runner.lives.learnt(g), card
+      )
     except OSError as e:
       raise FileError(
         f"cannot write in {folder}: {e.strerror or e}; --resume writes them again"

@@ -14,6 +14,7 @@ import numpy as np
 
 from mjx_cl import envs, faults
 from mjx_cl.adapt import decide as phase_lib
+from mjx_cl.adapt import methods
 from mjx_cl.adapt.arms import ARMS, FOREVER, never_stops
 from mjx_cl.adapt.loop import Choices, Digest, Programs, choices
 from mjx_cl.adapt.state import cut
@@ -53,7 +54,7 @@ class Progress(NamedTuple):
     seconds: of wall time.
     arms: of each stream.
     seeds: of each stream.
-    phase: int (groups,), index into decide.PHASES.
+    phase: int (groups,), index into phases.PHASES.
     reward: float (groups,), mean of the chunk.
     alarms: int (groups,), so far.
     updates: int (groups,), so far.
@@ -110,6 +111,9 @@ class Runner:
     self.labels = list(itertools.product(config.arms, seeds))
     self.groups = len(self.labels)
     arms = [ARMS[arm] for arm in config.arms]
+    for name, arm in zip(config.arms, arms):
+      if not isinstance(arm.method, str):
+        methods.check(name, arm.method, self.trained.agent)
     self.endless = any(never_stops(arm) for arm in arms)
     self.breaks = np.asarray([ARMS[arm].breaks for arm, _ in self.labels])
     self.chunk_steps = CHUNK * self.repeat
@@ -158,8 +162,7 @@ class Runner:
       trains,
       [(id(t), bool(b), seed) for t, b, (_, seed) in zip(trains, self.breaks, self.labels)],
       self.keys,
-      any(ARMS[arm].rollback for arm in self.config.arms),
-      any(ARMS[arm].guarded for arm in self.config.arms),
+      methods.used(tuple(self.config.arms)),
       ahead=learners > 0 and self.chunks > SOON,
     )
 

@@ -46,7 +46,10 @@ def variants(words: list[str]) -> list[Variant]:
   """
   found = []
   for word in words:
-    folder, _, arm = (word, "", "") if pathlib.Path(word).is_dir() else word.rpartition(":")
+    # an arm may have colons of its own, FILE.py:make
+    folders = [word[:i] for i, x in enumerate(word) if x == ":" and pathlib.Path(word[:i]).is_dir()]
+    folder = word if pathlib.Path(word).is_dir() else (folders or [word.rpartition(":")[0]])[-1]
+    arm = word[len(folder) + 1 :] if folder else ""
     home = pathlib.Path(folder or word)
     if not (home / "runs.parquet").is_file() or not (home / "config.json").is_file():
       raise FileError(f"{home} holds no finished run (no runs.parquet)")

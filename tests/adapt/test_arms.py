@@ -17,11 +17,13 @@ import pytest
 import quick
 
 from mjx_cl import envs
-from mjx_cl.adapt import act
 from mjx_cl.adapt import decide as phase_lib
+from mjx_cl.adapt import loop as loop_lib
+from mjx_cl.adapt import methods
 from mjx_cl.adapt.arms import ARMS, FOREVER
 from mjx_cl.adapt.decide import ABORT_BUDGET, END, ENDED, START, STOP
 from mjx_cl.adapt.loop import WIDTH, Loop, choices
+from mjx_cl.adapt.methods import guarded
 from mjx_cl.config import PRESETS, AdaptConfig, RunConfig
 from mjx_cl.detectors import Alarm, Detector
 from mjx_cl.dreamer.agent import Agent
@@ -46,6 +48,8 @@ NAMES = (
   "detector",
   "rollback",
   "guarded",
+  "staged",
+  "calm",
   "none",
   "always",
   "periodic",
@@ -59,6 +63,8 @@ NAMES = (
   "no-fault",
 )
 
+
+HEARD = {"detector", "rollback", "guarded", "staged", "calm", "world-model", "no-fault"}
 
 # ---- table ---------------------------------------------------------------------------------------
 
@@ -85,27 +91,25 @@ def test_choices_of_all_arms():
     "world-model": [],
     "rollback": [],
     "guarded": [],
+    "staged": [],
+    "calm": [],
     "randomised": [],
     "no-fault": [],
   }
   assert len(drawn) == 1 and 1000 <= drawn[0] <= 1440
   on = lambda field: {name for name, row in rows.items() if getattr(row, field)}
-  assert on("listens") == {"detector", "rollback", "guarded", "world-model", "no-fault"}
-  assert (
-    on("world_only") == {"world-model"}
-    and on("fresh") == {"scratch"}
-    and on("rollback") == {"rollback"}
-    and on("guarded") == {"guarded"}
-  )
+  assert on("listens") == HEARD and on("fresh") == {"scratch"}
+  own = tuple(methods.METHODS.values())
+  assert x.methods.all == own and own[0] is methods.PAPER
+  by = {name: list(methods.METHODS)[int(row.method)] for name, row in rows.items()}
+  assert by == {name: name if name in methods.METHODS else "paper" for name in NAMES}
   few = choices([("detector", 0), ("none", 0)], c, 1500)
-  assert (
-    few.fresh is few.rollback is few.guarded is None and few.at.shape[1] == x.at.shape[1] == WIDTH
-  )  # one program
+  assert few.fresh is None and few.methods.all == (methods.PAPER,)
+  assert few.at.shape[1] == x.at.shape[1] == WIDTH  # one program
   assert choices(
     [("periodic", 0)], dataclasses.replace(c, period=100, warmup=100), 1500
   ).at.shape == (1, 2 * WIDTH)
-  heard = {"detector", "rollback", "guarded", "world-model", "no-fault"}
-  assert on("rule") == heard | {"oracle", "scratch"}
+  assert on("rule") == HEARD | {"oracle", "scratch"}
   assert {name: int(row.limit) for name, row in rows.items()} == dict.fromkeys(NAMES, 777) | {
     "none": FOREVER,
     "always": FOREVER,
@@ -142,7 +146,7 @@ def test_bad_settings_are_refused():
   with pytest.raises(
     UserError,
     match=(
-      "unknown arm 'orcale'; choose from: always, detector, guarded, no-fault, none, oracle, "
+      "unknown arm 'orcale'; choose from: always, calm, detector, guarded, no-fault, none, oracle, "
       "oracle-budget, oracle-stop, periodic"
     ),
   ):
@@ -336,7 +340,7 @@ def story():
   keys = jax.vmap(jax.random.key)(jnp.arange(len(NAMES)))
 
   def begin():
-    state = loop.init(train, len(NAMES), rollback=True, guarded=True)
+    state = loop.init(train, len(NAMES), methods.used(NAMES))
     return state._replace(
       detector=state.detector._replace(at=jnp.tile(jnp.array(ALARMS), (len(NAMES), 1)))
     )
@@ -375,6 +379,8 @@ def spans(story):
     "detector": heard,
     "rollback": heard,
     "guarded": heard,
+    "staged": heard,
+    "calm": heard,
     "none": [],
     "always": [(20, 1, None, None)],
     "periodic": [(80, 5, 7, END), (160, 10, 12, END), (240, 15, None, None)],
@@ -522,11 +528,12 @@ def aborted(story):
 
   def live(names, due, config, chunks, reward, level):
     count, all_ = len(names), len(NAMES)
-    labels = [(name, 0) for name in (*names, "scratch", "guarded", *["none"] * all_)][:all_]
+    labels = [(name, 0) for name in (*names, "scratch", *methods.METHODS, *["none"] * all_)]
+    labels = [label for label in labels if label[0] != "paper"][:all_]
     chosen = choices(labels, config, STEPS * CHUNKS)
     chosen = chosen._replace(at=chosen.at.at[:count, : len(due)].set(jnp.array(due)))
     keys = jax.vmap(jax.random.key)(jnp.zeros(all_, int))
-    state = loop.init(of(story.begin.train, "detector"), all_, rollback=True, guarded=True)
+    state = loop.init(of(story.begin.train, "detector"), all_, methods.used(NAMES))
     state = state._replace(
       train=state.train._replace(updates=jnp.full(all_, 2000, jnp.int32))
     )  # past the warm-up of the learning rate
@@ -629,53 +636,55 @@ def test_old_and_new_weights_act_by_turns(same):
   new, groups, first, last = np.array([0.2, 0.9, 0.5, 0.2], np.float32), 4, 3, 90
   flags = lambda on: jnp.full(groups, on)
   weights = lambda x: {"w": jnp.full((groups, 3), x)}
-  guarded = jnp.array([True, True, True, False])
-  acting, guard, told = weights(1.0), act.unguarded(weights(7.0), groups), []
+  own, which = (methods.PAPER, guarded.METHOD), jnp.array([1, 1, 1, 0])
+  memory = tuple(jax.vmap(functools.partial(methods.remember, m))(weights(7.0)) for m in own)
+  acting, told = weights(1.0), []
   heard = {1: [[] for _ in range(groups)], 0: [[] for _ in range(groups)]}
   turn, guard_acts = np.zeros(groups, int), np.zeros(groups, bool)  # chunks since the first update
   for c in range(last + 1):
-    was = flags(phase_lib.ADAPTING if c else phase_lib.NOMINAL)
-    ends = c == last
-    phase = decide_state(flags(phase_lib.CONVERGED if ends else phase_lib.ADAPTING))
     old_acts = np.asarray(acting["w"][:, 0]) == 1.0
     reward = np.where(old_acts, 0.5, new).astype(np.float32)
-    # the learner's average moves on with each chunk; what `_act` hands over
-    learnt = c > first
-    held = {"w": jnp.where((guarded & learnt)[:, None], guard.new["w"], acting["w"])}
-    moved = jax.tree.map(lambda x: x + 1.0, held) if c >= first else held
-    acting, guard, weighed = act.take_turns(
-      moved, guard, was, phase, flags(c == 0), jnp.asarray(reward), flags(int(c >= first)), guarded
+    # the learner's average moves on with each chunk, and reaches the learner at once
+    learnt, ends = c > first, c == last
+    held = jnp.where(((which == 1) & learnt)[:, None], memory[1].new["w"], acting["w"])
+    view = methods.View(
+      was=flags(phase_lib.ADAPTING if c else phase_lib.NOMINAL),
+      phase=flags(phase_lib.CONVERGED if ends else phase_lib.ADAPTING),
+      begins=flags(c == 0),
+      over=flags(ends),
+      reward=jnp.asarray(reward),
+      recent=flags(jnp.nan),
+      signals=jnp.full((groups, 6), jnp.nan),
+      taken=flags(int(c >= first)),
+      rate=flags(float(c >= first)),
+      acted=acting,
+      learner={"w": held + 1.0},
     )
+    acting, memory, (back, earned, earns) = loop_lib._act(own, which, memory, view)
     for g in range(groups):
-      if c and (not learnt or turn[g] % act.TURN >= act.SKIP):
+      if c and (not learnt or turn[g] % guarded.TURN >= guarded.SKIP):
         heard[int(learnt and not bool(guard_acts[g]))][g].append(reward[g])
-    guard_acts = np.asarray(guard.acts)
+    guard_acts = np.asarray(memory[1].acts) & (np.asarray(which) == 1)
     turn = turn + learnt
     told.append(np.asarray(acting["w"][:, 0]) == 1.0)
-    mean = lambda side, g: np.mean(heard[side][g][-act.KEPT :]) if heard[side][g] else np.nan
-    if c:
-      for g in range(groups):
-        np.testing.assert_allclose(weighed.earned[g], mean(0, g), rtol=1e-5)
-        np.testing.assert_allclose(weighed.earns[g], mean(1, g), rtol=1e-5)
+    mean = lambda side, g: np.mean(heard[side][g][-guarded.KEPT :]) if heard[side][g] else np.nan
+    for g in range(3) if c else ():
+      np.testing.assert_allclose(earned[g], mean(0, g), rtol=1e-5)
+      np.testing.assert_allclose(earns[g], mean(1, g), rtol=1e-5)
   told = np.array(told)[
     first:last
   ]  # whether the old weights act in chunk first + 1, first + 2, ...
-  turns = told[: len(told) // act.TURN * act.TURN].reshape(-1, act.TURN, groups)
+  turns = told[: len(told) // guarded.TURN * guarded.TURN].reshape(-1, guarded.TURN, groups)
   assert (turns == turns[:, :1]).all()  # whole turns
   turns = turns[:, 0]
   other = np.arange(len(turns)) % 4 == 3
   assert (turns[:, 1] == other).all() and (turns[:, 2] == other).all() and not turns[:, 3].any()
   # the worse learner leads until both sides have enough chunks, then the old weights do
   led = np.flatnonzero(turns[:, 0] != other)
-  assert led[0] > act.KEPT // act.TURN and (np.arange(led[0], len(turns)) == led).all()
-  assert weighed.back.tolist() == [True, False, False, False]
+  assert led[0] > guarded.KEPT // guarded.TURN and (np.arange(led[0], len(turns)) == led).all()
+  assert back.tolist() == [True, False, False, False]
   assert (np.asarray(acting["w"][:, 0]) == 1.0).tolist() == [True, False, False, False]
-  assert not guard.learnt.any() and not guard.acts.any()
-
-
-def decide_state(phase):
-  """A PhaseState of which act reads the phase alone."""
-  return phase_lib.init(EAGER)._replace(phase=phase)
+  assert not memory[1].learnt.any() and not memory[1].acts.any()
 
 
 # ---- a run of all arms ---------------------------------------------------------------------------
@@ -795,7 +804,7 @@ def test_events_say_what_started_and_ended_each_arm(lived):
   }
   for name, reasons in want.items():
     assert [r for _, r in events(out, name, "start")] == reasons, name
-  for name in ("detector", "rollback", "guarded", "world-model", "no-fault"):
+  for name in sorted(HEARD):
     acted = [s for s, r in events(out, name, "alarm") if r.startswith("acted on")]
     assert acted and [r for _, r in events(out, name, "start")] == [
       f"alarm at step {s}" for s in acted

@@ -332,7 +332,7 @@ def test_shapes_are_those_of_what_is_packed(make, learners, rollback):
   one = lambda x: x[:, :1]
   for g in range(5, 5 + learners):
     robot = jax.tree.map(one, runner.lives.herds[0].streams)
-    runner.lives._join(g, runner.loop.init(runner.trained.train, 1, rollback), robot)
+    runner.lives._join(g, runner.loop.init(runner.trained.train, 1, runner.lives.methods), robot)
   tree, bands = packing.pack(runner.lives)
   assert bands == [list(range(5, 5 + learners))[k : k + 4] for k in range(0, learners, 4)]
   shapes = lambda tree: jax.tree.map(lambda x: (x.shape, str(x.dtype)), tree)

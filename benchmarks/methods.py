@@ -1,0 +1,20 @@
+"""Methods that are told the onset, as arms: what a method gains is not mixed with what the detector
+misses. `mjx-cl bench benchmarks/methods.toml` from the repository's root.
+"""
+
+from mjx_cl.adapt.arms import ONSET, RULE, Arm
+
+
+def staged() -> Arm:
+  """World model, then critic, then actor."""
+  return Arm("method `staged`, told the onset", ONSET, RULE, method="staged")
+
+
+def calm() -> Arm:
+  """Explores in dreams alone."""
+  return Arm("method `calm`, told the onset", ONSET, RULE, method="calm")
+
+
+def guarded() -> Arm:
+  """Old and new weights by turns."""
+  return Arm("method `guarded`, told the onset", ONSET, RULE, method="guarded")

@@ -1,0 +1,113 @@
+"""What a method is: pure functions of one stream that say what of an update is learnt and which
+weights act.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from mjx_cl.dreamer.agent import Agent, TrainState
+from mjx_cl.dreamer.state import Record
+
+
+class View(NamedTuple):
+  """What a method may read of the chunk (64 decisions) that one stream has just lived.
+
+  Attributes:
+    was: int32 (), phase before it, of decide.NOMINAL to decide.ENDED.
+    phase: int32 (), phase after it.
+    begins: bool (), an adaptation begins in it.
+    over: bool (), an adaptation ends in it, however it does.
+    reward: float32 (), mean reward a control step.
+    recent: float32 (), mean reward of the last `patience` chunks of the adaptation; nan: of none.
+    signals: float32 (6,), means in the order of decide.SIGNALS; nan: unknown.
+    taken: int32 (), updates of the learner after it.
+    rate: float32 (), how far what acts is drawn towards the learner; 0 without an update.
+    acted: parameters that acted in it.
+    learner: parameters of the learner after it.
+  """
+
+  was: jax.Array
+  phase: jax.Array
+  begins: jax.Array
+  over: jax.Array
+  reward: jax.Array
+  recent: jax.Array
+  signals: jax.Array
+  taken: jax.Array
+  rate: jax.Array
+  acted: Any
+  learner: Any
+
+
+class Acts(NamedTuple):
+  """What a method answers.
+
+  Attributes:
+    params: that act, and predict, in the chunk to come; where an adaptation is over the learner
+      goes on from them too.
+    memory: of the method.
+    back: bool (), the weights of before the adaptation are put back: a row `rollback` of
+      events.parquet, with the two that follow.
+    earned: float32 (), mean reward a step of the weights of before.
+    earns: float32 (), of the learner's.
+  """
+
+  params: Any
+  memory: Any
+  back: jax.Array | bool = False
+  earned: jax.Array | float = jnp.nan
+  earns: jax.Array | float = jnp.nan
+
+
+# (agent, memory, state, batch, key) -> (state', metrics, latents), as Agent.update
+Update = Callable[
+  [Agent, Any, TrainState, Record, jax.Array],
+  tuple[TrainState, dict[str, jax.Array], tuple[jax.Array, jax.Array]],
+]
+
+
+def follow(params: Any, learner: Any, rate: jax.Array) -> Any:
+  """Params + rate (learner - params), leaf by leaf."""
+  return jax.tree.map(lambda a, p: a + rate * (p - a), params, learner)
+
+
+def average(memory: Any, view: View) -> Acts:
+  """The paper's way: a moving average of the learner's weights acts, and stays in the end."""
+  return Acts(follow(view.acted, view.learner, view.rate), memory)
+
+
+@dataclass(frozen=True)
+class Method:
+  """How a stream learns and acts once an adaptation has begun; before, every stream acts by the
+  agent that it came with. All functions are pure, of one stream, and traced by JAX.
+
+  Attributes:
+    init: params -> memory, a pytree of arrays whose shapes and types stay; `params` are those that
+      act when the first adaptation begins.
+    act: (memory, View) -> Acts, after every chunk from the one on in which the first adaptation
+      begins.
+    keep: (memory, TrainState, TrainState) -> TrainState: of the states before and after an update
+      what the learner goes on with. None: the latter.
+    update: one update of the learner, see Update; None: Agent.update. Where its metrics show a loss
+      at fault the stream is given up.
+    hides: memory -> bool (): the chunk was not lived by what learns, the stop rule looks away.
+    copies: sets of parameters that the memory holds, for the memory that a run says it takes.
+    weighs: `act` fills back, earned and earns.
+  """
+
+  init: Callable[[Any], Any] = lambda params: ()
+  act: Callable[[Any, View], Acts] = average
+  keep: Callable[[Any, TrainState, TrainState], TrainState] | None = None
+  update: Update | None = None
+  hides: Callable[[Any], jax.Array] | None = None
+  copies: int = 0
+  weighs: bool = False
+
+
+PAPER = Method()

@@ -1,0 +1,273 @@
+"""Methods: one contract for each that ships, is installed or stands in the docs, and what is said of
+one that breaks it.
+"""
+
+import dataclasses
+import functools
+import pathlib
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import quick
+from test_arms import EAGER, STEPS, hand_rows, scripted
+
+from mjx_cl.adapt import decide, methods
+from mjx_cl.adapt.arms import ALARM, ARMS, RULE, Arm
+from mjx_cl.adapt.loop import Loop, choices
+from mjx_cl.adapt.methods import Acts, Method, calm, staged
+from mjx_cl.config import PRESETS, RunConfig
+from mjx_cl.dreamer.agent import Agent
+from mjx_cl.errors import PluginError, UserError
+from mjx_cl.rollout.monitor import Monitor
+from mjx_cl.runs import identity, settings
+from mjx_cl.types import Spec
+
+ROOT = pathlib.Path(__file__).parents[2]
+CHUNKS, ALARMED = 14, 37  # chunks lived; row of the alarm
+END = 10  # chunk in which the first adaptation ends, where it has a budget
+AGENT = Agent(dataclasses.replace(PRESETS["tiny"].dreamer, batch=4, length=8, imagine=4), 24, 6)
+LASTING = dataclasses.replace(EAGER, budget=END * STEPS - ALARMED, patience=99)
+TASK = Spec("", (), (), 0.02, 100, 0.6, None, ())
+
+
+@pytest.fixture(scope="module")
+def example(tmp_path_factory):
+  """The method of docs/extending.md as FILE.py:make."""
+  block = re.search(
+    r"```python\n(# trust\.py.*?)```", (ROOT / "docs/extending.md").read_text(), re.S
+  )
+  path = tmp_path_factory.mktemp("methods") / "trust.py"
+  path.write_text(block[1])
+  assert len(block[1].splitlines()) < 60
+  return f"{path}:trust"
+
+
+NAMES = [*methods.METHODS, "example"]
+NAMES += [name for name in ARMS if name not in ARMS.own and methods.of(ARMS[name]) != methods.PAPER]
+
+
+@pytest.fixture
+def arm(request, example):
+  """Name of an arm of the method, started by alarms."""
+  own = {"paper": "detector", "example": example}
+  return own.get(request.param, request.param)
+
+
+each = pytest.mark.parametrize("arm", NAMES, indirect=True)
+
+
+def begin(loop, arms, train):
+  """State and choices of streams of arms."""
+  labels = [(arm, i) for i, arm in enumerate(arms)]
+  chosen = choices(labels, loop.config, STEPS * CHUNKS)
+  state = loop.init(train, len(arms), chosen.methods.all)
+  at = jnp.tile(jnp.array([ALARMED, -1, -1]), (len(arms), 1))
+  return state._replace(detector=state.detector._replace(at=at)), chosen
+
+
+@functools.cache
+def loop_of(arms):
+  """The loop that lives these arms; a program is compiled once."""
+  loop = Loop(AGENT, Monitor(AGENT, n=4, least=2), scripted(), TASK, LASTING, capacity=512)
+  loop.programs = quick.programs(loop)
+  return loop
+
+
+def live(arms, at=0, state=None):
+  """[state of each chunk from `at` on, the begin included], [digest], of streams of arms whose
+  detectors all alarm at the same row; `state`: goes on from that one.
+  """
+  loop = loop_of(arms)
+  train = jax.jit(AGENT.init)(jax.random.key(0))
+  # past the warm-up of the learning rate; fresh heads say exactly 0
+  shake = lambda x: x + 0.01 * jax.random.normal(jax.random.key(x.size), x.shape)
+  train = train._replace(params=jax.tree.map(shake, train.params), updates=jnp.int32(2000))
+  new, chosen = begin(loop, arms, train)
+  state = new if state is None else jax.tree.map(jnp.array, state)
+  keys = jax.vmap(jax.random.key)(jnp.arange(len(arms)))
+  copy = lambda tree: jax.tree.map(lambda x: np.array(x), tree)
+  states, digests = [copy(state)], []
+  for c in range(at, CHUNKS):
+    rows = hand_rows(c * STEPS, len(arms))
+    state, digest = loop.digest(state, rows, jnp.int32((c + 1) * STEPS), chosen, keys)
+    states.append(copy(state))
+    digests.append(copy(digest))
+  assert quick.traces(loop.programs) == (1, 0, 1)  # the memory's shapes and types stay
+  return states, digests
+
+
+@pytest.fixture(scope="module")
+def lived():
+  """lived(arm): a life of it beside the paper's method and one that never learns."""
+  kept = {}
+  return lambda arm: kept[arm] if arm in kept else kept.setdefault(arm, live(three(arm)))
+
+
+def three(arm):
+  """It, the paper's and one that never learns."""
+  return arm, "detector", "none"
+
+
+def stream(tree, g):
+  """Of stream g, of fields that lead with streams."""
+  return jax.tree.map(lambda x: x[g], tree)
+
+
+@each
+def test_shapes_are_right(arm):
+  methods.check(arm, methods.of(ARMS[arm]), AGENT)
+
+
+@each
+def test_it_is_frozen_until_the_alarm(lived, arm, same):
+  states, digests = lived(arm)
+  first = next(c for c, d in enumerate(digests) if d.decision[0] == decide.START)
+  assert first == ALARMED // STEPS
+  for state in states[: first + 1]:
+    for tree in ("acting", "train"):
+      assert same(stream(getattr(state, tree), 0), stream(getattr(states[0], tree), 0))
+  assert digests[-1].updates[0] > 0
+  changed = lambda tree: not same(stream(tree(states[-1]), 0), stream(tree(states[0]), 0))
+  assert changed(lambda s: s.acting) and changed(lambda s: s.train.params)
+
+
+@each
+def test_it_learns_from_what_came_after_the_alarm_alone(lived, arm):
+  states, digests = lived(arm)
+  rows = states[-1].replay.data.obs[0, 0, :, 0]
+  count = int(states[-1].replay.count[0, 0])
+  assert count > 5 * STEPS and (rows[:count] > ALARMED).all()
+
+
+@each
+def test_others_are_untouched(lived, arm, same):
+  """The stream that never learns to the last bit; the paper's as without the method beside it, up
+  to rounding: it is another program.
+  """
+  states, digests = lived(arm)
+  for tree in ("acting", "train"):
+    assert same(stream(getattr(states[-1], tree), 2), stream(getattr(states[0], tree), 2))
+  alone, _ = lived("detector")
+  for a, b in zip(jax.tree.leaves(states[8].acting), jax.tree.leaves(alone[8].acting)):
+    np.testing.assert_allclose(a[1], b[1], rtol=1e-3, atol=1e-4)
+
+
+@each
+def test_what_acts_when_it_is_over_is_learnt_on_from(lived, arm, same):
+  states, digests = lived(arm)
+  over = next(c for c, d in enumerate(digests) if d.decision[0] == decide.ABORT_BUDGET)
+  for state in states[over + 1 :]:
+    assert same(stream(state.acting, 0), stream(state.train.params, 0))
+    assert same(stream(state.acting, 0), stream(states[over + 1].acting, 0))
+
+
+@each
+def test_it_goes_on_from_a_checkpoint(lived, arm, same):
+  states, _ = lived(arm)
+  again, _ = live(three(arm), 6, states[6])
+  assert same(again[-1], states[-1])
+
+
+def test_the_tables_name_each_other():
+  own = {arm.method for name, arm in ARMS.items() if name in ARMS.own}
+  assert own == set(methods.METHODS)
+  assert methods.used(("none", "calm", "rollback")) == (
+    methods.PAPER,
+    methods.METHODS["rollback"],
+    methods.METHODS["calm"],
+  )
+
+
+def test_stages_by_hand(same):
+  """Which parts of a state an update changes, by the number of updates before it."""
+  train = jax.jit(AGENT.init)(jax.random.key(0))
+  after = jax.tree.map(lambda x: x + 1, train)
+  parts = {k: (lambda s, k=k: s.params[k]) for k in train.params}
+  parts |= {"slow": lambda s: s.slow, "range": lambda s: s.range}
+  for taken, still in ((0, 2), (staged.MODEL - 1, 2), (staged.MODEL, 1), (staged.CRITIC, 0)):
+    kept = staged.keep(jnp.int32(taken), train, after)
+    held = {k for k, part in parts.items() if same(part(kept), part(train))}
+    assert held == [set(), {"pol"}, {"pol", "val", "slow", "range"}][still], taken
+    assert kept.updates == after.updates
+
+
+def test_a_calm_robot_explores_in_dreams_alone(lived):
+  states, digests = lived("calm")
+  deter = jax.random.normal(jax.random.key(1), (5, AGENT.size.deter))
+  stoch = AGENT.hot(jnp.zeros((5, AGENT.size.stoch), int))
+  spread = lambda params: np.asarray(AGENT._policy(stream(params, 0), deter, stoch)[1])
+  learning = [c for c, d in enumerate(digests) if d.phase[0] == decide.ADAPTING and d.updates[0]]
+  least, _ = AGENT.deviations
+  for c, state in enumerate(states[1:]):
+    assert (spread(state.train.params) > 2 * least).all()  # what dreams
+    np.testing.assert_allclose(
+      spread(state.acting).min(), least if c in learning else spread(state.acting).min(), rtol=1e-5
+    )
+    assert (spread(state.acting).max() < 1.001 * least) == (c in learning)
+  assert len(learning) > 3 and calm.LOW < -15
+
+
+def test_an_update_of_ones_own_takes_the_place_of_dreamers(same):
+  """The world's losses alone, by a gradient step of the method's own, in a stream beside another."""
+
+  def update(agent, memory, state, batch, key):
+    learnt, metrics, latents = agent.update(state, batch, key)
+    return learnt._replace(params={**learnt.params, "pol": state.params["pol"]}), metrics, latents
+
+  ARMS.members["own"] = lambda: Arm("", ALARM, RULE, method=Method(update=update))
+  try:
+    states, digests = live(three("own"))
+  finally:
+    del ARMS.members["own"]
+  own, paper = stream(states[-1].train, 0), stream(states[-1].train, 1)
+  assert same(own.params["pol"], stream(states[0].train.params["pol"], 0))
+  assert not same(paper.params["pol"], stream(states[0].train.params["pol"], 1))
+  assert digests[-1].updates[0] == digests[-1].updates[1] > 0
+
+
+BROKEN = {
+  "init of its method fails: KeyError": Method(init=lambda params: params["policy"]),
+  "act of its method fails: AttributeError": Method(act=lambda memory, view: view.weights),
+  "act of its method must give an Acts": Method(act=lambda memory, view: view.acted),
+  "act of its method must keep structure, shapes and types of the parameters": Method(
+    act=lambda memory, view: Acts(view.acted["pol"], memory)
+  ),
+  "act of its method must keep structure and shapes of memory": Method(
+    act=lambda memory, view: Acts(view.acted, (1.0,))
+  ),
+  "keep of its method must keep structure, shapes and types of the learner's state": Method(
+    keep=lambda memory, before, after: after.params
+  ),
+  "hides of its method must keep structure, shapes and types of one bool": Method(
+    hides=lambda memory: 1.0
+  ),
+}
+
+
+@pytest.mark.parametrize("said", BROKEN)
+def test_a_broken_method_is_refused_in_a_line(said):
+  with pytest.raises(PluginError) as e:
+    methods.check("mine", BROKEN[said], AGENT)
+  assert str(e.value).startswith(f"arm 'mine': {said}") and "\n" not in str(e.value)
+
+
+def test_what_is_no_arm_is_refused_in_a_line(tmp_path):
+  file = tmp_path / "mine.py"
+  file.write_text("def fails():\n  raise ValueError('no luck')\ndef other():\n  return 3\n")
+  for name, said in (
+    ("fails", "cannot be made: ValueError: no luck"),
+    ("other", "must give a mjx_cl.adapt.arms.Arm; got 3"),
+    ("othr", "has nothing of the name 'othr' that can be called; did you mean 'other'"),
+  ):
+    with pytest.raises((PluginError, UserError), match=re.escape(said)):
+      settings.check(RunConfig("walker", arms=(f"{file}:{name}",)))
+
+
+def test_a_run_knows_the_file_of_its_arm(example):
+  """A run that goes on notices that the method has changed meanwhile."""
+  config = settings.check(RunConfig("walker", arms=("none", example)))
+  files = identity.identity(config)["files"]
+  assert set(files) == {example} and len(files[example]) == 64
