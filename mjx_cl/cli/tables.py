@@ -97,11 +97,15 @@ def fits(shown: Table, on: Console) -> bool:
 
 
 def _cell(arm: dict, key: str, form: str, of: str | None = None) -> str:
-  """A number of an arm, out of how many, and its 95 % interval below it; - for what is unknown."""
+  """A number of an arm, and its 95 % interval below it, where it is one out of several that of its
+  share; - for what is unknown.
+  """
   number = lambda x: "-" if x is None else format(round(x, 9), form)
   text, interval = number(arm[key]), arm.get(f"{key}_ci")
   if of and arm[key] is not None:
     text = f"{text} of {arm[of]}"
+    share = lambda x: f"{x / max(1, arm[of]):.0%}"
+    return f"{text}\n[{', '.join(map(share, interval))}]" if interval else text
   return f"{text}\n[{', '.join(map(number, interval))}]" if interval else text
 
 

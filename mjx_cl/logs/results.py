@@ -129,7 +129,9 @@ def faults_figure(summary: dict, file: pathlib.Path | str | BinaryIO) -> None:
     dark = shade[at] > 0.6
     axis.text(*at[::-1], text, ha="center", va="center", fontsize=8, color="w" if dark else "k")
   axis.imshow(shade, cmap="Blues", vmin=0, vmax=1, aspect="auto")
-  axis.set_xticks(range(len(kinds)), kinds, fontsize=8)
+  units = {"scale": "share", "freeze": "", "dropout": "share", "delay": "samples"}
+  named = [f"{kind}\n{units.get(kind, 'in its unit')}" for kind in kinds]
+  axis.set_xticks(range(len(kinds)), named, fontsize=8)
   axis.set_yticks(range(len(columns)), columns, fontsize=8)
   within, rate = summary["inject"]["within"], summary["rate_hz"]
   time = f"{within:,} samples" if rate is None else f"{within / rate:g} s"

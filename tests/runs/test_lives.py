@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from mjx_cl.adapt import decide
-from mjx_cl.adapt.choices import Choices
+from mjx_cl.adapt.choices import Choices, Methods
 from mjx_cl.config import CHUNK, FOREVER, AdaptConfig, RunConfig
 from mjx_cl.errors import FileError
 from mjx_cl.io.checkpoints import Checkpoints
@@ -295,7 +295,8 @@ def test_a_stream_departs_where_the_phase_machine_starts(repeat):
       jnp.asarray(at),
       one(True, bool),
       one(9999, jnp.int32),
-      one(False, bool),
+      one(0, jnp.int32),
+      Methods(),
       None,
     )
     want = bool(starts(fired, jnp.int32(phase), chosen, jnp.int32(now), own))
