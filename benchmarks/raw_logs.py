@@ -1,5 +1,5 @@
 """What `mjx-cl detect` finds in the raw logs of our own robots, without their world model: python
-benchmarks/raw_logs.py [--out results/raw_logs.json]
+benchmarks/raw_logs.py [--out results/raw_logs.json] [--innovations]
 
 Frozen shipped agents drive robots with the faults of suite `leaderboard` (all that score), on seeds
 that tune. A log holds what the robot sees and does, observation and action, a column each. The
@@ -9,6 +9,11 @@ are set to one false alarm in as many samples as the board's detectors, all thre
 they give, alarms within 10 s as one, is counted on healthy robots of still other seeds. Found: an
 alarm within 5 s of the onset. Beside it the same share of detectors that watch the world model's
 residuals, of the same faults on seeds 0 to 9 (results/leaderboard.parquet).
+
+With --innovations a log holds what the world model did not foresee instead: the signed one-step
+errors of every variable and of the reward, observation less prediction, the mean of SAMPLES draws
+of the prior, in multiples of a unit that symlog makes alike (errors of symlog values, as the model
+is trained on).
 """
 
 from __future__ import annotations
@@ -27,6 +32,7 @@ import numpy as np  # noqa: E402
 
 from mjx_cl import envs, faults  # noqa: E402
 from mjx_cl.cli import app  # noqa: E402
+from mjx_cl.dreamer import nets  # noqa: E402
 from mjx_cl.io import tables  # noqa: E402
 from mjx_cl.leaderboard import lives, parts, suite  # noqa: E402
 from mjx_cl.logs import charts, verdict  # noqa: E402
@@ -37,12 +43,29 @@ from mjx_cl.training import agents  # noqa: E402
 ROBOTS = ("walker", "quadruped", "car")
 SEEDS, NOMINAL, QUIET = range(100, 103), range(120, 128), range(128, 136)
 WITHIN_S, APART_S, CHUNK = 5.0, 2.5, 64
+SAMPLES = 4  # draws of the prior that a prediction is the mean of
 PAUSE_S = 10.0  # alarms that are closer are one event, as `detect` has it
 BESIDE = ("learnt", "multichart", "cusum", "rolling_sigma")  # of the board
 
 
-def live(env, trained, who, keys, onsets, steps) -> tuple[np.ndarray, np.ndarray]:
-  """Observation and action (lanes, steps, columns), and which steps begin an episode."""
+def innovations(agent, params, rows, keys) -> np.ndarray:
+  """Signed one-step errors of symlog observations and of the reward, (T, lanes, O + 1)."""
+
+  def one(deter, stoch, action, obs, reward, key):
+    ahead = lambda k: agent.open_loop(params, deter, agent.hot(stoch), action[None], k)
+    seen, earned = jax.vmap(ahead)(jax.random.split(key, SAMPLES))
+    wrong = nets.symlog(obs) - jnp.mean(nets.symlog(seen[:, 0]), 0)
+    return jnp.concatenate([wrong, (reward - jnp.mean(earned[:, 0], 0))[:, None]], -1)
+
+  one_chunk = jax.vmap(one)  # over the rows
+  fields = (rows.deter, rows.stoch, rows.action, rows.final_obs, rows.reward)
+  return one_chunk(*(x[:, 0] for x in fields), keys)
+
+
+def live(env, trained, who, keys, onsets, steps, ahead) -> tuple[np.ndarray, np.ndarray]:
+  """Observation and action, or where `ahead` the innovations, (lanes, steps, columns), and which
+  steps begin an episode.
+  """
   names = list(dict.fromkeys(lane.fault for lane in who if lane.fault))
   breaks = tuple(faults.make(n, env) for n in names) or (faults.none(env),)
   severity, target, _ = lives._drawn(who, names, breaks)
@@ -58,9 +81,15 @@ def live(env, trained, who, keys, onsets, steps) -> tuple[np.ndarray, np.ndarray
   )
   params = jax.tree.map(lambda x: x[None], trained.train.params)
   seen, episodes = [], []
-  for _ in range(-(-steps // CHUNK)):
+  errors = jax.jit(lambda rows, key: innovations(
+    trained.agent, trained.train.params, rows, jax.random.split(key, CHUNK)
+  ))  # fmt: skip
+  for k in range(-(-steps // CHUNK)):
     state, rows = rollout.chunk(params, state, CHUNK)
-    seen.append(np.concatenate([np.asarray(rows.obs)[:, 0], np.asarray(rows.action)[:, 0]], -1))
+    if ahead:
+      seen.append(np.asarray(errors(rows, jax.random.key(k))))
+    else:
+      seen.append(np.concatenate([np.asarray(rows.obs)[:, 0], np.asarray(rows.action)[:, 0]], -1))
     episodes.append(np.asarray(rows.episode)[:, 0])
   episode = np.concatenate(episodes)[:steps].T
   fresh = np.diff(episode, axis=1, prepend=episode[:, :1]) != 0
@@ -75,8 +104,8 @@ def gapped(x: np.ndarray, fresh: np.ndarray, rows: int) -> np.ndarray:
   return x
 
 
-def robot(name: str) -> dict:
-  """Shares found of a robot's faults, the charts' and the board's."""
+def robot(name: str, ahead: bool) -> dict:
+  """Shares found of a robot's faults, the charts' and the board's; `ahead`: in innovations."""
   env, board = envs.make(name), suite.suite("leaderboard")
   trained = agents.of(env, None)
   who, keys, onsets, steps, _ = parts.who_lives(board, name, "tune", "fault", env.spec.control_s)
@@ -94,7 +123,7 @@ def robot(name: str) -> dict:
   for seeds in (NOMINAL, QUIET):
     lanes, drawn = [lives.Lane(s) for s in seeds], jnp.stack([jax.random.key(s) for s in seeds])
     steps_ = board.nominal["steps"]
-    logs, fresh = live(env, trained, lanes, drawn, np.zeros(len(lanes)), steps_)
+    logs, fresh = live(env, trained, lanes, drawn, np.zeros(len(lanes)), steps_, ahead)
     sound.append([gapped(x, f, apart) for x, f in zip(logs, fresh)])
   past = np.concatenate(sound[0])
   varies = np.nanstd(past, 0) > 1e-6
@@ -107,7 +136,7 @@ def robot(name: str) -> dict:
   false = sum(events(np.flatnonzero(fired(x))) for x in sound[1])
   counted = sum(len(x) for x in sound[1])
   hits: dict[tuple[str, float], list[bool]] = {}
-  logs, fresh = live(env, trained, who, keys[keep], onsets[keep], steps)
+  logs, fresh = live(env, trained, who, keys[keep], onsets[keep], steps, ahead)
   for lane, onset, x, begin in zip(who, onsets[keep], logs, fresh):
     if lane.fault:
       alarms = fired(gapped(x, begin, apart))[onset : onset + within]
@@ -137,7 +166,7 @@ def robot(name: str) -> dict:
 def main(args) -> None:
   began, found = time.monotonic(), []
   for name in args.robot:
-    found.append(robot(name))
+    found.append(robot(name, args.innovations))
     print({k: v for k, v in found[-1].items() if k != "faults"}, flush=True)
   if args.out:
     command = " ".join(["python", *sys.argv])
@@ -149,4 +178,5 @@ if __name__ == "__main__":
   parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
   parser.add_argument("--robot", nargs="+", choices=ROBOTS, default=ROBOTS)
   parser.add_argument("--out")
+  parser.add_argument("--innovations", action="store_true")
   sys.exit(app.attempt(lambda: main(parser.parse_args())))

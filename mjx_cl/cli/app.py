@@ -148,15 +148,30 @@ def read(kind: Any, argv: list[str], **how: Any) -> Any:
     raise UserError(_mistake(said, argv) or "wrong arguments; see mjx-cl --help") from None
 
 
+def _commands_with(flag: str) -> list[str]:
+  """Commands that take --flag."""
+  name = flag.lstrip("-").partition("=")[0].replace("-", "_")
+  return [
+    f"mjx-cl {kind.__name__.lower()}"
+    for kind in COMMANDS
+    if name in {f.name for f in dataclasses.fields(kind)}
+  ]
+
+
 def _mistake(said: str, argv: list[str]) -> str:
   """What tyro says of a mistake, without its excerpts of the help."""
   command = " ".join(["mjx-cl", *(word for word in argv[:1] if not word.startswith("-"))])
   if found := re.match(
-    r"Unrecognized options: (.*?)(?: Available .*)?(?: Perhaps you meant: (--[\w.-]+).*)?$", said
+    r"Unrecognized (?:or misplaced )?options: (.*?)(?: Arguments are applied.*?)?"
+    r"(?: Available .*)?(?: Perhaps you meant: (--[\w.-]+).*)?$",
+    said,
   ):
-    words = found[1].split(", ")
+    words = re.sub(r" \(applied to [^)]*\)", ",", found[1]).replace(",,", ",").split(",")
+    words = [word.strip() for word in words if word.strip()]
     flags = [word for word in words if word.startswith("-")] or words
     meant = f"; did you mean {found[2]}?" if found[2] and len(flags) == 1 else ""
+    if homes := _commands_with(flags[0]) if len(flags) == 1 else ():
+      meant = f"; it is a flag of {', '.join(homes)}"
     return f"unknown argument of {command}: {', '.join(flags)}{meant}; see {command} --help"
   if re.match(r"Missing from ", said) and (
     flags := re.findall(r"(--[\w.-]+) [^()]*\(required\)", said)

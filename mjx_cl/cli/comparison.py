@@ -12,6 +12,8 @@ from mjx_cl.cli.tables import console, table
 from mjx_cl.errors import choose, require
 from mjx_cl.scoring import versus
 
+FEW = 6  # pairs, below which a bootstrap interval covers too rarely
+
 
 def do_compare(args: Compare) -> None:
   """Compares runs, or arms of one."""
@@ -57,10 +59,13 @@ def _show_comparison(rows: list[dict], first: str) -> None:
           "" if own else "-" if row["better"] is None else f"{row['better']:.0%}",
         )
       )
-    title = f"{measure}: {versus.MEASURES[measure][0]}"
+    what, more = versus.MEASURES[measure]
+    title = f"{measure}: {what}; {'more' if more else 'fewer'} is better"
     close = {"box": box.SIMPLE, "pad_edge": False, "collapse_padding": True}
     console().print(table(heads, cells, left=("variant",), title=title, **close))
   print(
     f"n: streams; IQM: interquartile mean; difference: from {first[shared:]}, mean over pairs of "
-    "one seed; better: of pairs; [95 % interval]"
+    "one seed; better: of pairs, a tie is half a pair; [95 % interval]"
   )
+  if any(0 < row["pairs"] < FEW for row in rows if row["variant"] != first):
+    print(f"fewer than {FEW} pairs: such intervals are too narrow; take more seeds")

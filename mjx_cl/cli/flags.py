@@ -265,7 +265,8 @@ class Compare:
 
   Attributes:
     runs: FOLDER or FOLDER:ARM; of one folder alone all of its arms, of several the arm `detector`.
-    measure: Of the table; default: all.
+      The first is what the others are compared with.
+    measure: reward_final, reward_kept, return_lost, terminations, updates; default: all.
     out: Picture (.png): shares of streams that keep so much of their reward.
     overwrite: Replace --out.
   """

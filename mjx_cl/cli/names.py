@@ -18,6 +18,13 @@ FILE = pathlib.Path(__file__).parent / "names.json"  # what registries.tables gi
 GROUPS = ("mjx_cl.envs", "mjx_cl.faults", "mjx_cl.detectors", "mjx_cl.methods")  # of entry points
 
 
+# of headings that do not speak for themselves
+ABOUT = {
+  "suites": " (of recorded streams, for leaderboard and record)",
+  "benches": " (suites of runs, for bench)",
+}
+
+
 def _live(kinds: Iterable[str]) -> dict[str, dict[str, str]]:
   runtime.setup()
   from mjx_cl.cli import registries  # imports JAX
@@ -36,7 +43,7 @@ def do_list(args: List) -> None:
     return
   wide = max(60, shutil.get_terminal_size((100, 24)).columns)
   for kind in chosen:
-    print(kind)
+    print(kind + ABOUT.get(kind, ""))
     for name, about in known[kind].items():
       line = f"  {name:22s} {about}"
       print(textwrap.fill(line, wide, subsequent_indent=" " * 25, break_on_hyphens=False))

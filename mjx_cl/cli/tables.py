@@ -129,7 +129,8 @@ def show_summary(s: dict, out: str) -> None:
   """
   shares = ", ".join(f"{k} {v:.0%}" for k, v in s["wall_share"].items())
   print(f"{_headline(s)}; {clock(s['wall_s'])} wall ({shares})")
-  dropped = _show_arms(("arm",), [((name,), arm) for name, arm in s["arms"].items()])
+  arms = [((name,), arm) for name, arm in s["arms"].items()]
+  dropped = _show_arms(("arm",), arms, s["steps"] - s["onset"])
   _explain(dropped, "95 % interval", "summary.json")
   print(f"files in {out}")
 
@@ -146,7 +147,7 @@ def show_agents(together: dict, apart: Mapping[str, dict]) -> None:
   for arm, every in together["arms"].items():
     rows += [((arm, f"all {len(apart)}"), every)]
     rows += [((arm, agent), own["arms"][arm]) for agent, own in apart.items()]
-  dropped = _show_arms(("arm", "agent"), rows)
+  dropped = _show_arms(("arm", "agent"), rows, together["steps"] - together["onset"])
   interval = "95 % interval, of all by a bootstrap of agents and then of their streams"
   _explain(dropped, interval, "bench.json")
 
@@ -159,13 +160,18 @@ def _headline(s: dict) -> str:
   )
 
 
-def _show_arms(names: tuple[str, ...], arms: Collection[tuple[tuple[str, ...], dict]]) -> int:
-  """Prints a row for each of `arms`, its names first; returns how many of DROPPED had no room."""
+def _show_arms(
+  names: tuple[str, ...], arms: Collection[tuple[tuple[str, ...], dict]], lived: int
+) -> int:
+  """Prints a row for each of `arms`, its names first; returns how many of DROPPED had no room.
+  `lived`: control steps after the onset.
+  """
   on = console()
+  within = lambda name: name.replace("10,000", f"{min(10_000, lived):,}")
   for dropped in range(len(DROPPED) + 1):
     kept = {k: cell for k, cell in COLUMNS.items() if k not in DROPPED[:dropped]}
     rows = [(*own, *(cell(arm) for cell in kept.values())) for own, arm in arms]
-    shown = table((*names, *kept), rows, left=(*names, "outcome"), show_lines=True)
+    shown = table((*names, *map(within, kept)), rows, left=(*names, "outcome"), show_lines=True)
     if fits(shown, on):
       break
   on.print(shown)
@@ -228,7 +234,9 @@ def detect_table(rows: list[dict], columns: bool) -> Table:
 
 def _columns(event: dict) -> str:
   """Columns of an event, with what happened to them."""
-  how = lambda c: f"mean {c['by']:+.3g}" if c["how"] == "mean" else f"spread x{c['by']:.2f}"
+  how = lambda c: (
+    f"mean by about {c['by']:+.2g}" if c["how"] == "mean" else f"spread x{c['by']:.2f}"
+  )
   return ", ".join(f"{c['column']} ({how(c)})" for c in event["columns"]) or "all a little"
 
 
@@ -246,19 +254,19 @@ def show_verdict(summary: dict) -> None:
     print(f"{'changed' if not k else 'and again'} from {_at(event)} on: {_columns(event)}")
     chance = f"{event['expected']:.1g}" if event["expected"] > 1e-9 else "less than 1e-09"
     print(
-      f"  {len(event['charts'])} of {verdict['of']} charts agree; events as clear expected in a "
-      f"healthy log of this length: {chance}"
+      f"  {len(event['charts'])} of {verdict['of']} charts agree; of events as clear a healthy log "
+      f"of this length has {chance}"
     )
   if not believed:
     names = summary["columns"]
     which = ", ".join(names) if len(names) <= 8 else f"{len(names)} columns"
     print(f"no change in {which} that a healthy log of this length would not show as well")
   if doubted:
-    print(f"{doubted} more alarm{'s' * (doubted > 1)} of a kind that a healthy log shows as well")
+    print(f"{doubted} more event{'s' * (doubted > 1)} of a kind that a healthy log shows as well")
   alarms = summary["false_alarms"]
   print(
-    f"false alarms: {alarms['counted']:,} in the nominal log by cross-validation, "
-    f"{alarms['expected']:.3g} are asked for"
+    f"false alarms: {alarms['counted']:,} in the nominal log by cross-validation; at the rate that "
+    f"is set, {alarms['expected']:.3g} are expected"
   )
   if faults := summary.get("inject", {}).get("faults"):
     _show_faults(faults, summary["inject"]["within"], summary["rate_hz"])

@@ -68,18 +68,23 @@ def claim(out: pathlib.Path | str, overwrite: bool) -> pathlib.Path:
 
 def write(result: Detection, out: pathlib.Path | str) -> None:
   """Writes detect.json, alarms.csv (one line per detector, column and alarm) and detect.png into
-  folder `out`, and inject.csv and inject.png where faults were put into the nominal log.
+  folder `out`, and inject.csv and inject.png where faults were put into the nominal log. `event` of
+  an alarm: the number, from 1, of the event of detect.json that it lies in, where that is believed.
   """
   out, text = pathlib.Path(out), io.StringIO()
   alarms = csv.writer(text, lineterminator="\n")
-  alarms.writerow(("detector", "column", "sample", "seconds", "score"))
+  alarms.writerow(("detector", "column", "sample", "seconds", "score", "event"))
+  event = np.zeros(len(result.xs), int)
+  for k, own in enumerate(result.summary.get("events", ()), 1):
+    if own["believed"]:
+      event[own["begin"] : own["end"]] = k
   for detector, fired in result.fired.items():
     names = watched(fired, result.summary["columns"])
     for t, c in np.argwhere(fired):
       score = result.scores[detector][t, c]
       at = "" if result.seconds is None else f"{result.seconds[t]:.9g}"
       told = f"{score:.9g}" if np.isfinite(score) else ""
-      alarms.writerow((detector, names[c], t, at, told))
+      alarms.writerow((detector, names[c], t, at, told, event[t] or ""))
   faults = result.summary.get("inject", {}).get("faults", [])
   with folders.together():
     if faults:
@@ -155,6 +160,7 @@ def figure(result: Detection, file: pathlib.Path | str | BinaryIO, panels: int =
   import matplotlib.pyplot as plt
 
   names, (steps, _) = result.summary["columns"], result.xs.shape
+  step = _step(result)
   hits = sum(fired.sum(0) for fired in result.fired.values())
   shown = sorted(sorted(range(len(names)), key=lambda c: -hits[c])[:panels])
   height = [1.5] * len(shown) + [0.35 + 0.22 * len(result.fired)]
@@ -167,20 +173,21 @@ def figure(result: Detection, file: pathlib.Path | str | BinaryIO, panels: int =
     gridspec_kw={"height_ratios": height},
   )
   for axis, c in zip(axes, shown):
-    axis.plot(*_envelope(result.past[:, c], -len(result.past)), color="0.6", lw=0.7)
-    axis.plot(*_envelope(result.xs[:, c], 0), color="#1f5fa8", lw=0.7)
+    for x, begin, color in ((result.past, -len(result.past), "0.6"), (result.xs, 0, "#1f5fa8")):
+      at, line = _envelope(x[:, c], begin)
+      axis.plot(at * step, line, color=color, lw=0.7)
     axis.set_ylabel(f"ln {names[c]}" if result.summary["logarithm"] else names[c], fontsize=8)
     axis.tick_params(labelsize=8)
   for event in result.summary.get("events", ()):
     named = {column["column"] for column in event["columns"]} if event["believed"] else ()
     for axis, c in zip(axes, shown):
       if names[c] in named:
-        axis.axvspan(event["begin"], event["end"], color="#c4472b", alpha=0.2, lw=0)
+        axis.axvspan(event["begin"] * step, event["end"] * step, color="#c4472b", alpha=0.2, lw=0)
   _marks(result, axes[-1])
   for axis in axes:
     axis.axvline(0, color="k", lw=0.8)
     # the log that is judged keeps half of the width at least
-    axis.set_xlim(-min(len(result.past), steps), steps)
+    axis.set_xlim(-min(len(result.past), steps) * step, steps * step)
   hidden = f"; {len(names) - len(shown)} more columns watched" if len(names) > len(shown) else ""
   axes[0].set_title(
     f"{pathlib.Path(result.summary['log']).name}: alarms per detector (marks); nominal log in "
@@ -193,9 +200,10 @@ def figure(result: Detection, file: pathlib.Path | str | BinaryIO, panels: int =
 
 def _marks(result: Detection, axis: Axes) -> None:
   """Alarms of each detector as marks."""
+  step = _step(result)
   for k, (name, fired) in enumerate(result.fired.items()):
-    at = np.flatnonzero(fired.any(1))
-    early = np.flatnonzero(result.before[name]) - len(result.past)
+    at = np.flatnonzero(fired.any(1)) * step
+    early = (np.flatnonzero(result.before[name]) - len(result.past)) * step
     axis.plot(early, np.full(len(early), k), "|", color="0.6", ms=8, mew=1.2)
     axis.plot(at, np.full(len(at), k), "|", color="#c4472b", ms=8, mew=1.2)
   unsure = {r["detector"] for r in result.summary["detectors"] if r["calibrated"] is False}
@@ -209,9 +217,15 @@ def _marks(result: Detection, axis: Axes) -> None:
   axis.set_xlabel(_axis(result) + ("; * threshold not calibrated" if unsure else ""), fontsize=9)
 
 
-def _axis(result: Detection) -> str:
+def _step(result: Detection) -> float:
+  """Of the axis between two samples: in seconds where the log has a clock."""
   rate = result.summary["rate_hz"]
-  return "sample" if rate is None else f"sample ({1 / rate:.4g} s)"
+  return 1.0 if rate is None else 1 / rate
+
+
+def _axis(result: Detection) -> str:
+  unit = "sample" if result.summary["rate_hz"] is None else "time [s]"
+  return f"{unit} (below 0: the end of the nominal log)"
 
 
 def _envelope(x: np.ndarray, begin: int, bins: int = 2000) -> tuple[np.ndarray, np.ndarray]:

@@ -16,6 +16,7 @@ from mjx_cl.io import folders, tables
 from mjx_cl.render import style
 from mjx_cl.scoring import survival as estimate
 from mjx_cl.scoring.versus import Variant, profile
+from mjx_cl.scoring.versus import value as versus_value
 
 FEW = 3  # seeds that give no interval, see report.few
 
@@ -229,9 +230,15 @@ def _versus(found: list[Variant]) -> Figure:
     share, (low, high) = profile(one, levels)
     axis.step(levels, share, where="post", color=style.nth(k), lw=1.6, label=one.name)
     axis.fill_between(levels, low, high, step="post", color=style.nth(k), alpha=0.12, lw=0)
+  kept = [versus_value(row, "reward_kept") for one in found for row in one.rows.values()]
+  ends = (
+    np.clip([np.nanmin(kept), np.nanmax(kept)], 0.0, 1.2) if np.isfinite(kept).any() else (0, 1)
+  )
   axis.set(
+    title="right and high is better; band: 95 % interval",
     xlabel="reward over the last 2,000 steps / reward before the onset",
     ylabel="share of streams with at least that",
+    xlim=(max(0.0, ends[0] - 0.1), min(1.2, ends[1] + 0.1)),
     ylim=(-0.03, 1.05),
   )
   axis.legend(fontsize=8)

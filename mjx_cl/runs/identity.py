@@ -126,6 +126,11 @@ def departure(old: dict, changed: list[str]) -> str:
     return (
       f"was begun when its detector {old.get('detector')} had another default threshold than today"
     )
+  if changed == ["seeds"]:
+    return (
+      f"was begun with {old.get('seeds')} seeds; the others are a run of their own (--first-seed), "
+      "which --merge puts together with it"
+    )
   return f"was begun with another {', '.join(changed)}" if changed else ""
 
 

@@ -24,11 +24,12 @@ from typing import Any
 
 import numpy as np
 
+from mjx_cl import detectors, envs, faults
 from mjx_cl.adapt import decide as phase_lib
 from mjx_cl.adapt.loop import Programs
 from mjx_cl.config import RunConfig
 from mjx_cl.errors import FileError, UserError
-from mjx_cl.faults.presets import becomes
+from mjx_cl.faults.presets import becomes, changes
 from mjx_cl.io import folders, tables
 from mjx_cl.io.interrupt import Interruptible
 from mjx_cl.render import figures
@@ -97,7 +98,11 @@ def _begun(
 ) -> Runner | None:
   """A run that is ready for its next chunk; None where it is finished. Arguments of `execute`."""
   fresh = not pathlib.Path(out).exists()
-  state = folders.claim_folder(out, resume, overwrite)
+  try:
+    state = folders.claim_folder(out, resume, overwrite)
+  except UserError:
+    _known(config)  # a name that is wrong is the better news
+    raise
   out = pathlib.Path(out)  # not before: it would make the current folder of an empty name
   if state == "done":
     # `auto` physics is resolved there
@@ -122,6 +127,14 @@ def _begun(
     tables.write_json(out / "config.json", values)
     runner.fork()
   return runner
+
+
+def _known(config: RunConfig) -> None:
+  """Raises UserError where robot, fault, target or detector are not there."""
+  into = becomes(config)
+  robot = envs.make(config.env if into is None else into, config.physics)
+  faults.build(changes(config), robot, config.onset)
+  detectors.factory(config.detector)
 
 
 def live(

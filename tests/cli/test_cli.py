@@ -170,7 +170,7 @@ def test_version(capsys):
 
 def test_the_names_that_ship_are_those_of_the_registries():
   """`python -m mjx_cl.cli.names` writes them."""
-  groups = (envs.ENVS.group, faults.FAULTS.group, detectors.DETECTORS.group)
+  groups = (envs.ENVS.group, faults.FAULTS.group, detectors.DETECTORS.group, ARMS.group)
   assert groups == names.GROUPS
   assert json.loads(names.FILE.read_text()) == registries.tables(registries.TABLES)
 
@@ -225,7 +225,7 @@ def test_a_run_is_shown_as_a_table_with_intervals(capsys, monkeypatch):
     "-",
     "0.88",
   ]
-  assert [cell for cell in below if cell] == ["[269, 537]", "[1.2, 3.82]", "[0.85, 0.92]"]
+  assert [cell for cell in below if cell] == ["[269, 537]", "[30%, 96%]", "[0.85, 0.92]"]
   assert "[steps]" in out and out.endswith("files in runs/x\n")
 
 
@@ -416,7 +416,7 @@ RUN = {
   "setting without a name": (["run", "walker", "--set", "=5"], ["name=value", "'=5'"]),
   "arm": (
     ["run", "walker", "--arm", "detektor"],
-    ["detektor", "always, detector, guarded, no-fault, none, oracle"],
+    ["detektor", "always, calm, detector, guarded, no-fault, none, oracle"],
   ),
   "arm twice": (["run", "walker", "--arm", "none", "none"], ["once"]),
   "physics": (["run", "walker", "--physics", "warp"], ["warp", "native"]),

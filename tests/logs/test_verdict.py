@@ -377,7 +377,7 @@ def test_the_command_answers_three_questions(mjx, logs, tmp_path):
   few = "--column", *NAMES[:5]
   argv = logs[0], "--nominal", logs[2], *few, "--inject", 2, "--out", out
   code, text, err = mjx(*argv)
-  assert code == 0 and "(120.0" in text and "hip_encoder (mean +0.1" in text
+  assert code == 0 and "(120.0" in text and "hip_encoder (mean by about +0.1" in text
   assert "false alarms:" in text and "seen within 100 samples (2 s)" in text
   names = {p.name for p in out.iterdir()}
   assert names == {"detect.json", "alarms.csv", "detect.png", "inject.csv", "inject.png"}

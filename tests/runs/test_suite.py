@@ -573,7 +573,7 @@ def test_a_part_of_other_settings_that_was_not_asked_for_stops_nothing(mjx, refu
   (note,) = [line for line in err.splitlines() if "left out" in line]
   assert (
     code == 0
-    and note.endswith("walker (was begun with another seeds)")
+    and "walker (was begun with 1 seeds; the others are a run of their own" in note
     and list(json.loads(text)["entries"]) == ["quadruped", "car"]
   )
   assert (
@@ -583,7 +583,7 @@ def test_a_part_of_other_settings_that_was_not_asked_for_stops_nothing(mjx, refu
   assert not (tmp_path / "to/walker").exists() and (tmp_path / "to/car/runs.parquet").exists()
   message = refused(2, "bench", "quick", "--only", "walker", "--out", out)
   assert (
-    "out/walker was begun with another seeds" in message
+    "out/walker was begun with 1 seeds; the others" in message
     and "another --out" in message
     and "remove that folder" in message
     and "--overwrite" not in message
