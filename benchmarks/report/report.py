@@ -1585,9 +1585,13 @@ def two_agents(results: pathlib.Path) -> str:
 
 
 def raw_logs(results: pathlib.Path) -> str:
-  """What `detect` finds in raw logs, beside detectors of the world model's residuals."""
+  """What `detect` finds in raw logs, and in the world model's signed errors, beside detectors of its
+  residuals.
+  """
   rows, shown = [], ("learnt", "multichart", "cusum")
+  signed = {one["robot"]: one for one in load(results / "innovations.json")["robots"]}
   for own in load(results / "raw_logs.json")["robots"]:
+    other = signed[own["robot"]]
     rows.append(
       (
         f"`{own['robot']}`",
@@ -1595,10 +1599,20 @@ def raw_logs(results: pathlib.Path) -> str:
         number(own["streams"]),
         f"{percent(own['found'])} {percents(own['found_ci'])}",
         f"1 in {number(own['false_alarm_in'])} ({own['false_alarms']} seen)",
+        f"{percent(other['found'])} {percents(other['found_ci'])}",
+        f"1 in {number(other['false_alarm_in'])} ({other['false_alarms']})",
         *(percent(own["board"][name]) for name in shown),
       )
     )
-  head = ("robot", "columns", "faulty logs", "`detect` finds [%]", "its false alarms, in samples")
+  head = (
+    "robot",
+    "columns",
+    "faulty logs",
+    "`detect` finds [%]",
+    "its false alarms, in samples",
+    "in signed errors [%]",
+    "false alarms",
+  )
   return grid((*head, *(f"`{name}` [%]" for name in shown)), rows)
 
 

@@ -102,7 +102,7 @@ SOURCES = {
   ),
   "two-agents": ("walker_gear/summary.json", "walker_plain/summary.json"),
   "gradient": ("policy_gradient.json",),
-  "raw-logs": ("raw_logs.json",),
+  "raw-logs": ("raw_logs.json", "innovations.json"),
   "long-logs": ("long_log.json",),
   "gait": ("quadruped_agent/gait.json", "quadruped_trot_agent/gait.json"),
   "quadruped": (
