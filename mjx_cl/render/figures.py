@@ -223,12 +223,13 @@ def versus(found: list[Variant], path: os.PathLike | str) -> pathlib.Path:
 
 
 def _versus(found: list[Variant]) -> Figure:
-  levels = np.linspace(0.0, 1.2, 121)
+  levels = np.linspace(0.0, 1.2, 241)
+  shared = os.path.commonprefix([one.name for one in found]).rfind("/") + 1
   drawn = Figure(figsize=(6.4, 4.2), layout="constrained")
   axis = drawn.subplots()
   for k, one in enumerate(found):
     share, (low, high) = profile(one, levels)
-    axis.step(levels, share, where="post", color=style.nth(k), lw=1.6, label=one.name)
+    axis.step(levels, share, where="post", color=style.nth(k), lw=1.6, label=one.name[shared:])
     axis.fill_between(levels, low, high, step="post", color=style.nth(k), alpha=0.12, lw=0)
   kept = [versus_value(row, "reward_kept") for one in found for row in one.rows.values()]
   ends = (
@@ -241,7 +242,7 @@ def _versus(found: list[Variant]) -> Figure:
     xlim=(max(0.0, ends[0] - 0.1), min(1.2, ends[1] + 0.1)),
     ylim=(-0.03, 1.05),
   )
-  axis.legend(fontsize=8)
+  axis.legend(loc="lower left")
   return drawn
 
 

@@ -18,7 +18,7 @@ MEASURES: dict[str, tuple[str, bool]] = {
   "reward_kept": ("that reward over the reward before the onset", True),
   "return_lost": ("return lost after the onset", False),
   "terminations": ("falls or crashes", False),
-  "updates": ("updates", False),
+  "updates": ("gradient steps of the learner", False),
 }
 MUST_AGREE = ("env", "fault", "target", "severity", "schedule", "onset", "steps", "agent", "seeds")
 
