@@ -84,3 +84,14 @@ class OfAdaptation(enum.IntEnum):
   """
 
   FRESH = 0
+
+
+@enum.unique
+class OfMonitor(enum.IntEnum):
+  """Of the key of a chunk's predictions, which those of n steps draw from as it is.
+
+  Attributes:
+    AHEAD: predictions of one step.
+  """
+
+  AHEAD = 1_000_000

@@ -179,7 +179,9 @@ class Loop:
       history=self.monitor.init(groups, 1),
       detector=spread(self.detector.init()),
       phase=spread(decide.init(self.config)),
-      past=unknown((max(1, self.config.refit // self.repeat), groups), a.obs_size),
+      past=unknown(
+        (max(1, self.config.refit // self.repeat), groups), a.obs_size, self.monitor.signed
+      ),
       owed=none(),
       executed=jnp.zeros(groups, jnp.int32),
       memory=tuple(jax.vmap(functools.partial(methods.remember, m))(params()) for m in own),
@@ -191,7 +193,9 @@ class Loop:
     sight = Sight(
       self.monitor.init(1, 1),
       jax.tree.map(lambda x: jnp.asarray(x)[None], self.detector.init()),
-      unknown((max(1, self.config.refit // self.repeat), 1), self.agent.obs_size),
+      unknown(
+        (max(1, self.config.refit // self.repeat), 1), self.agent.obs_size, self.monitor.signed
+      ),
     )
     phase = jax.tree.map(lambda x: jnp.asarray(x)[None], decide.init(self.config))
     return strong(Frozen(sight, phase))

@@ -231,7 +231,8 @@ class RunConfig(FaultConfig):
     parts: Also write the residual of each part of the observation into trace.parquet, columns
       residual_NAME.
     residuals: Also write residuals.parquet: the residual of every single variable of the
-      observation, in its own unit, for each stream and control step.
+      observation, in its own unit, for each stream and control step, and innovation_NAME, the
+      signed error of its prediction one step ahead, of the reward too.
   """
 
   steps: int = 25_000

@@ -8,6 +8,8 @@ later and o ranging over observation variables:
     is t+n, when it is known
   streaming   s_t[o] = (1/n) sum_{i=1..n} |xhat_{t|t-i}[o] - x_t[o]|, in the row whose arrival is t
 
+  innovation  x_{t+1}[o] - xhat_{t+1|t}[o], with its sign, in the row whose arrival is t+1
+
 OPR = mean over o; RPR is the same sum over the reward. A window is cut at a reset and averaged over
 the steps left; fewer than `least` of them, or fewer than n steps since the run began, make the row
 invalid. Source: the paper, section on change detection.
@@ -24,6 +26,7 @@ from jaxtyping import Bool, Float, Int, Key, PRNGKeyArray
 
 from mjx_cl.dreamer import rssm
 from mjx_cl.errors import UserError
+from mjx_cl.keys import OfMonitor
 from mjx_cl.rollout.scan import Row
 from mjx_cl.types import Array, Spec, Var
 
@@ -57,6 +60,8 @@ class Residual(NamedTuple):
     surprise: float32 (), KL(posterior || prior) of the latent at the decision [nats].
     latent: float32 (16,), a fixed projection of the posterior latent at the decision, see
       `Monitor.project`.
+    innovation: float32 (O + 1,), signed one-step errors of the observation and, last, the reward,
+      in raw units; None unless the Monitor is `signed`.
   """
 
   opr: jax.Array
@@ -68,15 +73,25 @@ class Residual(NamedTuple):
   terminated: jax.Array
   surprise: jax.Array
   latent: jax.Array
+  innovation: jax.Array | None = None
 
 
-def unknown(leading: tuple[int, ...], variables: int) -> Residual:
-  """Rows of which nothing is known."""
+def unknown(leading: tuple[int, ...], variables: int, signed: bool = False) -> Residual:
+  """Rows of which nothing is known; `signed`: as of a Monitor that is."""
   # no two fields share a buffer: all are donated
   nan = lambda *shape: jnp.full(leading + shape, jnp.nan)
   false = lambda: jnp.zeros(leading, bool)
   return Residual(
-    nan(), nan(), nan(variables), false(), nan(GROUPS), nan(), false(), nan(), nan(LATENT)
+    nan(),
+    nan(),
+    nan(variables),
+    false(),
+    nan(GROUPS),
+    nan(),
+    false(),
+    nan(),
+    nan(LATENT),
+    nan(variables + 1) if signed else None,
   )
 
 
@@ -126,6 +141,7 @@ class Monitor:
       actions).
     least: fewest steps a cut window may keep.
     spec: of the robot, for `groups`; None: eight stretches of the observation in raw units.
+    signed: rows have an innovation.
   """
 
   def __init__(
@@ -136,7 +152,9 @@ class Monitor:
     actions: str = "recorded",
     least: int = 5,
     spec: Spec | None = None,
+    signed: bool = False,
   ) -> None:
+    self.signed = signed
     if form not in ("paper", "streaming"):
       raise UserError(f"unknown residual form {form!r}; choose from: paper, streaming")
     if actions not in ("recorded", "policy"):
@@ -199,6 +217,7 @@ class Monitor:
       terminated=rows.terminated,
       surprise=surprise,
       latent=latent,
+      innovation=jax.vmap(self._ahead, (0, 1, 0), 1)(params, rows, keys) if self.signed else None,
     )
     return self._last(history, seq), residual
 
@@ -265,6 +284,18 @@ class Monitor:
     good = (count >= self.least) & seq.exists[:rows]  # n steps since the run began
     mean = jnp.where(good[..., None], mean, jnp.nan)
     return jnp.mean(mean[..., :-1], -1), mean[..., -1], mean[..., :-1], good
+
+  def _ahead(
+    self, params: Any, rows: Row, key: PRNGKeyArray
+  ) -> Float[Array, "steps members innovation"]:
+    """Innovations of one parameter set; rows have leading (T, members)."""
+    flat = lambda x: x.reshape((-1,) + x.shape[2:])
+    deter, stoch = flat(rows.deter).astype(jnp.float32), self.agent.hot(flat(rows.stoch))
+    key = jax.random.fold_in(key, OfMonitor.AHEAD)
+    obs, reward = self.agent.open_loop(params, deter, stoch, flat(rows.action)[None], key)
+    foreseen = jnp.concatenate([obs[0], reward[0][:, None]], -1)
+    came = jnp.concatenate([rows.final_obs, rows.reward[..., None]], -1)
+    return came - foreseen.reshape(came.shape)
 
   def _look(
     self,

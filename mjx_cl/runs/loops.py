@@ -58,6 +58,7 @@ def make_loop(
     agent.stepwise,
     config.form,
     config.actions,
+    config.residuals,
     spec,
     detectors.factory(config.detector),
     config.detector,
@@ -66,7 +67,7 @@ def make_loop(
   )
   return Loop(
     agent,
-    Monitor(agent, n=15, form=config.form, actions=config.actions, spec=spec),
+    Monitor(agent, 15, config.form, config.actions, spec=spec, signed=config.residuals),
     detector,
     spec,
     config.adapt,

@@ -86,7 +86,7 @@ def of(config: RunConfig, spec: Spec, trained: DreamerConfig, repeat: int = 1) -
   at_once = min(learners, len(runtime.cores()))
   size = params / 4 / 640_867 * (config.adapt.batch or trained.batch) * trained.length / (4 * 64)
   scratch = int(at_once * SCRATCH * size / memory.GROWTH)
-  more = config.parts * 8 + config.residuals * len(spec.obs)  # columns of four bytes
+  more = config.parts * 8 + config.residuals * (2 * len(spec.obs) + 1)  # columns of four bytes
   return Room(
     lives * (config.adapt.refit * residual + LIFE) + rows,
     learners * (one.weights + copies * params) + (at_once + len(agents)) * one.weights + scratch,

@@ -198,8 +198,12 @@ def finish(runner: Runner, tell: Callable[[str], Any] = lambda text: None) -> di
   write_rows(out / "runs.parquet", rows, rows[0])
   if config.residuals:
     columns = {k: table[k] for k in ("stream", "arm", "seed", "step")}
-    for k, v in enumerate(runner.env.spec.obs):
-      columns[v.name] = np.ascontiguousarray(trace["variables"][:, :, k].T).reshape(-1)
+    names = [v.name for v in runner.env.spec.obs]
+    one = lambda values, k: np.ascontiguousarray(values[:, :, k].T).reshape(-1)
+    columns |= {name: one(trace["variables"], k) for k, name in enumerate(names)}
+    columns |= {
+      f"innovation_{name}": one(trace["innovation"], k) for k, name in enumerate([*names, "reward"])
+    }
     tables.write_table(out / "residuals.parquet", columns)
   figures.figure(out)
   if runner.endless and "posture" in trace:

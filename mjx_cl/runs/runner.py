@@ -345,6 +345,7 @@ class Runner:
       part["parts"] = at_end(digest.residual.groups, self.repeat)
     if self.config.residuals:
       part["variables"] = at_end(digest.residual.variables, self.repeat)
+      part["innovation"] = at_end(digest.residual.innovation, self.repeat)
     if self.endless:  # what the stop rule reads besides the signals
       level: Any = self.config.adapt.acceptance
       if level is None:

@@ -209,6 +209,28 @@ def test_one_step_ahead_needs_no_history():
     )
 
 
+def test_innovations_are_signed_errors_of_one_step():
+  """In the row of the arrival itself, over two chunks, resets or not; without them a residual has no
+  such field.
+  """
+  rows = make_rows(40)
+  monitor = Monitor(Stub(), 5, least=2, signed=True)
+  history, innovation = monitor.init(GROUPS, MEMBERS), []
+  for at in (0, 20):
+    history, seen = monitor.update(Stub.params, history, part(rows, at, at + 20), KEYS)
+    innovation.append(np.asarray(seen.innovation))
+  innovation, r = np.concatenate(innovation), jax.tree.map(np.asarray, rows)
+  hot = np.eye(CLASSES)[r.stoch].reshape(r.stoch.shape[:3] + (-1,))
+  ahead = r.deter @ A + r.action @ B + hot @ E
+  gain = np.asarray(Stub.params["gain"])[None, :, None, None]
+  came = np.concatenate([r.final_obs, r.reward[..., None]], -1)
+  np.testing.assert_allclose(innovation, came - gain * (ahead @ C), rtol=1e-4, atol=1e-4)  # float32
+  assert (r.terminated | r.truncated).any() and (innovation < 0).any() and (innovation > 0).any()
+  plain = Monitor(Stub(), 5, least=2)
+  _, seen = plain.update(Stub.params, plain.init(GROUPS, MEMBERS), part(rows, 0, 20), KEYS)
+  assert seen.innovation is None
+
+
 def test_opr_is_the_mean_over_variables_and_blind_to_none():
   """A shift of one variable by 3 adds 3 / OBS to OPR where every prediction lies below the truth,
   and nothing to the other variables.

@@ -237,9 +237,11 @@ def test_residuals_of_the_variables_have_opr_for_their_mean(whole):
   rows, spec = by_stream(whole[0]), envs.make("walker").spec
   table = tables.read_table(whole[0] / "residuals.parquet")
   names = [v.name for v in spec.obs]
-  assert list(table) == ["stream", "arm", "seed", "step", *names] and np.array_equal(
-    table["step"], np.tile(np.arange(STEPS), 4)
-  )
+  signed = [f"innovation_{name}" for name in (*names, "reward")]
+  assert list(table) == ["stream", "arm", "seed", "step", *names, *signed]
+  assert np.array_equal(table["step"], np.tile(np.arange(STEPS), 4))
+  ahead = np.stack([table[name] for name in signed])
+  assert np.isfinite(ahead).all() and (ahead < 0).any(1).all() and (ahead > 0).any(1).all()
   values = np.stack([table[name].reshape(4, STEPS) for name in names], -1)
   np.testing.assert_array_equal(np.isfinite(values).all(-1), rows["valid"])
   np.testing.assert_allclose(
