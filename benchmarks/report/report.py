@@ -668,6 +668,7 @@ def agents(results: pathlib.Path) -> str:
       falls,
     ),
     ("`walker-2`", "walker_2_agent/eval.json", trained("walker_2_agent"), falls),
+    ("`walker-3`", "walker_3_agent/eval.json", trained("walker_3_agent"), falls),
     ("`car`", "car_agent/eval.json", trained("car_agent"), driving),
     ("`car-2`", "car_2_agent/eval.json", trained("car_2_agent"), driving),
     ("`car-3`", "car_3_agent/eval.json", trained("car_3_agent"), driving),

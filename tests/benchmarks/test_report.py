@@ -48,7 +48,7 @@ SOURCES = {
     "car_agent/curve.parquet",
     *(
       f"{agent}_agent/{file}"
-      for agent in ("walker_2", "car_2", "car_3")
+      for agent in ("walker_2", "walker_3", "car_2", "car_3")
       for file in ("eval.json", "curve.parquet")
     ),
     "quadruped_agent/eval.json",
