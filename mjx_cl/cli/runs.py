@@ -7,6 +7,7 @@ import re
 from collections.abc import Collection, Mapping, Sequence
 from typing import NamedTuple
 
+from mjx_cl.adapt.arms import ARMS
 from mjx_cl.cli import track
 from mjx_cl.cli.flags import Bench, Run
 from mjx_cl.cli.live import RunDisplay
@@ -40,6 +41,12 @@ def do_run(args: Run) -> None:
     track.beside(display, track.of_run, args.out, args.track, args.resume) as show,
   ):
     summary = run.execute(config, args.out, args.resume, args.overwrite, show, tell=say)
+  idle = [name for name, arm in summary["arms"].items() if arm["updates_mean"] == 0]
+  learners = [name for name in idle if ARMS[name].learns]
+  if learners:
+    say(
+      f"note: no stream of arm {', '.join(learners)} has finetuned: nothing is said of its method"
+    )
   if args.keep and not pathlib.Path(args.out, "agents").is_dir():
     say("note: --keep wrote no agent, since no stream has finetuned")
   if args.json:

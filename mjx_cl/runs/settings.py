@@ -16,6 +16,8 @@ def check(config: RunConfig) -> RunConfig:
     UserError: for an unknown preset, schedule or arm, a number out of range, or settings that
       exclude each other.
   """
+  for arm in config.arms:
+    choose("arm", arm, ARMS)
   changes = presets.changes(config)
   moves = presets.becomes(config) is not None
   # a robot that becomes another one at an onset later than the last step never does
@@ -34,8 +36,6 @@ def _check_arms(config: RunConfig, moments: set[int]) -> None:
   """Raises UserError unless the arms fit snapshots, stops and the `moments` [control steps after
   the onset] at which the robot changes.
   """
-  for arm in config.arms:
-    choose("arm", arm, ARMS)
   endless = [name for name, arm in ARMS.items() if never_stops(arm)]
   require(
     not config.snapshots or set(endless) & set(config.arms),
