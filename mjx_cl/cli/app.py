@@ -154,7 +154,7 @@ def _commands_with(flag: str) -> list[str]:
   return [
     f"mjx-cl {kind.__name__.lower()}"
     for kind in COMMANDS
-    if name in {f.name for f in dataclasses.fields(kind)}
+    if {name, f"{name}s"} & {f.name for f in dataclasses.fields(kind)}
   ]
 
 
@@ -311,7 +311,9 @@ def main(argv: list[str] | None = None) -> int:
   # a save that was broken off has threads that would complain of the interpreter's end; foreign
   # code may have one that never ends
   busy = any(not t.daemon and t is not threading.current_thread() for t in threading.enumerate())
-  if argv is None and status and (busy or Interruptible.again):
+  # nobody waits for what was compiled ahead and not needed: all files are written
+  ahead = any(t.name.startswith("ahead") for t in threading.enumerate())
+  if argv is None and (ahead or (status and (busy or Interruptible.again))):
     for stream in (sys.stdout, sys.stderr):
       with contextlib.suppress(OSError, ValueError):
         stream.flush()

@@ -39,6 +39,14 @@ def do_compare(args: Compare) -> None:
     print(figures.versus(found, out), file=sys.stderr if args.json else sys.stdout)
 
 
+def _better(row: dict) -> str:
+  """Share of pairs in which a variant is better; where none differs, that."""
+  if row["better"] is None:
+    return "-"
+  alike = row["difference"] == 0 and not any(row["difference_ci"] or (0,))
+  return "alike" if alike else f"{row['better']:.0%}"
+
+
 def _show_comparison(rows: list[dict], first: str) -> None:
   """A table for each measure: a line for each variant, intervals beneath the numbers."""
   number = lambda x: "-" if x is None else f"{x:.3g}" if abs(x) < 1e3 else f"{x:.0f}"
@@ -56,7 +64,7 @@ def _show_comparison(rows: list[dict], first: str) -> None:
           number(row["iqm"]) + between(row["iqm_ci"]),
           "" if own else row["pairs"],
           "" if own else number(row["difference"]) + between(row["difference_ci"]),
-          "" if own else "-" if row["better"] is None else f"{row['better']:.0%}",
+          "" if own else _better(row),
         )
       )
     what, more = versus.MEASURES[measure]

@@ -5,6 +5,7 @@ readers tell apart, and darker ones of the same hues.
 """
 
 import contextlib
+import zlib
 from collections.abc import Iterator
 from typing import Any
 
@@ -44,8 +45,8 @@ STYLE: dict[Any, Any] = {
 
 
 def arm(name: str) -> str:
-  """Colour of an arm; one that the table lacks has the cycle's last."""
-  return ARMS.get(name, CYCLE[-1])
+  """Colour of an arm; one that the table lacks has one of the cycle's, always the same."""
+  return ARMS.get(name) or CYCLE[zlib.crc32(name.encode()) % len(CYCLE)]
 
 
 def nth(k: int) -> str:

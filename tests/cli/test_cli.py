@@ -883,3 +883,16 @@ def test_bash_completes_a_flag(mjx, tmp_path):
   """
   done = subprocess.run(["bash", "-c", ask], cwd=tmp_path, capture_output=True, text=True)
   assert (code, done.stdout.strip()) == (0, "--detector"), done.stderr
+
+
+def test_nobody_waits_for_what_is_compiled_ahead():
+  """A run whose streams never learn ends while a thread still compiles what they would need."""
+  code = (
+    "import sys, threading, time\n"
+    "threading.Thread(target=time.sleep, args=(3600,), name='ahead_0').start()\n"
+    "sys.argv = ['mjx-cl', 'list', 'arms']\n"
+    "from mjx_cl.cli import app\n"
+    "sys.exit(app.main())\n"
+  )
+  done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=600)
+  assert done.returncode == 0 and "  detector" in done.stdout and "FILE.py:NAME" in done.stdout
