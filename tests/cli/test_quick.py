@@ -71,14 +71,18 @@ def test_it_says_what_it_is_not_and_runs_what_was_asked(monkeypatch, tmp_path, c
 
   def execute(config, out, *_, **__):
     got.append(config)
-    return {"wall_s": 1.0}
+    return summary
 
+  summary = {"arms": {"detector": {"updates_mean": 3.0}, "none": {"updates_mean": 0.0}}}
   monkeypatch.setattr(runs.run, "execute", execute)
   argv = ["run", "walker", "--quick", "--json", "--out", str(tmp_path / "x")]
   assert app.main(argv) == 0
   out, err = capsys.readouterr()
-  assert json.loads(out) == {"wall_s": 1.0} and got[0].onset == 2000 and got[0].seeds == 2
+  assert json.loads(out) == summary and got[0].onset == 2000 and got[0].seeds == 2
   assert err.count("\n") == 1 and "first look, no result: 2 robots for 6,400 steps" in err
+  summary["arms"]["detector"]["updates_mean"] = 0.0  # an arm that could have learnt
+  assert app.main(argv) == 0
+  assert "note: no stream of arm detector has finetuned" in capsys.readouterr().err
 
 
 def test_help_says_it_in_a_line(capsys):
