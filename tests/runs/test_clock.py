@@ -98,7 +98,7 @@ def told_after_a_tenth(config, spans, core, cores=2):
 
 
 # of the published runs; those that miss noticed more or less than others of their robot do
-WITHIN, PLANNED, RUNS = 86, 100, 109
+WITHIN, PLANNED, RUNS = 86, 101, 110
 HEARD_WITHIN, HEARD = 46, 68  # those of them with an arm that waits for an alarm
 
 
