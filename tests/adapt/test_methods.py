@@ -151,8 +151,9 @@ def test_others_are_untouched(lived, arm, same):
   for tree in ("acting", "train"):
     assert same(stream(getattr(states[-1], tree), 2), stream(getattr(states[0], tree), 2))
   alone, _ = lived("detector")
-  for a, b in zip(jax.tree.leaves(states[8].acting), jax.tree.leaves(alone[8].acting)):
-    np.testing.assert_allclose(a[1], b[1], rtol=1e-3, atol=1e-4)
+  flat = lambda state: np.concatenate([x[1].ravel() for x in jax.tree.leaves(state.acting)])
+  moved = np.linalg.norm(flat(alone[8]) - flat(alone[0]))
+  assert moved > 0 and np.linalg.norm(flat(states[8]) - flat(alone[8])) < 0.05 * moved
 
 
 @each
