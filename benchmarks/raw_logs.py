@@ -11,9 +11,7 @@ alarm within 5 s of the onset. Beside it the same share of detectors that watch 
 residuals, of the same faults on seeds 0 to 9 (results/leaderboard.parquet).
 
 With --innovations a log holds what the world model did not foresee instead: the signed one-step
-errors of every variable and of the reward, observation less prediction, the mean of SAMPLES draws
-of the prior, in multiples of a unit that symlog makes alike (errors of symlog values, as the model
-is trained on).
+errors of every variable and of the reward, as `run --residuals` writes them.
 """
 
 from __future__ import annotations
@@ -32,10 +30,10 @@ import numpy as np  # noqa: E402
 
 from mjx_cl import envs, faults  # noqa: E402
 from mjx_cl.cli import app  # noqa: E402
-from mjx_cl.dreamer import nets  # noqa: E402
 from mjx_cl.io import tables  # noqa: E402
 from mjx_cl.leaderboard import lives, parts, suite  # noqa: E402
 from mjx_cl.logs import charts, verdict  # noqa: E402
+from mjx_cl.rollout.monitor import Monitor  # noqa: E402
 from mjx_cl.rollout.scan import Rollout, nest, start  # noqa: E402
 from mjx_cl.scoring import intervals  # noqa: E402
 from mjx_cl.training import agents  # noqa: E402
@@ -43,23 +41,8 @@ from mjx_cl.training import agents  # noqa: E402
 ROBOTS = ("walker", "quadruped", "car")
 SEEDS, NOMINAL, QUIET = range(100, 103), range(120, 128), range(128, 136)
 WITHIN_S, APART_S, CHUNK = 5.0, 2.5, 64
-SAMPLES = 4  # draws of the prior that a prediction is the mean of
 PAUSE_S = 10.0  # alarms that are closer are one event, as `detect` has it
 BESIDE = ("learnt", "multichart", "cusum", "rolling_sigma")  # of the board
-
-
-def innovations(agent, params, rows, keys) -> np.ndarray:
-  """Signed one-step errors of symlog observations and of the reward, (T, lanes, O + 1)."""
-
-  def one(deter, stoch, action, obs, reward, key):
-    ahead = lambda k: agent.open_loop(params, deter, agent.hot(stoch), action[None], k)
-    seen, earned = jax.vmap(ahead)(jax.random.split(key, SAMPLES))
-    wrong = nets.symlog(obs) - jnp.mean(nets.symlog(seen[:, 0]), 0)
-    return jnp.concatenate([wrong, (reward - jnp.mean(earned[:, 0], 0))[:, None]], -1)
-
-  one_chunk = jax.vmap(one)  # over the rows
-  fields = (rows.deter, rows.stoch, rows.action, rows.final_obs, rows.reward)
-  return one_chunk(*(x[:, 0] for x in fields), keys)
 
 
 def live(env, trained, who, keys, onsets, steps, ahead) -> tuple[np.ndarray, np.ndarray]:
@@ -81,13 +64,13 @@ def live(env, trained, who, keys, onsets, steps, ahead) -> tuple[np.ndarray, np.
   )
   params = jax.tree.map(lambda x: x[None], trained.train.params)
   seen, episodes = [], []
-  errors = jax.jit(lambda rows, key: innovations(
-    trained.agent, trained.train.params, rows, jax.random.split(key, CHUNK)
-  ))  # fmt: skip
+  monitor = Monitor(trained.agent, signed=True)
+  errors = jax.jit(lambda rows, key: monitor.ahead(trained.train.params, rows, key))
   for k in range(-(-steps // CHUNK)):
     state, rows = rollout.chunk(params, state, CHUNK)
     if ahead:
-      seen.append(np.asarray(errors(rows, jax.random.key(k))))
+      alone = jax.tree.map(lambda x: x[:, 0], rows)
+      seen.append(np.asarray(errors(alone, jax.random.key(k))))
     else:
       seen.append(np.concatenate([np.asarray(rows.obs)[:, 0], np.asarray(rows.action)[:, 0]], -1))
     episodes.append(np.asarray(rows.episode)[:, 0])

@@ -217,7 +217,7 @@ class Monitor:
       terminated=rows.terminated,
       surprise=surprise,
       latent=latent,
-      innovation=jax.vmap(self._ahead, (0, 1, 0), 1)(params, rows, keys) if self.signed else None,
+      innovation=jax.vmap(self.ahead, (0, 1, 0), 1)(params, rows, keys) if self.signed else None,
     )
     return self._last(history, seq), residual
 
@@ -285,7 +285,7 @@ class Monitor:
     mean = jnp.where(good[..., None], mean, jnp.nan)
     return jnp.mean(mean[..., :-1], -1), mean[..., -1], mean[..., :-1], good
 
-  def _ahead(
+  def ahead(
     self, params: Any, rows: Row, key: PRNGKeyArray
   ) -> Float[Array, "steps members innovation"]:
     """Innovations of one parameter set; rows have leading (T, members)."""
