@@ -1586,8 +1586,8 @@ def two_agents(results: pathlib.Path) -> str:
 
 
 def raw_logs(results: pathlib.Path) -> str:
-  """What `detect` finds in raw logs, and in the world model's signed errors, beside detectors of its
-  residuals.
+  """What `detect` finds in raw logs, and in the world model's signed errors, beside detectors of
+  its residuals.
   """
   rows, shown = [], ("learnt", "multichart", "cusum")
   signed = {one["robot"]: one for one in load(results / "innovations.json")["robots"]}

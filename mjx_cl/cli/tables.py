@@ -254,8 +254,8 @@ def show_verdict(summary: dict) -> None:
     print(f"{'changed' if not k else 'and again'} from {_at(event)} on: {_columns(event)}")
     chance = f"{event['expected']:.1g}" if event["expected"] > 1e-9 else "less than 1e-09"
     print(
-      f"  {len(event['charts'])} of {verdict['of']} charts agree; of events as clear a healthy log "
-      f"of this length has {chance}"
+      f"  {len(event['charts'])} of {verdict['of']} charts agree; in a healthy log of this length "
+      f"{chance} such events are expected"
     )
   if not believed:
     names = summary["columns"]

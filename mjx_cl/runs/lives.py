@@ -60,7 +60,7 @@ class Lives:
     trains: the agent of each stream.
     life: name of each stream's life: equal ones have the same robot, agent and keys.
     keys: of the streams, for all but their robots.
-    ways: methods of the arms, as in Choices.
+    arm_methods: of the arms, as in Choices.
     together: all streams are one band from the start; None: on an accelerator.
     ahead: what a first departure needs is compiled beside the first chunks.
   """
@@ -73,13 +73,13 @@ class Lives:
     trains: Sequence[TrainState],
     life: Sequence[Hashable],
     keys: jax.Array,
-    ways: tuple[methods.Method, ...] = (methods.PAPER,),
+    arm_methods: tuple[methods.Method, ...] = (methods.PAPER,),
     together: bool | None = None,
     ahead: bool = False,
   ) -> None:
     self.loop, self.keys = loop, keys
     self.trains, self.streams = list(trains), len(trains)
-    self.methods = ways
+    self.methods = arm_methods
     together = jax.default_backend() != "cpu" if together is None else together
     # streams of a band, and those that share a LoopState
     self.band_size, self.width = (self.streams, self.streams) if together else (BAND, 1)
@@ -248,9 +248,8 @@ class Lives:
     seen, sight = self.loop.watch(herd.minds, was.sight, rows, step, keys)
     phase, digest = jax.block_until_ready(self.loop.rest(was.phase, seen, step))
     herd.frozen[lane] = Frozen(sight, phase)
-    if any(
-      method.weighs for method in self.methods
-    ):  # nothing to weigh yet; streams that learn say it too
+    # nothing to weigh yet; streams that learn say it too
+    if any(method.weighs for method in self.methods):
       unknown = np.full(1, np.nan, np.float32)
       digest = digest._replace(back=np.zeros(1, bool), earned=unknown, earns=unknown)
     digest = jax.tree.map(np.asarray, digest)

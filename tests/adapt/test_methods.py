@@ -1,5 +1,5 @@
-"""Methods: one contract for each that ships, is installed or stands in the docs, and what is said of
-one that breaks it.
+"""Methods: one contract for each that ships, is installed or stands in the docs, and what is said
+of one that breaks it.
 """
 
 import dataclasses
@@ -17,7 +17,7 @@ from test_arms import EAGER, STEPS, hand_rows, scripted
 from mjx_cl.adapt import decide, methods
 from mjx_cl.adapt.arms import ALARM, ARMS, RULE, Arm
 from mjx_cl.adapt.loop import Loop, choices
-from mjx_cl.adapt.methods import Acts, Method, calm, staged
+from mjx_cl.adapt.methods import Acts, Method, staged
 from mjx_cl.config import PRESETS, RunConfig
 from mjx_cl.dreamer.agent import Agent
 from mjx_cl.errors import PluginError, UserError
@@ -204,15 +204,12 @@ def test_a_calm_robot_explores_in_dreams_alone(lived):
   least, _ = AGENT.deviations
   for c, state in enumerate(states[1:]):
     assert (spread(state.train.params) > 2 * least).all()  # what dreams
-    np.testing.assert_allclose(
-      spread(state.acting).min(), least if c in learning else spread(state.acting).min(), rtol=1e-5
-    )
     assert (spread(state.acting).max() < 1.001 * least) == (c in learning)
-  assert len(learning) > 3 and calm.LOW < -15
+  assert len(learning) > 3
 
 
 def test_an_update_of_ones_own_takes_the_place_of_dreamers(same):
-  """The world's losses alone, by a gradient step of the method's own, in a stream beside another."""
+  """A gradient step of the method's own, in a stream beside another."""
 
   def update(agent, memory, state, batch, key):
     learnt, metrics, latents = agent.update(state, batch, key)

@@ -210,8 +210,8 @@ def test_one_step_ahead_needs_no_history():
 
 
 def test_innovations_are_signed_errors_of_one_step():
-  """In the row of the arrival itself, over two chunks, resets or not; without them a residual has no
-  such field.
+  """In the row of the arrival itself, over two chunks, resets or not; without them a residual has
+  no such field.
   """
   rows = make_rows(40)
   monitor = Monitor(Stub(), 5, least=2, signed=True)
