@@ -80,6 +80,7 @@ def main(args: argparse.Namespace) -> None:
     for name, settings in entries_of.variants().items()
     if settings["use"] != "multichart"
     and name not in REFERENCES
+    and not entries_of.entry(name, settings).signed
     and all(name in own or settings["use"] in detectors.PAPER for own in detectors.board().values())
   }
   robots, tables, data = held.choose(), {}, {}

@@ -28,7 +28,8 @@ from mjx_cl.leaderboard import score
 FILE = pathlib.Path(detectors.__file__).parent / "thresholds.json"
 LEAST = 10  # alarms
 LATER = [f"results/learnt/{robot}" for robot in ("car", "quadruped", "walker")]
-BOARDS = ["results/leaderboard_100k", *LATER]
+LATEST = [f"results/innovations/{robot}" for robot in ("walker",)]
+BOARDS = ["results/leaderboard_100k", *LATER, *LATEST]
 
 
 def collect(folder: pathlib.Path) -> dict:

@@ -1585,6 +1585,62 @@ def two_agents(results: pathlib.Path) -> str:
   )
 
 
+def several_agents(results: pathlib.Path) -> str:
+  """The paper's fault on walkers of several agents, together and apart."""
+  held = load(results / "agents" / "bench.json")
+  together = held["agents"]["walker"]
+  each = [(name, held["entries"][f"agent={name}"]) for name in together["agents"]]
+  rows = []
+  for name, entry in [(f"all {len(each)}", together), *((f"`{name}`", own) for name, own in each)]:
+    own, still = entry["arms"]["detector"], entry["arms"]["none"]
+    n = own["affected"]
+    shares = lambda arm, n=n: percents(
+      [x / n for x in arm["recovered_within_10000_ci"]]
+      if arm["recovered_within_10000_ci"]
+      else None
+    )
+    rows.append(
+      (
+        name,
+        f"{n} of {own['seeds']}",
+        f"{own['false_alarm_streams']}",
+        f"{own['affected_alarmed_within_500']} of {own['affected_watched']}",
+        both(own, "latency_median_steps"),
+        f"{own['recovered_within_10000']} of {n} {shares(own)} %",
+        f"{still['recovered_within_10000']} of {n} {shares(still)} %",
+        both(own, "recovery_median_steps"),
+        both(own, "reward_final_affected", 2),
+        both(still, "reward_final_affected", 2),
+        f"{own['converged']}",
+      )
+    )
+  seeds = each[0][1]["arms"]["detector"]["seeds"]
+  text = fill(f"""
+      Seeds 0 to {seeds - 1} of each agent; arm `detector`, where `none` is not named: streams that lose a tenth by the fault, streams with a false alarm before it, affected ones that alarm within 500
+      steps, median latency of all streams [steps] (a miss is infinite), affected ones recovered within 10,000 steps, median recovery [steps], reward per step of the affected over the last 2,000 steps
+      (interquartile means), streams that converged. Brackets: 95 %; of one agent Wilson or a bootstrap of its streams, of all a bootstrap of agents and then of their streams.""")
+  return (
+    text
+    + "\n\n"
+    + grid(
+      (
+        "agent",
+        "affected",
+        "false alarms",
+        "alarm",
+        "latency",
+        "recovered",
+        "recovered, `none`",
+        "recovery",
+        "at the end",
+        "at the end, `none`",
+        "converged",
+      ),
+      rows,
+    )
+  )
+
+
 def raw_logs(results: pathlib.Path) -> str:
   """What `detect` finds in raw logs, and in the world model's signed errors, beside detectors of
   its residuals.
@@ -1856,6 +1912,7 @@ BLOCKS = {
   "full": full,
   "in-loop": in_loop,
   "two-agents": two_agents,
+  "several-agents": several_agents,
   "gradient": gradient,
   "raw-logs": raw_logs,
   "long-logs": long_logs,
@@ -1893,7 +1950,7 @@ def gap(results: pathlib.Path) -> str:
 
 def schema(results: pathlib.Path) -> str:
   """The columns of a recorded set."""
-  from mjx_cl.leaderboard.streams import LATENT, META, SCHEMA
+  from mjx_cl.leaderboard.streams import LATENT, META, SCHEMA, SIGNED
 
   files = [
     ("ROBOT.parquet", SCHEMA),
@@ -1902,6 +1959,13 @@ def schema(results: pathlib.Path) -> str:
       {
         "stream, step": "as above",
         f"z0 .. z{LATENT - 1}": "float32, a fixed projection of the world model's latent",
+      },
+    ),
+    (
+      "ROBOT_innovations.parquet",
+      {
+        "stream, step": "as above",
+        f"{SIGNED}NAME": "float16, signed one-step error of the world model in a variable NAME of the observation, and in the reward, in their units",
       },
     ),
     ("streams.parquet", META),

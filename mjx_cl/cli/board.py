@@ -88,7 +88,12 @@ def do_leaderboard(args: Leaderboard) -> None:
     args.overwrite or not (out / "leaderboard.json").exists(),
     f"{args.out} holds a leaderboard; give --overwrite to replace it, or another --out",
   )
-  entries, extra = score.chosen(args.detector, robots[0]), own(args, held, robots)
+  entries, left = score.able(
+    score.chosen(args.detector, robots[0]), held, robots, args.detector or ()
+  )
+  for why in left:
+    say(why)
+  extra = own(args, held, robots)
   taken = {*score.variants(), *(one.name for one in entries), *score.ORACLES}
   for name, _ in extra:
     require(name not in taken, f"the board has a detector {name!r} already; give --name")

@@ -142,11 +142,13 @@ def _asked(where: str, function: Callable, *args: Any) -> Any:
     raise PluginError(f"{where} raised {line(e)}") from None
 
 
-def _figures(name: str, build: Callable[..., Any], robot: str | None, shared: bool) -> dict:
+def _figures(
+  name: str, build: Callable[..., Any], robot: str | None, agent: str | None, shared: bool
+) -> dict:
   """What `make` hands on to a factory of its own accord."""
   if name == "rolling_sigma":
     return one_threshold(robot) if shared else CALIBRATED.get(robot or "", {})
-  handed = {"robot": robot, "make": make}
+  handed = {"robot": robot, "agent": agent, "make": make}
   taken = inspect.signature(build).parameters
   return {k: v for k, v in handed.items() if v is not None and k in taken}
 
@@ -184,6 +186,7 @@ def make(
   patience: int = 1,
   cool_down: int = 0,
   robot: str | None = None,
+  agent: str | None = None,
   shared: bool = False,
   **settings: Any,
 ) -> Detector:
@@ -205,6 +208,7 @@ def make(
       combine.cool_down.
     robot: whose figures `rolling_sigma` starts from, where CALIBRATED has them, default the
       walker's; handed on to a factory that takes it. Others: see `calibrated`.
+    agent: that acts, a shipped name or a folder, handed on likewise.
     shared: `rolling_sigma` has one threshold for both residuals, see `one_threshold`.
     **settings: of the factory. One that takes `make` is handed this function, to build others.
   """
@@ -216,7 +220,7 @@ def make(
   build = _pure(name, build) if ":" in name else build
   if not takes_number(build) and (channel is not None or log is not None or whiten):
     raise UserError(f"detector {name!r} has channels of its own; leave out channel, log and whiten")
-  detector = _built(name, build, patience, _figures(name, build, robot, shared) | settings)
+  detector = _built(name, build, patience, _figures(name, build, robot, agent, shared) | settings)
   if takes_number(build):
     detector = combine.whitened(detector, whiten) if whiten else detector
     names = (channel or "opr+rpr").split("+")

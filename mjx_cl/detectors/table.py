@@ -13,6 +13,7 @@ from mjx_cl.detectors.e_detector import e_detector
 from mjx_cl.detectors.ewma import ewma
 from mjx_cl.detectors.glr import glr
 from mjx_cl.detectors.hotelling import hotelling
+from mjx_cl.detectors.innovations import innovations
 from mjx_cl.detectors.knn import knn
 from mjx_cl.detectors.kswin import kswin
 from mjx_cl.detectors.learnt import learnt
@@ -53,6 +54,7 @@ DETECTORS = Registry(
     "bfar": bfar,
     "multichart": multichart,
     "learnt": learnt,
+    "innovations": innovations,
     # what every score is printed beside; the oracle, which must be told the onset, is in
     # baselines.REFERENCES alone
     "never": baselines.never,

@@ -2,13 +2,14 @@
 
 import inspect
 from collections.abc import Callable, Collection
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 
 from mjx_cl import detectors as detectors_lib
 from mjx_cl.errors import PluginError, UserError, choose
 from mjx_cl.io.plugins import line, of_user
+from mjx_cl.leaderboard.streams import StreamSet
 from mjx_cl.rollout.monitor import CHANNELS
 from mjx_cl.scoring.autoregression import ORDER
 
@@ -25,6 +26,7 @@ class Entry(NamedTuple):
     reference: looks at nothing.
     own: robot -> build where the settings are a robot's own, which is compiled for each robot;
       None: `build` serves all.
+    signed: takes innovations.
   """
 
   name: str
@@ -32,6 +34,7 @@ class Entry(NamedTuple):
   calibrated: bool
   reference: bool
   own: Callable[[str], Build] | None = None
+  signed: bool = False
 
 
 def variants() -> dict[str, dict]:
@@ -65,7 +68,8 @@ def entry(name: str, settings: dict) -> Entry:
   if use == "rolling_sigma" or "robot" in parameters:
     more = {"shared": True} if use == "rolling_sigma" else {}
     own = lambda robot: lambda threshold: build(threshold, robot=robot, **more)
-  return Entry(name, build, calibrated, bool(getattr(factory, "reference", False)), own)
+  reference, signed = (bool(getattr(factory, k, False)) for k in ("reference", "signed"))
+  return Entry(name, build, calibrated, reference, own, signed)
 
 
 def fitted(names: Collection[str]) -> dict[str, str]:
@@ -100,6 +104,42 @@ def chosen(names: Collection[str], robot: str) -> list[Entry]:
     one_line(name, lambda: build(1.0).init())
     more.append(one)
   return [entry(n, s) for n, s in known.items() if not names or n in names] + more
+
+
+def able(
+  entries: list[Entry], streams: StreamSet, robots: Collection[str], named: Collection[str] = ()
+) -> tuple[list[Entry], list[str]]:
+  """The entries that can be run on these robots of a set, and why each of the others cannot: one
+  that takes innovations needs a set that holds them, and what it knows of the set's agents.
+
+  Raises:
+    UserError for such a one that is `named`.
+  """
+  kept, left = [], []
+  for one in entries:
+    try:
+      if one.signed:
+        one = _signed(one, streams, robots)
+      kept.append(one)
+    except UserError as e:
+      if one.name in named:
+        raise
+      left.append(f"{one.name} is left out: {e}")
+  return kept, left
+
+
+def _signed(one: Entry, streams: StreamSet, robots: Collection[str]) -> Entry:
+  """A detector that takes innovations, of each robot's agent."""
+
+  def own(robot: str) -> Build:
+    agent, build = streams.agent(robot), cast(Any, one.build)
+    return lambda threshold: build(threshold, robot=robot, agent=agent)
+
+  for robot in robots:
+    streams.need_innovations(robot)
+    if one.own:
+      own(robot)(1.0)
+  return one._replace(own=own) if one.own else one
 
 
 def one_line(name: str, run: Callable[[], Any]) -> Any:

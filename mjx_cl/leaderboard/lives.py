@@ -106,20 +106,21 @@ def live(
   onsets: np.ndarray,
   steps: int,
   watch_from: int,
+  signed: bool,
   progress: Callable[[int, int, int], Any],
 ) -> dict[str, np.ndarray]:
   """Lives `steps` control steps of every lane; the monitor looks at healthy lanes all the time, at
-  the others from `watch_from` on.
+  the others from `watch_from` on; `signed`: with innovations.
 
   Returns:
     COLUMNS float32 (steps, S), nan where unknown; episode int16, terminated bool (steps, S); latent
-    float16 (steps, S, 16); target (S,) names.
+    float16 (steps, S, 16); innovation float32 (steps, S, O + 1) where `signed`; target (S,) names.
   """
   names = list(dict.fromkeys(lane.fault for lane in who if lane.fault))
   faults = tuple(faults_lib.make(n, env) for n in names) or (faults_lib.none(env),)
   severity, target, drawn = _drawn(who, names, faults)
   agent, n = trained.agent, len(who)
-  rollout, monitor = Rollout(env, agent, faults), Monitor(agent, spec=env.spec)
+  rollout, monitor = Rollout(env, agent, faults), Monitor(agent, spec=env.spec, signed=signed)
   plan = lambda s, o: faults_lib.plan(
     s, jnp.broadcast_to(o, s.shape), jnp.full(s.shape, faults_lib.FOREVER)
   )
@@ -168,10 +169,15 @@ def _looks(
     seen = jax.tree.map(lambda x: np.asarray(x)[:, 0], seen)
     gap = ((0, 0), (0, len(who) - seen_of))
     wide = lambda x: np.pad(x, (gap + ((0, 0),))[: x.ndim], constant_values=np.nan)
-    return {name: wide(read(name, seen)) for name in COLUMNS} | {
-      "episode": np.asarray(rows.episode)[:, 0].astype(np.int16),
-      "terminated": np.asarray(rows.terminated)[:, 0],
-      "latent": wide(seen.latent).astype(np.float16),
-    }
+    more = {"innovation": wide(seen.innovation)} if monitor.signed else {}
+    return (
+      {name: wide(read(name, seen)) for name in COLUMNS}
+      | more
+      | {
+        "episode": np.asarray(rows.episode)[:, 0].astype(np.int16),
+        "terminated": np.asarray(rows.terminated)[:, 0],
+        "latent": wide(seen.latent).astype(np.float16),
+      }
+    )
 
   return look

@@ -33,6 +33,7 @@ class Part(NamedTuple):
     watch_from: control step from which the monitor looks at faulty lanes.
     tag: lanes and length, which its file holds.
     of: onsets, agent and physics, likewise.
+    signed: whether innovations are kept.
   """
 
   who: list[lives.Lane]
@@ -42,6 +43,7 @@ class Part(NamedTuple):
   watch_from: int
   tag: str
   of: str
+  signed: bool = False
 
 
 def part(
@@ -56,9 +58,9 @@ def part(
   """A part of a robot, see PARTS."""
   simulator = runtime.default_physics() if physics == "auto" else physics
   who, keys, onsets, steps, watch_from = who_lives(suite, robot, split, kind, env.spec.control_s)
-  tag = json.dumps([who, steps, trained.card.get("updates"), VERSION])
+  tag = json.dumps([who, steps, trained.card.get("updates"), VERSION, suite.innovations])
   of = json.dumps([onsets.tolist(), digest(trained.train.params), simulator])
-  return Part(who, keys, onsets, steps, watch_from, tag, of)
+  return Part(who, keys, onsets, steps, watch_from, tag, of, suite.innovations)
 
 
 def live(
@@ -70,7 +72,7 @@ def live(
 ) -> dict[str, np.ndarray]:
   """Lives a part, keeps it in a file and returns what `lives.live` gives."""
   data = lives.live(
-    env, trained, own.who, own.keys, own.onsets, own.steps, own.watch_from, progress
+    env, trained, own.who, own.keys, own.onsets, own.steps, own.watch_from, own.signed, progress
   )
   arrays.write(path, {"tag": own.tag, "of": own.of, **data})
   return data

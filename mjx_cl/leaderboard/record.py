@@ -25,6 +25,7 @@ from mjx_cl.rollout.monitor import watched
 from mjx_cl.training import agents
 
 MADE = ("command", "versions", "python", "git_commit", "machine")  # of config.json: how it was made
+ENDS = ("", "_latents", "_innovations")  # of the names of a robot's files
 HELD = "held.json"  # config.json of the set whose files are being replaced
 
 
@@ -48,7 +49,7 @@ def claim(
     _beside(suite, out, robots)
     return
   ours = {"config.json", "streams.parquet"} | {
-    f"{r}{end}.parquet" for r in {*suite.robots, *(held or ())} for end in ("", "_latents")
+    f"{r}{end}.parquet" for r in {*suite.robots, *(held or ())} for end in ENDS
   }
   if held is not None:
     for name in sorted(ours):
@@ -226,9 +227,10 @@ def record(
   for robot, (env, trained) in ready.items():
     parts, speed[robot] = _parts(suite, robot, env, trained, out / "work", physics, progress)
     groups = ",".join(name for name, _ in watched(env.spec))
+    variables = (*(v.name for v in env.spec.obs), "reward") if suite.innovations else ()
     number = min((row["stream"] for row in table if row["robot"] == robot), default=free)
     made["details"][robot], fresh = set_tables.write(
-      suite, staged, robot, parts, number, env.spec.control_s, groups
+      suite, staged, robot, parts, number, env.spec.control_s, groups, variables
     )
     rows, free = rows + fresh, max(free, number + len(fresh))
     made["stream_steps"][robot] = int(sum(data["opr"].size for *_, data in parts.values()))

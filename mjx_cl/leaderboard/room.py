@@ -11,7 +11,7 @@ from mjx_cl.types import Spec
 
 ROW = (
   4 * len(COLUMNS) + 2 * len(PROJECTION) + 3
-)  # bytes of a lane and control step, as `live` gives
+)  # bytes of a lane and control step, as `live` gives, without innovations
 COPIES = 4  # of them: as lived, rounded, as one table, and that once more while it is written
 
 
@@ -26,10 +26,12 @@ def of(suite: Suite, robot: str, spec: Spec, learner: DreamerConfig) -> int:
     healthy, seeds = suite.nominal[split], last - first + 1
     rows += seeds * (healthy * suite.nominal["steps"] + faulty * end)
     most = max(most, seeds * max(healthy, faulty))
-  return grown(most, rows, spec, learner)
+  return grown(most, rows, spec, learner, suite.innovations)
 
 
-def grown(lanes: int, rows: int, spec: Spec, learner: DreamerConfig) -> int:
+def grown(
+  lanes: int, rows: int, spec: Spec, learner: DreamerConfig, innovations: bool = False
+) -> int:
   """Bytes that a process grows to.
 
   Args:
@@ -37,9 +39,11 @@ def grown(lanes: int, rows: int, spec: Spec, learner: DreamerConfig) -> int:
     rows: control steps of all robots.
     spec: of the robot.
     learner: of its agent.
+    innovations: whether they are kept.
   """
+  row = ROW + 4 * (len(spec.obs) + 1) * innovations
   record = needs.need(learner.size, len(spec.obs), len(spec.act), 0, learner.bins).record
-  return memory.resident(lanes * (LIFE + 2 * CHUNK * record)) + COPIES * ROW * rows
+  return memory.resident(lanes * (LIFE + 2 * CHUNK * record)) + COPIES * row * rows
 
 
 def check(suite: Suite, robot: str, spec: Spec, learner: DreamerConfig) -> None:

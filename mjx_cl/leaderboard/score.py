@@ -24,6 +24,7 @@ from mjx_cl.leaderboard import oracle as oracles
 from mjx_cl.leaderboard import program as programs
 from mjx_cl.leaderboard.calibration import Found
 from mjx_cl.leaderboard.entries import Entry, fitted, one_line
+from mjx_cl.leaderboard.entries import able as able
 from mjx_cl.leaderboard.entries import chosen as chosen
 from mjx_cl.leaderboard.entries import variants as variants
 from mjx_cl.leaderboard.streams import Data, StreamSet, joined, load
@@ -79,7 +80,7 @@ def score(
   begin = time.perf_counter()
   robots = streams.choose(robots)
   room = programs.room(streams, robots)
-  runners = {e.name: sweep.Runner(e.build, room) for e in entries if not e.own}
+  runners = {e.name: sweep.Runner(e.build, room, e.signed) for e in entries if not e.own}
   rows: list[dict] = []
   curves: dict[str, dict[str, list[dict]]] = {}
   faults: list[dict] = []
@@ -132,7 +133,7 @@ def examine(
     samples: of `data`.
     data: streams of the robot.
   """
-  runner = sweep.Runner(one.own(data.robot), room) if one.own else runners[one.name]
+  runner = sweep.Runner(one.own(data.robot), room, one.signed) if one.own else runners[one.name]
   return one_line(one.name, lambda: calibration.examine(one, data, runner, samples))
 
 

@@ -3,6 +3,7 @@
 import dataclasses
 import pathlib
 import zlib
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,12 +11,13 @@ import numpy as np
 from mjx_cl.errors import FileError
 from mjx_cl.io import tables
 from mjx_cl.leaderboard.lives import Lane
-from mjx_cl.leaderboard.streams import COLUMNS, META, PROJECTION
+from mjx_cl.leaderboard.streams import COLUMNS, META, PROJECTION, SIGNED
 from mjx_cl.leaderboard.suite import Suite
 
 Part = tuple[list[Lane], np.ndarray, dict[str, np.ndarray]]  # lanes, onsets (S,), what `live` gave
 FLOOR = 1e-6  # residuals below are taken as this before the logarithm
-FINENESS = {"opr": 4, "rpr": 4, "reward": 4, "surprise": 4, "group": 2, "z": 2}
+FINENESS = {"opr": 4, "rpr": 4, "reward": 4, "surprise": 4, "group": 2, "z": 2, "innovation": 1}
+HALF = 60_000.0, 2.0**-24  # the largest innovation and the finest step that float16 holds
 PROBES = 5  # fault streams of each robot that come once more, cut off
 HEALTHY_PROBES = 2  # of each split of each robot
 
@@ -31,8 +33,10 @@ class Robot:
     grain: rounding step of each column.
     rows: blocks of ROBOT.parquet, a dict of columns each.
     latents: blocks of ROBOT_latents.parquet.
+    signed: blocks of ROBOT_innovations.parquet.
     meta: rows of META.
     differ: pasts that differ from those of their twins.
+    names: columns of innovations, in their order; none: not recorded.
   """
 
   suite: Suite
@@ -41,8 +45,10 @@ class Robot:
   grain: dict[str, float]
   rows: list[dict[str, np.ndarray]] = dataclasses.field(default_factory=list)
   latents: list[dict[str, np.ndarray]] = dataclasses.field(default_factory=list)
+  signed: list[dict[str, np.ndarray]] = dataclasses.field(default_factory=list)
   meta: list[dict[str, Any]] = dataclasses.field(default_factory=list)
   differ: int = 0
+  names: tuple[str, ...] = ()
 
   def add(self, **values: Any) -> None:
     """A stream more in `meta`."""
@@ -58,7 +64,9 @@ class Robot:
     until: int,
     columns: tuple[str, ...] = COLUMNS,
   ) -> None:
-    """Rows `steps` of the stream that was added last, and its latents up to step `until`."""
+    """Rows `steps` of the stream that was added last, its latents up to step `until`, and its
+    innovations where all `columns` are kept.
+    """
     index = lambda last: {
       "stream": np.full(last - steps[0], self.number - 1, np.int32),
       "step": np.arange(steps[0], last, dtype=np.int32),
@@ -73,6 +81,10 @@ class Robot:
     self.latents.append(
       index(until) | {name: rounded(z[:, k], name, self.grain) for k, name in enumerate(PROJECTION)}
     )
+    if self.names and columns == COLUMNS:
+      errors = data["innovation"][at, lane]
+      signed = {c: half(errors[:, k], c, self.grain) for k, c in enumerate(self.names)}
+      self.signed.append(index(steps[1]) | signed)
 
   def healthy(self, split: str, part: Part) -> None:
     """Streams of healthy robots."""
@@ -143,15 +155,18 @@ def write(
   number: int,
   control_s: float,
   groups: str,
+  variables: Sequence[str] = (),
 ) -> tuple[dict, list[dict]]:
-  """Writes ROBOT.parquet and ROBOT_latents.parquet, streams numbered from `number` on.
+  """Writes ROBOT.parquet, ROBOT_latents.parquet and, where `variables` names what their innovations
+  are of, ROBOT_innovations.parquet, streams numbered from `number` on.
 
   Returns:
     (details of config.json: rounding steps, and the number of pasts that differ in the last digits,
     hence later in all, which should be 0; the streams' rows of META).
   """
   common = {"robot": robot, "control_s": control_s, "groups": groups}
-  own = Robot(suite, common, number, grains(parts["tune", "nominal"][2]))
+  names = tuple(f"{SIGNED}{name}" for name in variables)
+  own = Robot(suite, common, number, grains(parts["tune", "nominal"][2], names), names=names)
   for split in ("score", "tune"):
     own.healthy(split, parts[split, "nominal"])
     own.faulty(split, parts[split, "fault"])
@@ -162,10 +177,14 @@ def write(
   for name, blocks, split_up in (
     (robot, own.rows, COLUMNS),
     (f"{robot}_latents", own.latents, PROJECTION),
+    (f"{robot}_innovations", own.signed, names),
   ):
+    if not blocks:
+      continue
     table = {k: np.concatenate([block[k] for block in blocks]) for k in blocks[0]}
     tables.write_table(out / f"{name}.parquet", table, split=split_up, codec="brotli", level=level)
-  return {"rounding": own.grain, "pasts_that_differ": own.differ}, own.meta
+  told = {"rounding": own.grain, "pasts_that_differ": own.differ}
+  return told | ({"innovations": list(names)} if names else {}), own.meta
 
 
 def healthy_probes(rows: list[dict]) -> list[dict]:
@@ -200,19 +219,28 @@ def write_meta(out: pathlib.Path, rows: list[dict]) -> None:
   tables.write_table(out / "streams.parquet", columns)
 
 
-def grains(healthy: dict[str, np.ndarray]) -> dict[str, float]:
+def grains(healthy: dict[str, np.ndarray], names: Sequence[str] = ()) -> dict[str, float]:
   """How each column is rounded, from healthy streams: relative steps (of residuals, groups and
-  surprise) or absolute ones (reward, latents), powers of two near the deviation (of the logarithm;
-  absolute) divided by FINENESS.
+  surprise) or absolute ones (reward, latents, innovations), powers of two near the deviation (of
+  the logarithm; absolute) divided by FINENESS.
+
+  Args:
+    healthy: what `live` gave.
+    names: columns of innovations.
   """
-  out = {}
-  for name in COLUMNS + PROJECTION:
-    x = healthy["latent"][..., int(name[1:])] if name in PROJECTION else healthy[name]
+  out, signed = {}, {name: k for k, name in enumerate(names)}
+  for name in (*COLUMNS, *PROJECTION, *names):
+    if name in signed:
+      x = healthy["innovation"][..., signed[name]]
+    else:
+      x = healthy["latent"][..., int(name[1:])] if name in PROJECTION else healthy[name]
     x = x[np.isfinite(x)].astype(np.float64)
     wide = float(np.std(x if absolute(name) else np.log(np.maximum(x, FLOOR)))) if len(x) else 0.0
     fineness = FINENESS["z" if name in PROJECTION else name.split("_")[0]]
     power = float(np.round(np.log2(max(wide, 1e-9) / fineness)))
     out[name] = 2.0 ** (power if absolute(name) else min(-1.0, power))
+    if name in signed:
+      out[name] = max(out[name], HALF[1])
   return out
 
 
@@ -220,7 +248,7 @@ def absolute(name: str) -> bool:
   """Whether a column is rounded to absolute steps; the others may not be negative and are rounded
   to relative ones.
   """
-  return name == "reward" or name in PROJECTION
+  return name == "reward" or name in PROJECTION or name.startswith(SIGNED)
 
 
 def rounded(x: np.ndarray, name: str, grain: dict[str, float]) -> np.ndarray:
@@ -235,3 +263,8 @@ def rounded(x: np.ndarray, name: str, grain: dict[str, float]) -> np.ndarray:
   bits = x.view(np.uint32).astype(np.uint64)
   kept = (((bits + (1 << (drop - 1))) >> drop) << drop).astype(np.uint32).view(np.float32)
   return np.where(np.isfinite(x), kept, np.nan).astype(np.float32)
+
+
+def half(x: np.ndarray, name: str, grain: dict[str, float]) -> np.ndarray:
+  """`rounded`, as float16."""
+  return rounded(np.clip(x, -HALF[0], HALF[0]), name, grain).astype(np.float16)

@@ -21,7 +21,7 @@ from mjx_cl.leaderboard import parts as parts_of
 from mjx_cl.leaderboard import program as programs
 from mjx_cl.leaderboard import room, score, streams, sweep
 from mjx_cl.leaderboard.calibration import Found
-from mjx_cl.leaderboard.entries import Entry, chosen
+from mjx_cl.leaderboard.entries import Entry, able, chosen
 from mjx_cl.leaderboard.suite import Suite, of
 from mjx_cl.runs import cluster
 from mjx_cl.training import agents
@@ -87,7 +87,7 @@ def record(
         continue
       wanted[name] = own
       rows = own.steps * len(own.who)
-      needs[name] = room.grown(len(own.who), rows, env.spec, trained.agent.config)
+      needs[name] = room.grown(len(own.who), rows, env.spec, trained.agent.config, own.signed)
   if not wanted:
     return
   _plan(folder, "record", values)
@@ -163,7 +163,8 @@ def examine_all(
     tell(f"{name} examined, {len(over)} of {len(entries)}")
 
   names = list(part.values())
-  needs = dict.fromkeys(names, memory.resident(COPIES * room.ROW * rows))
+  row = room.ROW + 4 * max(len(held.signed(robot)) for robot in robots)
+  needs = dict.fromkeys(names, memory.resident(COPIES * row * rows))
   cluster.together(worker, folder, names, needs, finished, tell, on, _whole)
   return lambda name, data: read_found(folder / part[name] / f"{data.robot}.npz")
 
@@ -179,9 +180,10 @@ def examine(folder: pathlib.Path, name: str, values: dict, tell: Tell) -> None:
   """Examines a detector of FOLDER/suite.json on all robots, into FOLDER/NAME."""
   held, robots = streams.StreamSet(values["streams"]), values["robots"]
   require(held.config == values["config"], f"{held.folder} holds another set than the driver's")
-  (one,) = chosen((values["detector"],), robots[0])
+  named = (values["detector"],)
+  (one,), _ = able(chosen(named, robots[0]), held, robots, named)
   fits = programs.room(held, robots)
-  runners = {} if one.own else {one.name: sweep.Runner(one.build, fits)}
+  runners = {} if one.own else {one.name: sweep.Runner(one.build, fits, one.signed)}
   folders.make(folder / name)
   for robot in robots:
     data = streams.load(held, robot)

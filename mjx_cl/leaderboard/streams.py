@@ -2,15 +2,17 @@
 detectors are scored on. Schema: `SCHEMA`, `META`.
 
 A set is a folder: `streams.parquet` (one row per stream, `META`), ROBOT.parquet (one row per stream
-and control step, `SCHEMA`), ROBOT_latents.parquet (stream, step, z0..z15, where they were kept) and
-config.json. A fault stream shares its past with the healthy robot of the same seed: rows before its
-onset are those of the stream `prefix`, and stand there alone. `StreamSet` joins them; so does, in
-pandas,
+and control step, `SCHEMA`), ROBOT_latents.parquet (stream, step, z0..z15, where they were kept),
+from version 2 on ROBOT_innovations.parquet (stream, step, innovation_NAME of every variable and of
+the reward, where the suite keeps them) and config.json. A fault stream shares its past with the
+healthy robot of the same seed: rows before its onset are those of the stream `prefix`, and stand
+there alone. `StreamSet` joins them; so does, in pandas,
   own = rows[rows.stream == s]; past = rows[(rows.stream == prefix) & (rows.step < onset)];
   pandas.concat([past, own])
 Values are rounded to powers of two near a quarter of the deviation on healthy robots (half for
-groups and latents), of the logarithm where they cannot be negative: a column's variance grows by
-0.5 % (2 %), the files shrink to a third. config.json holds the steps.
+groups and latents, a whole one for innovations), of the logarithm where they cannot be negative: a
+column's variance grows by 0.5 % (2 %, 8 %), the files shrink to a third. config.json holds the
+steps.
 """
 
 import pathlib
@@ -28,9 +30,10 @@ from mjx_cl.leaderboard.suite import suite as suite
 from mjx_cl.rollout.monitor import CHANNELS, LATENT, Residual
 from mjx_cl.scoring import metrics
 
-VERSION = 1
+VERSION, READ = 2, (1, 2)  # as written, and what can be read
 RECORDINGS = pathlib.Path(__file__).parent / "recordings"
 COLUMNS = tuple(CHANNELS)
+SIGNED = "innovation_"  # and the name of the variable
 PROJECTION = tuple(f"z{k}" for k in range(LATENT))  # of the latent
 SCHEMA = {
   "stream": "int32, number of the stream",
@@ -88,7 +91,8 @@ class Streams(NamedTuple):
   """Streams side by side, time-major NumPy arrays; unknown values are nan.
 
   Attributes:
-    residual: monitor.Residual with leading (T, S); `variables` is empty.
+    residual: monitor.Residual with leading (T, S); `variables` is empty, `innovation` None where it
+      was not asked for.
     episode: int16 (T, S).
     stream: number, int (S,).
     seed: int (S,).
@@ -150,10 +154,10 @@ class StreamSet:
     version = self.config.get("version")
     if version is None:
       raise FileError(f"{none}: its config.json is of something else; {make}")
-    if version != VERSION:
+    if version not in READ:
       raise FileError(
-        f"{self.folder}: streams of version {version}, this release reads version {VERSION}; "
-        "record them anew"
+        f"{self.folder}: streams of version {version}, this release reads versions "
+        f"{' and '.join(map(str, READ))}; record them anew"
       )
     try:
       self.suite = suites.of(self.config["suite"])
@@ -164,6 +168,7 @@ class StreamSet:
     self.meta = tables.read_table(self.folder / "streams.parquet")
     self._demand("streams.parquet", self.meta, META)
     self._held: dict[str, tuple[Rows, Rows]] = {}
+    self._errors: dict[str, Rows] = {}
 
   def _rows(self, file: str, schema: dict[str, str]) -> Rows:
     columns = tables.read_table(self.folder / file)
@@ -186,6 +191,23 @@ class StreamSet:
   def robots(self) -> list[str]:
     """Robots of the set, in its order."""
     return list(dict.fromkeys(self.meta["robot"].tolist()))
+
+  def signed(self, robot: str) -> tuple[str, ...]:
+    """Columns of the robot's innovations, none where the set does not hold them."""
+    return tuple(self.config.get("details", {}).get(robot, {}).get("innovations", ()))
+
+  def need_innovations(self, robot: str) -> tuple[str, ...]:
+    """`signed`; FileError where the set has none."""
+    names = self.signed(robot)
+    if not names:
+      raise FileError(
+        f"{self.folder} holds no innovations of {robot}; record a suite with `innovations = true`"
+      )
+    return names
+
+  def agent(self, robot: str) -> str:
+    """Name of the agent that was recorded, the robot's own where the set does not tell."""
+    return self.config.get("agents", {}).get(robot, {}).get("name", robot)
 
   def choose(self, robots: Collection[str] = ()) -> list[str]:
     """These robots, each once; all where none is named. UserError for one that the set lacks."""
@@ -237,11 +259,20 @@ class StreamSet:
     """Rows and latents of a robot."""
     if robot not in self._held:
       self._held.clear()  # one robot at a time: a set may be larger than the memory
+      self._errors.clear()
       self._held[robot] = (
         self._rows(f"{robot}.parquet", SCHEMA),
         self._rows(f"{robot}_latents.parquet", LATENTS),
       )
     return self._held[robot]
+
+  def _innovations(self, robot: str) -> Rows:
+    """Rows of a robot's innovations; FileError where the set has none."""
+    if robot not in self._errors:
+      names = self.need_innovations(robot)
+      schema = {name: SCHEMA[name] for name in ("stream", "step")} | dict.fromkeys(names, "float16")
+      self._errors = {robot: self._rows(f"{robot}_innovations.parquet", schema)}
+    return self._errors[robot]
 
   def _fill(
     self,
@@ -251,6 +282,7 @@ class StreamSet:
     column: int,
     out: dict[str, np.ndarray],
     z: dict[str, np.ndarray],
+    errors: dict[str, np.ndarray],
   ) -> None:
     """Writes what is known of stream `number` before step `limit` into column `column` of the
     arrays, its past first.
@@ -259,16 +291,24 @@ class StreamSet:
     at = self._at(number)
     if m["prefix"][at] is not None and np.isfinite(m["prefix"][at]):
       cut = m["onset"][at] if m["kind"][at] == "fault" else m["steps"][at]
-      self._fill(robot, int(m["prefix"][at]), min(limit, int(cut)), column, out, z)
+      self._fill(robot, int(m["prefix"][at]), min(limit, int(cut)), column, out, z, errors)
     rows, latents = self._load(robot)
     rows.put(number, limit, column, out)
     latents.put(number, limit, column, z)
+    if errors:
+      self._innovations(robot).put(number, limit, column, errors)
 
   def _at(self, number: int) -> int:
     return int(np.flatnonzero(self.meta["stream"] == number)[0])
 
-  def get(self, robot: str, numbers: Sequence[int] | np.ndarray) -> Streams:
-    """Streams of one robot, the shorter ones filled up with unknown values to the longest."""
+  def get(self, robot: str, numbers: Sequence[int] | np.ndarray, signed: bool = False) -> Streams:
+    """Streams of one robot, the shorter ones filled up with unknown values to the longest.
+
+    Args:
+      robot: of the set.
+      numbers: of its streams.
+      signed: with their innovations; FileError where the set has none.
+    """
     at = [self._at(n) for n in numbers]
     if not at:
       raise UserError(
@@ -282,8 +322,14 @@ class StreamSet:
     known |= {"episode": np.zeros(shape, np.int16), "terminated": np.zeros(shape, bool)}
     z = np.full(shape + (LATENT,), np.nan, np.float32)
     latents = {name: z[..., k] for k, name in enumerate(PROJECTION)}
+    names = self.signed(robot)
+    e = np.full((*shape, len(names)), np.nan, np.float32) if signed else None
+    errors = {} if e is None else {name: e[..., k] for k, name in enumerate(names)}
+    if signed:
+      self._load(robot)  # lets go of another robot's
+      self._innovations(robot)
     for column, (number, steps) in enumerate(zip(numbers, m["steps"])):
-      self._fill(robot, int(number), int(steps), column, known, latents)
+      self._fill(robot, int(number), int(steps), column, known, latents, errors)
     episode = known.pop("episode")
     groups = [known.pop(c) for c in COLUMNS if c.startswith("group_")]
     residual = Residual(
@@ -292,6 +338,7 @@ class StreamSet:
       valid=np.isfinite(known["opr"]),
       groups=np.stack(groups, -1),  # type: ignore[arg-type]
       latent=z,  # type: ignore[arg-type]
+      innovation=e,  # type: ignore[arg-type]
     )
     onset = np.nan_to_num(m["onset"].astype(float), nan=shape[0])
     return Streams(
@@ -339,15 +386,18 @@ class Data(NamedTuple):
 
 
 def load(streams: StreamSet, robot: str) -> Data:
-  """One robot's streams.
+  """One robot's streams, with innovations where the set has them.
 
   Raises:
     FileError where its fault streams are not one for each seed that scores.
   """
-  tune, score = (streams.get(robot, streams.find(robot, "nominal", s)) for s in ("tune", "score"))
+  signed = bool(streams.signed(robot))
+  tune, score = (
+    streams.get(robot, streams.find(robot, "nominal", s), signed) for s in ("tune", "score")
+  )
   keys, suite = streams.faults(robot), streams.suite
   numbers = np.concatenate([streams.find(robot, "fault", "score", *key) for key in keys])
-  fault = streams.get(robot, numbers)
+  fault = streams.get(robot, numbers, signed)
   data = Data(robot, tune, score, fault, suite.count_from, suite.arl0, suite.horizon_s)
   seeds = list(dict.fromkeys(score.seed.tolist()))
   for name, severity in keys:

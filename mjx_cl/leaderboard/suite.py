@@ -32,6 +32,7 @@ class Suite:
     nominal: steps, and split -> streams per seed.
     latents: nominal (streams), after_s.
     robots: robot -> split -> {fault or fault:target: severities}.
+    innovations: whether the signed one-step error of every variable is kept.
   """
 
   name: str
@@ -43,6 +44,7 @@ class Suite:
   nominal: dict[str, int]
   latents: dict[str, float]
   robots: dict[str, dict[str, dict[str, tuple[float, ...]]]]
+  innovations: bool = False
 
   def __post_init__(self) -> None:
     whole: dict[str, list[Any]] = {
@@ -65,6 +67,7 @@ class Suite:
     )
     for name, keys in TABLES.items():
       self._need(set(getattr(self, name)) == keys, f"[{name}] needs {', '.join(sorted(keys))}")
+    self._need(isinstance(self.innovations, bool), "innovations must be true or false")
     after_s = self.latents["after_s"]
     for name, value in (("arl0", self.arl0), ("horizon_s", self.horizon_s), ("after_s", after_s)):
       self._need(
@@ -152,7 +155,7 @@ def suite(name: str) -> Suite:
     data = tables.read_suite(base, SUITES)[1] | data
   fields = {f.name for f in dataclasses.fields(Suite)}
   wrong = [f"unknown {k!r}" for k in sorted(set(data) - fields)]
-  wrong += [f"missing {k!r}" for k in sorted(fields - set(data))]
+  wrong += [f"missing {k!r}" for k in sorted(fields - set(data) - {"innovations"})]
   if wrong:
     raise UserError(f"suite {path.name}: {', '.join(wrong)}; it takes: {', '.join(sorted(fields))}")
   try:

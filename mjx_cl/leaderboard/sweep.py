@@ -30,6 +30,7 @@ from mjx_cl.leaderboard.program import (
   program,
   shared,
 )
+from mjx_cl.rollout.monitor import Residual
 from mjx_cl.scoring import thresholds as healthy
 
 
@@ -39,17 +40,18 @@ class Runner:
   Args:
     build: threshold -> Detector.
     room: of the set; None: that of the first robot.
+    signed: it takes innovations, whose number is a robot's own.
   """
 
-  def __init__(self, build: Callable, room: Room | None = None) -> None:
-    self.build, self.room, self.together = build, room, 0
+  def __init__(self, build: Callable, room: Room | None = None, signed: bool = False) -> None:
+    self.build, self.room, self.together, self.signed = build, room, 0, signed
     self.shape = (0, 0, 0, 0)  # output rows, places of the pool, stretches, samples
     self.compiled: Any = None
 
   def prepare(self, data: Samples) -> None:
     """Compiles for these streams; a second robot that fits needs nothing."""
     if not self.together:
-      one_row = jax.tree.map(lambda x: x[0], data.residual)
+      one_row = jax.tree.map(lambda x: x[0], self._rows(data))
       self.together = healthy.TOGETHER if shared(self.build, one_row) else 1
       self.lanes = LANES_SHARED if self.together > 1 else LANES
     copies = 1 if self.together > 1 else LEVELS
@@ -63,7 +65,10 @@ class Runner:
     if self.compiled is None or small or self.shape[3] != shape[3]:
       self.shape, self.compiled = shape, None
       run = program(self.build, rows, shape[1])
-      self.compiled = run.lower(self._filled([]), 0, data.residual).compile()
+      self.compiled = run.lower(self._filled([]), 0, self._rows(data)).compile()
+
+  def _rows(self, data: Samples) -> Residual:
+    return data.residual if self.signed else data.residual._replace(innovation=None)
 
   def _filled(self, stretches: list[Stretch]) -> Stretch:
     """What `program` takes, lanes without use at the first row and into nowhere."""
@@ -84,7 +89,7 @@ class Runner:
     return out
 
   def _call(self, stretches: list[Stretch], data: Samples) -> tuple[np.ndarray, np.ndarray]:
-    fired, scores = self.compiled(self._filled(stretches), len(stretches), data.residual)
+    fired, scores = self.compiled(self._filled(stretches), len(stretches), self._rows(data))
     return np.asarray(fired), np.asarray(scores)
 
   def healthy(

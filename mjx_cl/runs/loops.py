@@ -45,7 +45,9 @@ def make_loop(
   agent, spec, robot = trained.agent, robots[0].spec, known_as(robots[0])
   found = threshold_of(config)
   settings = config.settings | ({"threshold": found.value} if found else {})
-  detector = detectors.make(config.detector, **({"robot": robot} | settings))
+  told = {"robot": robot, "agent": agents.called(trained)} | settings
+  detector = detectors.make(config.detector, **told)
+  signed = config.residuals or getattr(detectors.factory(config.detector), "signed", False)
   repeat, episode = trained.repeat, min(r.spec.episode_steps for r in robots)
   records = lambda steps: capacity(steps, episode, repeat)
   size = (agent.config.size, len(spec.obs), len(spec.act))
@@ -63,11 +65,12 @@ def make_loop(
     detectors.factory(config.detector),
     config.detector,
     robot,
+    told["agent"],
     json.dumps(settings, sort_keys=True, default=repr),
   )
   return Loop(
     agent,
-    Monitor(agent, 15, config.form, config.actions, spec=spec, signed=config.residuals),
+    Monitor(agent, 15, config.form, config.actions, spec=spec, signed=signed),
     detector,
     spec,
     config.adapt,

@@ -101,6 +101,7 @@ SOURCES = {
     ),
   ),
   "two-agents": ("walker_gear/summary.json", "walker_plain/summary.json"),
+  "several-agents": ("agents/bench.json",),
   "gradient": ("policy_gradient.json",),
   "raw-logs": ("raw_logs.json", "innovations.json"),
   "long-logs": ("long_log.json",),
@@ -697,6 +698,7 @@ CONSTANTS = {
   "full": {"95", "500", "2,000", "1", "2", "3"},
   "in-loop": {"95", "500", "2,000", "10,000", "1", "2", "3"},
   "two-agents": {"95", "500", "10,000", "2,000"},
+  "several-agents": {"95", "500", "10,000", "2,000", "0", "2", "3"},  # the last of names
   "gradient": {"95"},
   "raw-logs": {"1"},
   "gait": {"20"},

@@ -17,7 +17,7 @@ import quick
 import scipy.stats
 
 from mjx_cl import detectors
-from mjx_cl.detectors import Alarm, Detector, any_of, on, rolling_sigma
+from mjx_cl.detectors import Alarm, Detector, any_of, innovations, on, rolling_sigma
 from mjx_cl.errors import UserError
 from mjx_cl.leaderboard import entries as entries_of
 from mjx_cl.leaderboard import program as program_of
@@ -37,6 +37,7 @@ REFERENCES = {
   f"{k} (residual)" for k, f in detectors.DETECTORS.items() if getattr(f, "reference", False)
 }  # they look at nothing
 STREAMS, STEPS = 3, 700
+ERRORS = len(innovations.fit_of("walker").grain)
 
 
 def residuals(key, steps=STEPS, streams=None, invalid=0.1):
@@ -49,7 +50,7 @@ def residuals(key, steps=STEPS, streams=None, invalid=0.1):
   wide = lambda k, n: jnp.where(
     valid[..., None], 1.0 + 0.1 * jax.random.normal(k, shape + (n,)), jnp.nan
   )
-  more = jax.random.split(keys[2], 4)
+  more = jax.random.split(keys[2], 5)
   return Residual(
     opr,
     draw(keys[2]),
@@ -60,6 +61,7 @@ def residuals(key, steps=STEPS, streams=None, invalid=0.1):
     jnp.zeros(shape, bool),
     draw(more[2]),
     wide(more[3], LATENT),
+    wide(more[4], ERRORS),
   )
 
 
@@ -143,7 +145,7 @@ def test_an_invalid_row_changes_nothing(case, same):
   for filling in (nan, jnp.full(STREAMS, 1e9)):  # whatever the row holds
     wide = lambda n: jnp.tile(filling[:, None], n)
     row = unknown((STREAMS,), 4)._replace(
-      opr=filling, rpr=filling, variables=wide(4), groups=wide(GROUPS)
+      opr=filling, rpr=filling, variables=wide(4), groups=wide(GROUPS), innovation=wide(ERRORS)
     )
     new, alarm = update(state, row)
     assert same(new, state)
@@ -193,7 +195,8 @@ def test_a_step_change_is_found(case, request):
   )  # ten deviations, in whatever a detector looks at
   xs = xs._replace(
     **{
-      k: jump(getattr(xs, k)) for k in ("opr", "rpr", "variables", "groups", "surprise", "latent")
+      k: jump(getattr(xs, k))
+      for k in ("opr", "rpr", "variables", "groups", "surprise", "latent", "innovation")
     },
     reward=xs.reward - 1.0 * late,
   )

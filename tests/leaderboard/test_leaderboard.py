@@ -86,6 +86,7 @@ def part(lanes, onsets, steps, seed):
       data[c][:, i] = 0.5 - 0.1 * x[:, k] if c == "reward" else np.exp(0.3 * x[:, k])
     data["latent"][:, i] = x[:, 12:]
   data["opr"][50:55] = data["rpr"][50:55] = np.nan  # a window that was cut
+  data["innovation"] = 3.0 * data["latent"][..., :3].astype(np.float32)
   episode = np.broadcast_to((np.arange(steps) // 100).astype(np.int16)[:, None], shape)
   return data | {
     "episode": episode,
@@ -94,8 +95,8 @@ def part(lanes, onsets, steps, seed):
   }
 
 
-def make_set(folder, suite=SUITE, robots=("walker",)):
-  """A set as `record` writes it, from synthetic recordings."""
+def make_set(folder, suite=SUITE, robots=("walker",), variables=()):
+  """A set as `record` writes it, from synthetic recordings; with innovations of `variables`."""
   folder.mkdir(parents=True, exist_ok=True)
   rows, details = [], {}
   for robot in robots:
@@ -116,7 +117,14 @@ def make_set(folder, suite=SUITE, robots=("walker",)):
         part(who, onsets, int(onsets.max()) + suite.after(CONTROL_S), 2),
       )
     details[robot], fresh = set_tables.write(
-      suite, folder, robot, parts, len(rows), CONTROL_S, ",".join(f"g{k}" for k in range(8))
+      suite,
+      folder,
+      robot,
+      parts,
+      len(rows),
+      CONTROL_S,
+      ",".join(f"g{k}" for k in range(8)),
+      variables,
     )
     rows += fresh
   set_tables.write_meta(folder, rows + set_tables.healthy_probes(rows))
@@ -159,6 +167,68 @@ def test_what_was_recorded_comes_back_but_for_the_rounding(small):
   )  # 0.1 / 4 is nearest to 2^-5
   assert np.isfinite(got.residual.latent[onsets[faulty[0]] + 5, 0]).all()
   assert np.isnan(got.residual.latent[onsets[faulty[0]] + 20 + 1, 0]).all()  # kept for 10 s
+
+
+def test_innovations_come_back_to_half_a_deviation(tmp_path):
+  parts = make_set(tmp_path, variables=("height", "speed", "reward"))
+  held = streams.StreamSet(tmp_path)
+  names = ("innovation_height", "innovation_speed", "innovation_reward")
+  assert held.signed("walker") == held.need_innovations("walker") == names
+  who, onsets, data = parts["score", "fault"]
+  faulty = [i for i, lane in enumerate(who) if lane.fault]
+  numbers = held.find("walker", "fault", "score")
+  got = held.get("walker", numbers, signed=True).residual.innovation
+  table = pyarrow.parquet.read_table(tmp_path / "walker_innovations.parquet")
+  assert table.column_names == ["stream", "step", *names]
+  grain = held.config["details"]["walker"]["rounding"]
+  for k, name in enumerate(names):
+    assert grain[name] == 4.0  # of 2^j the nearest, by its logarithm, to the deviation 3
+    for column, i in enumerate(faulty):
+      end = onsets[i] + SUITE.after(CONTROL_S)
+      np.testing.assert_allclose(got[:end, column, k], data["innovation"][:end, i, k], atol=2.0)
+      assert np.isnan(got[end:, column, k]).all()
+  assert held.get("walker", numbers).residual.innovation is None
+  assert streams.load(held, "walker").tune.residual.innovation.shape == (1024, 4 * SEEDS, 3)
+
+
+def test_float16_holds_every_innovation_that_is_written():
+  error = np.array([[-1e9, 0.0, 3.0, np.nan]], np.float32).T[:, :, None]
+  grain = set_tables.grains(
+    {c: np.ones((4, 1), np.float32) for c in streams.COLUMNS}
+    | {"latent": np.ones((4, 1, 16), np.float16), "innovation": np.zeros((4, 1, 1), np.float32)},
+    ("innovation_reward",),
+  )
+  assert np.float16(grain["innovation_reward"]) > 0  # of a variable that never varies
+  kept = set_tables.half(error[:, 0, 0], "innovation_reward", {"innovation_reward": 2.0})
+  np.testing.assert_array_equal(kept, np.float16([-60_000, 0, 4, np.nan]))  # 1.5 steps: to even
+
+
+def test_a_set_without_innovations_says_what_to_record(small):
+  held, _, folder = small
+  assert held.signed("walker") == ()
+  with pytest.raises(FileError, match="holds no innovations of walker; record a suite with") as e:
+    held.get("walker", held.find("walker", "fault", "score"), signed=True)
+  assert "\n" not in str(e.value)
+  entry = leaderboard.chosen(("ewma",), "walker")[0]._replace(name="mine", signed=True)
+  kept, left = leaderboard.able([entry], held, ["walker"])
+  assert not kept and len(left) == 1 and left[0].startswith("mine is left out: ")
+  with pytest.raises(FileError, match="holds no innovations"):
+    leaderboard.able([entry], held, ["walker"], ("mine",))
+
+
+def test_a_set_of_the_version_before_reads_alike(small, tmp_path):
+  held, _, folder = small
+  for path in folder.iterdir():
+    (tmp_path / path.name).write_bytes(path.read_bytes())
+  config = json.loads((folder / "config.json").read_text()) | {"version": 1}
+  del config["suite"]["innovations"]
+  (tmp_path / "config.json").write_text(json.dumps(config))
+  old, numbers = streams.StreamSet(tmp_path), held.find("walker", "nominal", "score")
+  jax.tree.map(
+    np.testing.assert_array_equal,
+    old.get("walker", numbers).residual,
+    held.get("walker", numbers).residual,
+  )
 
 
 def test_plain_parquet_readers_can_read_it(small):

@@ -73,6 +73,12 @@ def save(folder: os.PathLike | str, train: TrainState, card: dict) -> None:
     folders.atomic(folder / "card.json", lambda file: file.write(text.encode()))
 
 
+def called(trained: Trained) -> str:
+  """The name of an agent that ships, the folder of another."""
+  path = pathlib.Path(trained.path)
+  return path.name if path.parent == HERE else trained.path
+
+
 def of(env: Any, path: str | None = None, **departures: Any) -> Trained:
   """`load` for the robot `env`, which is known by the name in its spec; its `agents_of` names
   another whose agents it takes.
