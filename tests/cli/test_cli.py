@@ -876,7 +876,7 @@ def test_bash_completes_a_flag(mjx, tmp_path):
   code, script, _ = mjx("--tyro-print-completion", "bash")
   (tmp_path / "mjx-cl").write_text(script)
   ask = """
-    source mjx-cl; own=$(complete -p mjx-cl | sed -E 's/.*-F ([^ ]+).*/\\1/')
+    source ./mjx-cl; own=$(complete -p mjx-cl | sed -E 's/.*-F ([^ ]+).*/\\1/')
     COMP_WORDS=(mjx-cl run walker --detec); COMP_CWORD=3
     COMP_LINE="mjx-cl run walker --detec"; COMP_POINT=${#COMP_LINE}
     $own mjx-cl --detec walker; echo "${COMPREPLY[@]}"
