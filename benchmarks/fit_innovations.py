@@ -2,10 +2,10 @@
 
 Healthy streams and tuning faults of the seeds that tune, of each robot of a set that holds
 innovations; writes mjx_cl/detectors/fits/AGENT.npz, or --out FOLDER/innovations.npz for an agent of
-one's own. `--left-out` prints instead, for each tuning fault, the score of detector `learnt`'s
-looks and of this one by fits that have seen neither that fault nor its seeds: mean over its streams
-of 100 2^(-latency / 5 s), 0 where it is missed, at one alarm in 10,000 healthy control steps of the
-seeds that were not fitted on.
+one's own. `--left-out` prints instead, for each tuning fault, the score of detector `learnt` and of
+this one by fits that have seen neither that fault nor its seeds, and of this one by a fit that has
+seen the fault on other seeds: mean over its streams of 100 2^(-latency / 5 s), 0 where it is
+missed, at one alarm in 10,000 healthy control steps of the seeds that were not fitted on.
 """
 
 import argparse
@@ -177,7 +177,7 @@ def parted(streams: Streams, use: np.ndarray) -> Streams:
 
 
 def left_out(healthy: Streams, faulty: Streams, grain: np.ndarray, horizon_s: float) -> dict:
-  """{tuning fault: mean scores of detector `learnt` and of this one}, see the module's text."""
+  """{tuning fault: three mean scores}, see the module's text."""
   names, out = np.array(faulty.fault), {}
   middle = np.median(np.unique(healthy.seed))
   for half in (lambda seed: seed < middle, lambda seed: seed >= middle):
@@ -187,6 +187,9 @@ def left_out(healthy: Streams, faulty: Streams, grain: np.ndarray, horizon_s: fl
     quiet, loud, unseen, new = (weighable(s, fit) for s in (here, bad, there, met))
     old, seen = fit_learnt.reference(here)
     before = [fit_learnt.averages(s, old) for s in (bad, there, met)]
+    both = weighed(fit, quiet, loud, np.ones(len(bad.fault), bool))
+    a, b = scores(unseen, both), scores(new, both)
+    seen_ones = found(b, level(a, ARL0), met, horizon_s)
     for name in dict.fromkeys(names):
       use, at = (np.array(s.fault) != name for s in (bad, met))
       own = weighed(fit, quiet, loud, use)
@@ -195,7 +198,7 @@ def left_out(healthy: Streams, faulty: Streams, grain: np.ndarray, horizon_s: fl
       other = fit_learnt.weighed(old, seen, before[0], use)
       a, b = (fit_learnt.scores(s, other).max(0) for s in before[1:])
       two = found(b, level(a, ARL0), met, horizon_s)[~at]
-      out.setdefault(name, []).append((two, one))
+      out.setdefault(name, []).append((two, one, seen_ones[~at]))
   return {
     name: np.concatenate([np.stack(x) for x in rows], 1).mean(1) for name, rows in out.items()
   }

@@ -28,7 +28,7 @@ from mjx_cl.leaderboard import score
 FILE = pathlib.Path(detectors.__file__).parent / "thresholds.json"
 LEAST = 10  # alarms
 LATER = [f"results/learnt/{robot}" for robot in ("car", "quadruped", "walker")]
-LATEST = [f"results/innovations/{robot}" for robot in ("walker",)]
+LATEST = [f"results/innovations/{robot}" for robot in ("quadruped", "walker")]
 BOARDS = ["results/leaderboard_100k", *LATER, *LATEST]
 
 

@@ -106,10 +106,14 @@ class State(NamedTuple):
   Attributes:
     warm: of channels and errors: the fit's moments, or those of the stream's own samples.
     averages: of the features.
+    seen: int32 (), scores that `peak` was taken of.
+    peak: float32 (), the largest of a changed agent's first scores; 1 of the agent of the fit.
   """
 
   warm: Warm
   averages: Any
+  seen: Any
+  peak: Any
 
 
 def sample(residual: Residual, fit: Fit) -> tuple[Float[Array, "k"], Any]:
@@ -186,11 +190,13 @@ def innovations(
   faults that it was fitted on. mean, std, P, level, spread and S are of healthy robots of one
   agent; w, v and b of those against the tuning faults of the suite `leaderboard`. Units: what
   healthy robots pass once in 20,000 control steps (ratio, l_1) or 80,000 (l_2, l_3). After a
-  finetuning mean and std are those of the next 1,500 samples, since the agent is another.
+  finetuning the agent is another: mean and std are those of its next 1,500 samples, and scores are
+  divided by the largest of the 1,500 after these, if that is above 1.
 
   Args:
     threshold: decision level.
-    warmup: samples that fit mean and std from the start [control steps]; 0: the fit's.
+    warmup: samples that fit mean and std from the start, and as many the score's scale [control
+      steps]; 0: the fit's.
     agent: whose fit is taken, a shipped name or a folder; default: the robot's.
     robot: default: the walker.
 
@@ -211,6 +217,8 @@ def innovations(
   own, size, count = warmup or OWN, len(fit.mean), len(fit.grain)
   none = lambda: jnp.zeros((len(RATES), N + 2 * count))
   told = lambda: Warm(jnp.int32(own), jnp.asarray(fit.mean), jnp.square(fit.std) * own)
+  begin = lambda: State(told(), none(), jnp.int32(own), jnp.float32(1.0))
+  learns = lambda: State(cold(size), none(), jnp.int32(0), jnp.float32(1.0))
 
   def update(state: State, residual: Residual) -> tuple[State, Alarm]:
     e = residual.innovation
@@ -223,11 +231,13 @@ def innovations(
     warm, z, ready = standardise(state.warm, x, own)
     known, warm = known & ready, keep(known, warm, state.warm)
     new = keep(known, averaged(state.averages, features(z, fit)), state.averages)
-    alarm = judged(score(new, fit), known, threshold)
-    return State(warm, jnp.where(alarm.fired, 0.0, new)), alarm
+    own_score, tells = score(new, fit), known & (state.seen >= own)
+    peak = jnp.where(known & ~tells, jnp.maximum(state.peak, own_score), state.peak)
+    seen = jnp.minimum(state.seen + known, own)
+    alarm = judged(own_score / state.peak, tells, threshold)
+    return State(warm, jnp.where(alarm.fired, 0.0, new), seen, peak), alarm
 
-  learns = lambda: State(cold(size), none())
-  return Detector(learns if warmup else lambda: State(told(), none()), update, anew=learns)
+  return Detector(learns if warmup else begin, update, anew=learns)
 
 
 # whether its rows must have innovations, and what a board says beside its name

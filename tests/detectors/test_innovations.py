@@ -113,11 +113,13 @@ def test_recorded_faults_are_found_and_a_recorded_healthy_robot_is_left_alone():
   assert all(soon) and early <= 2  # of some 8,000 steps
 
 
-def test_after_a_finetuning_it_learns_mean_and_deviation_anew():
-  """By hand: as if the fit's were those of its first 1,500 samples."""
+def test_after_a_finetuning_it_learns_mean_deviation_and_scale_anew():
+  """By hand: as if the fit's were those of its first 1,500 samples, and its unit the largest score
+  of the next.
+  """
   fit = own.fit_of("walker")
-  rows = residuals(2000, fit._replace(mean=fit.mean + 2 * fit.std, std=1.5 * fit.std))
-  past, then = (jax.tree.map(lambda x: x[part], rows) for part in (slice(1600), slice(1600, None)))
+  rows = residuals(3600, fit._replace(mean=fit.mean + 2 * fit.std, std=1.5 * fit.std))
+  past, then = (jax.tree.map(lambda x: x[part], rows) for part in (slice(2400), slice(2400, None)))
   det = detectors.make("innovations", threshold=1e6)
   two = lambda x: jnp.broadcast_to(jnp.asarray(x), (2, *jnp.shape(x)))
   both = jax.tree.map(lambda x: jnp.stack([x, x], 1), past)
@@ -127,8 +129,12 @@ def test_after_a_finetuning_it_learns_mean_and_deviation_anew():
   x = np.asarray(seen, np.float64)
   late = jax.tree.map(lambda x: x[1500:], rows)
   score, _ = by_hand(late, fit._replace(mean=x.mean(0), std=x.std(0)), 1e6)
-  np.testing.assert_allclose(after(0).score, score[100:], rtol=5e-3, atol=5e-3)  # as above
-  assert np.median(after(1).score) > np.median(after(0).score)
+  peak = max(1.0, score[:1500].max())
+  assert peak > 1.2  # errors that are not correlated as the fit's
+  got = np.asarray(after(0).score)
+  assert np.isnan(got[:600]).all()
+  np.testing.assert_allclose(got[600:], score[1500:] / peak, rtol=5e-3, atol=5e-3)  # as above
+  assert np.median(after(1).score) > np.median(got[600:])
 
 
 def test_what_it_cannot_take_is_refused():
