@@ -319,7 +319,10 @@ def test_a_detector_in_the_loop_has_the_boards_threshold(tmp_path, monkeypatch):
   row = detectors.board()["car"]["cusum white"]
   runner, told = run.Runner(config, tmp_path / "r"), []
   assert built == [
-    ("cusum", {"robot": "car", "whiten": 8, "slack": 0.5, "threshold": row["threshold"]})
+    (
+      "cusum",
+      {"robot": "car", "agent": "car", "whiten": 8, "slack": 0.5, "threshold": row["threshold"]},
+    )
   ]
   value = runner.config_dict()
   assert (
