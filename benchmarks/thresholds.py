@@ -27,9 +27,12 @@ from mjx_cl.leaderboard import score
 
 FILE = pathlib.Path(detectors.__file__).parent / "thresholds.json"
 LEAST = 10  # alarms
-LATER = [f"results/learnt/{robot}" for robot in ("car", "quadruped", "walker")]
-LATEST = [f"results/innovations/{robot}" for robot in ("quadruped", "walker")]
-BOARDS = ["results/leaderboard_100k", *LATER, *LATEST]
+LATER = [
+  f"results/{name}/{robot}"
+  for name in ("learnt", "innovations")
+  for robot in ("car", "quadruped", "walker")
+]
+BOARDS = ["results/leaderboard_100k", *LATER]
 
 
 def collect(folder: pathlib.Path) -> dict:
