@@ -10,6 +10,7 @@ missed, at one alarm in 10,000 healthy control steps of the seeds that were not 
 
 import argparse
 import pathlib
+import sys
 from typing import Any, NamedTuple
 
 from mjx_cl.io import runtime
@@ -34,9 +35,12 @@ from benchmarks.fit_learnt import (  # noqa: E402
   level,
   regress,
 )
+from mjx_cl.cli import app  # noqa: E402
 from mjx_cl.detectors import innovations, learnt  # noqa: E402
+from mjx_cl.errors import require  # noqa: E402
 from mjx_cl.io import arrays, folders  # noqa: E402
 from mjx_cl.leaderboard.streams import Streams, StreamSet  # noqa: E402
+from mjx_cl.training import agents  # noqa: E402
 
 APART = 0.02  # shrinkage of the errors' correlations
 RARE = 80_000  # healthy control steps for each alarm of a unit of a single look
@@ -212,13 +216,21 @@ def main() -> None:
   parser.add_argument("--out", help="folder of an agent of one's own")
   parser.add_argument("--left-out", action="store_true")
   given = parser.parse_args()
+  sys.exit(app.attempt(lambda: run(given)))
+
+
+def run(given: argparse.Namespace) -> None:
+  """What the command does. UserError for a robot or a set that cannot be fitted to."""
   streams = StreamSet(given.streams)
-  for robot in [given.robot] if given.robot else streams.robots:
+  robots = streams.choose([given.robot] if given.robot else [])
+  require(not given.out or len(robots) == 1, "--out takes the fit of one robot; give --robot")
+  for robot in robots:
     names = streams.need_innovations(robot)
     grain = np.array([streams.config["details"][robot]["rounding"][name] for name in names])
     told = {name.split(":")[0] for name in streams.suite.robots[robot].get("tune", {})}
     healthy = streams.get(robot, streams.find(robot, "nominal", "tune"), signed=True)
     own = [key for key in streams.faults(robot, "tune") if key[0] in told]
+    require(own, f"{streams.folder} holds no tuning faults of {robot}")
     numbers = np.concatenate([streams.find(robot, "fault", "tune", *key) for key in own])
     faulty = streams.get(robot, numbers, signed=True)
     if given.left_out:
@@ -230,9 +242,11 @@ def main() -> None:
     fit = reference(healthy, grain)
     every = np.ones(len(numbers), bool)
     fit = weighed(fit, weighable(healthy, fit), weighable(faulty, fit), every)
+    agent = streams.agent(robot)
+    require(given.out or agent in agents.shipped(), f"agent {agent} does not ship; give --out")
     folder = pathlib.Path(given.out) if given.out else innovations.FITS
     folders.make(folder)
-    target = folder / (innovations.FILE if given.out else f"{streams.agent(robot)}.npz")
+    target = folder / (innovations.FILE if given.out else f"{agent}.npz")
     arrays.write(target, fit._asdict(), small=True)
     print(f"{target}: {len(grain)} errors, {int(every.sum())} streams with a fault")
 

@@ -92,7 +92,8 @@ def score(
   held = StreamSet(streams)
   chosen = held.choose(tuple(robots))
   if isinstance(detector, str):
-    entries, extra = board.chosen((detector,), chosen[0]), []
+    entries, _ = board.able(board.chosen((detector,), chosen[0]), held, chosen, (detector,))
+    extra = []
   elif callable(detector):
     name = getattr(detector, "__name__", type(detector).__name__)
     host = HostDetector(detector, name, channel)

@@ -94,10 +94,35 @@ def fit_of(agent: str) -> Fit:
       f"detector 'innovations' has no fit of agent {agent!r}; choose from: {', '.join(agents())}; "
       "docs/detection.md says how to fit another"
     )
-  held = arrays.read(path)
-  if set(held) != set(Fit._fields):
+  held = {k: np.asarray(v) for k, v in arrays.read(path).items()}
+  count = held["grain"].size if "grain" in held else 0
+  wanted = shapes(count)
+  if not count or {k: v.shape for k, v in held.items()} != wanted:
     raise FileError(f"{path} is no fit of detector 'innovations'")
+  if not all(v.dtype.kind == "f" and np.isfinite(v).all() for v in held.values()):
+    raise FileError(f"{path} holds something other than finite numbers")
   return Fit(**{k: np.asarray(v, np.float32) for k, v in held.items()})
+
+
+def shapes(p: int) -> dict[str, tuple[int, ...]]:
+  """Of the fields of a Fit with `p` errors."""
+  k, f, r = N + p, N + 2 * p, len(RATES)
+  return {
+    "mean": (k,),
+    "std": (k,),
+    "grain": (p,),
+    "apart": (p, p),
+    "center": (2 * p,),
+    "scale": (2 * p,),
+    "level": (r, f),
+    "spread": (r, f),
+    "factor": (r, k, k),
+    "low": (3, r),
+    "wide": (3, r),
+    "weights": (2, (N + 3) * r),
+    "bias": (),
+    "units": (2 + 2 * r,),
+  }
 
 
 class State(NamedTuple):
@@ -203,7 +228,7 @@ def innovations(
   Returns:
     Detector over monitor.Residual of a Monitor that is `signed`.
   Blind to: what the world model foresees all the same; a change of fewer steps than the fastest
-  average takes.
+  average takes; the 3,000 samples after a finetuning.
   Reference: Mehra, Peschon 1971, Automatica 7, 637-640 (innovations of a healthy model for fault
   detection); Hawkins 1991, Technometrics 33, 61-75 (each error against what the others tell);
   Lowry, Woodall, Champ, Rigdon 1992, Technometrics 34, 46-53 (averages of several variables).

@@ -65,10 +65,10 @@ def entry(name: str, settings: dict) -> Entry:
     use, **(more | rest), **({"threshold": threshold} if calibrated else {})
   )
   own = None
-  if use == "rolling_sigma" or "robot" in parameters:
+  reference, signed = (bool(getattr(factory, k, False)) for k in ("reference", "signed"))
+  if use == "rolling_sigma" or signed or {"robot", "agent"} & set(parameters):
     more = {"shared": True} if use == "rolling_sigma" else {}
     own = lambda robot: lambda threshold: build(threshold, robot=robot, **more)
-  reference, signed = (bool(getattr(factory, k, False)) for k in ("reference", "signed"))
   return Entry(name, build, calibrated, reference, own, signed)
 
 

@@ -235,7 +235,7 @@ def record(
     rows, free = rows + fresh, max(free, number + len(fresh))
     made["stream_steps"][robot] = int(sum(data["opr"].size for *_, data in parts.values()))
     name, weights = pathlib.Path(trained.path).name, parts_of.digest(trained.train.params)
-    made["agents"][robot] = {"name": name, "crc32": weights}
+    made["agents"][robot] = {"name": name, "agent": agents.called(trained), "crc32": weights}
   set_tables.write_meta(staged, rows + set_tables.healthy_probes(rows))
   config = _config(suite, command, made, old, kept)
   tables.write_json(staged / "config.json", config)

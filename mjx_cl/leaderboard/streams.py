@@ -206,8 +206,11 @@ class StreamSet:
     return names
 
   def agent(self, robot: str) -> str:
-    """Name of the agent that was recorded, the robot's own where the set does not tell."""
-    return self.config.get("agents", {}).get(robot, {}).get("name", robot)
+    """Shipped name or folder of the agent that was recorded, the robot's own where the set does not
+    tell.
+    """
+    told = self.config.get("agents", {}).get(robot, {})
+    return told.get("agent") or told.get("name", robot)
 
   def choose(self, robots: Collection[str] = ()) -> list[str]:
     """These robots, each once; all where none is named. UserError for one that the set lacks."""

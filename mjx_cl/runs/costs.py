@@ -3,7 +3,7 @@
 import functools
 import time
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,7 @@ from mjx_cl.errors import UserError
 from mjx_cl.faults.presets import becomes, changes
 from mjx_cl.runs import room, work
 from mjx_cl.runs.clock import COMPILE_LEARNER_S, COMPILE_S, clock_of
-from mjx_cl.runs.identity import arm_agents
+from mjx_cl.runs.identity import arm_agents, known_as
 from mjx_cl.runs.outlook import Standing
 from mjx_cl.runs.suite import Part
 from mjx_cl.scoring import stop_rule
@@ -58,9 +58,19 @@ class Robots:
 
   def __init__(self) -> None:
     self.make = functools.cache(envs.make)
-    self.learner = functools.cache(
-      lambda name, agent: agents.of(self.make(name, "auto"), agent).agent.config
-    )
+    self._agent = functools.cache(self._load)
+
+  def _load(self, name: str, agent: str | None) -> tuple[Any, str]:
+    trained = agents.of(self.make(name, "auto"), agent)
+    return trained.agent.config, agents.called(trained)
+
+  def learner(self, name: str, agent: str | None) -> Any:
+    """DreamerConfig of a robot's agent."""
+    return self._agent(name, agent)[0]
+
+  def called(self, name: str, agent: str | None) -> str:
+    """The agent's own name, see `agents.called`."""
+    return self._agent(name, agent)[1]
 
 
 def estimate(part: Part, rate: float, robots: Robots) -> Estimate:
@@ -99,9 +109,9 @@ def check(part: Part, robots: Robots) -> None:
   """
   c = part.config
   try:
-    detectors.make(c.detector, **c.settings)
     faults.build(changes(c), robots.make(becomes(c) or c.env, c.physics), c.onset)
-    robots.learner(c.env, c.agent)
+    robot, agent = known_as(robots.make(c.env, c.physics)), robots.called(c.env, c.agent)
+    detectors.make(c.detector, **({"robot": robot, "agent": agent} | c.settings))
     arm_agents(c, robots.make(c.env, c.physics))
     stop_rule.told(c)
   except UserError as e:

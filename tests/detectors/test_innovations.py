@@ -154,6 +154,13 @@ def test_a_fit_beside_ones_own_agent(tmp_path):
   arrays.write(tmp_path / own.FILE, {"mean": np.zeros(3)})
   with pytest.raises(FileError, match="is no fit of detector 'innovations'"):
     detectors.make("innovations", agent=str(tmp_path))
+  whole = own.fit_of("car")._asdict()
+  short, spoilt = whole | {"mean": whole["mean"][:3]}, whole | {"bias": np.float32(np.nan)}
+  for held, text in ((short, "is no fit of"), (spoilt, "something other than finite numbers")):
+    own.fit_of.cache_clear()
+    arrays.write(tmp_path / own.FILE, held)
+    with pytest.raises(FileError, match=text):
+      detectors.make("innovations", agent=str(tmp_path))
   other = tmp_path / "agent"
   other.mkdir()
   arrays.write(other / own.FILE, own.fit_of("car")._asdict())

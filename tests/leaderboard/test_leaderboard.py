@@ -116,6 +116,7 @@ def make_set(folder, suite=SUITE, robots=("walker",), variables=()):
         onsets,
         part(who, onsets, int(onsets.max()) + suite.after(CONTROL_S), 2),
       )
+    names = variables.get(robot, ()) if isinstance(variables, dict) else variables
     details[robot], fresh = set_tables.write(
       suite,
       folder,
@@ -124,7 +125,7 @@ def make_set(folder, suite=SUITE, robots=("walker",), variables=()):
       len(rows),
       CONTROL_S,
       ",".join(f"g{k}" for k in range(8)),
-      variables,
+      names,
     )
     rows += fresh
   set_tables.write_meta(folder, rows + set_tables.healthy_probes(rows))
@@ -189,6 +190,35 @@ def test_innovations_come_back_to_half_a_deviation(tmp_path):
       assert np.isnan(got[end:, column, k]).all()
   assert held.get("walker", numbers).residual.innovation is None
   assert streams.load(held, "walker").tune.residual.innovation.shape == (1024, 4 * SEEDS, 3)
+
+
+def test_a_detector_that_takes_innovations_runs_on_robots_of_different_size(tmp_path, monkeypatch):
+  """The largest error of the step over its threshold, in NumPy."""
+  both = dataclasses.replace(SUITE, robots=dict.fromkeys(("walker", "car"), SUITE.robots["walker"]))
+  make_set(tmp_path, both, ("walker", "car"), {"walker": "abc", "car": "ab"})
+  held = streams.StreamSet(tmp_path)
+
+  def largest(threshold=1.0):
+    def update(state, row):
+      score = jnp.max(jnp.abs(row.innovation))
+      return state, detectors.Alarm(score > threshold, score)
+
+    return detectors.Detector(lambda: jnp.zeros(()), update)
+
+  largest.signed = True
+  monkeypatch.setitem(detectors.DETECTORS, "largest", largest)
+  entry = entries_of.entry("largest", {"use": "largest"})
+  kept, left = leaderboard.able([entry], held, held.robots, ("largest",))
+  board = leaderboard.score(held, kept)
+  assert not left and {row["robot"] for row in board.rows if row["detector"] == "largest"} == {
+    "walker",
+    "car",
+  }
+  for robot in held.robots:
+    data = streams.load(held, robot)
+    e = np.abs(data.tune.residual.innovation).max(-1)[SUITE.count_from :]
+    (row, *_) = [r for r in board.rows if (r["detector"], r["robot"]) == ("largest", robot)]
+    assert row["arl0_alarms"] > 0 and 0 < np.nanmean(e > row["threshold"]) < 0.01
 
 
 def test_float16_holds_every_innovation_that_is_written():

@@ -1136,3 +1136,14 @@ def test_published_figures_are_drawn_anew(tmp_path, mjx):  # noqa: F811
     (tmp_path / "study/bench.json").write_text(text)
     with pytest.raises(FileError, match=f"^cannot draw the figures of .*{word}"):
       bench.redraw(tmp_path)
+
+
+def test_a_detector_without_a_fit_of_its_agent_is_refused_before_anything_is_lived():
+  config = RunConfig("walker", detector="innovations", agent="walker-2")
+  with pytest.raises(
+    UserError, match="part a: detector 'innovations' has no fit of agent 'walker-2'"
+  ):
+    costs.check(suites.Part("a", config), costs.Robots())
+  costs.check(
+    suites.Part("a", RunConfig("car", "car/sim-to-real", detector="innovations")), costs.Robots()
+  )

@@ -74,9 +74,9 @@ def save(folder: os.PathLike | str, train: TrainState, card: dict) -> None:
 
 
 def called(trained: Trained) -> str:
-  """The name of an agent that ships, the folder of another."""
+  """The name of an agent that ships, the whole path of another's folder."""
   path = pathlib.Path(trained.path)
-  return path.name if path.parent == HERE else trained.path
+  return path.name if path.parent == HERE else str(path.absolute())
 
 
 def of(env: Any, path: str | None = None, **departures: Any) -> Trained:
