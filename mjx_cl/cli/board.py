@@ -91,8 +91,6 @@ def do_leaderboard(args: Leaderboard) -> None:
   entries, left = score.able(
     score.chosen(args.detector, robots[0]), held, robots, args.detector or ()
   )
-  for why in left:
-    say(why)
   extra = own(args, held, robots)
   taken = {*score.variants(), *(one.name for one in entries), *score.ORACLES}
   for name, _ in extra:
@@ -105,6 +103,8 @@ def do_leaderboard(args: Leaderboard) -> None:
     tell(f"{done}/{total}  {robot}: {name}, {clock(seconds)} gone, {left} left", done == total)
 
   folders.probe(args.out)  # before minutes are spent
+  for why in left:
+    say(why)
   begin = time.perf_counter()
   found = None
   if on and entries:

@@ -211,13 +211,15 @@ def two(tmp_path, monkeypatch):
   (tmp_path / "two.toml").write_text(TWO)
   suite, draw = streams.suite(str(tmp_path / "two.toml")), [0]
 
-  def live(env, trained, who, keys, onsets, steps, watch, progress):
+  def live(env, trained, who, keys, onsets, steps, watch, signed, progress):
     rng = np.random.default_rng([draw[0], len(env.spec.obs), steps])
     life = {
       c: np.repeat(rng.gamma(4.0, size=(steps, 1)).astype(np.float32), len(who), 1)
       for c in streams.COLUMNS
     }
+    errors = rng.normal(size=(steps, 1, len(env.spec.obs) + 1)).astype(np.float32)
     return life | {
+      "innovation": np.repeat(errors, len(who), 1),
       "latent": np.zeros((steps, len(who), streams.LATENT), np.float16),
       "episode": np.zeros((steps, len(who)), np.int16),
       "terminated": np.zeros((steps, len(who)), bool),
@@ -259,7 +261,7 @@ def test_one_robot_of_a_set_is_recorded_anew(two, tmp_path, capsys):
     and set(config["kept"]) == {"car"}
   )
   assert set(config["agents"]) == {"walker", "car"} and all(
-    set(a) == {"name", "crc32"} for a in config["agents"].values()
+    set(a) == {"name", "agent", "crc32"} for a in config["agents"].values()
   )
   assert (
     set(config["details"])
