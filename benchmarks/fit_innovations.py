@@ -23,17 +23,14 @@ import numpy as np  # noqa: E402
 
 from benchmarks import fit_learnt  # noqa: E402
 from benchmarks.fit_learnt import (  # noqa: E402
-  AFTER,
   ARL0,
-  EVERY,
-  HALF_S,
-  LEAST,
   SETTLED,
   SHRINK,
   UNIT,
   found,
   level,
   regress,
+  rows,
 )
 from mjx_cl.cli import app  # noqa: E402
 from mjx_cl.detectors import innovations, learnt  # noqa: E402
@@ -104,22 +101,22 @@ def reference(streams: Streams, grain: np.ndarray) -> innovations.Fit:
   c = z[:, N:] @ apart.T
   both = np.concatenate([c, np.log(c**2 + innovations.SMALL)], 1)
   fit = fit._replace(mean=mean, std=std, apart=apart, center=both.mean(0))
-  fit = single(fit._replace(scale=both.std(0) + 1e-6))
+  fit = as_float32(fit._replace(scale=both.std(0) + 1e-6))
   del seen, z, c, both
   thin = np.where(np.arange(len(x)) % THIN == 0)[0]
   held = scan(x, known, fit, lambda m: m)[thin][late[thin]]
   fit = fit._replace(level=held.mean(0), spread=held.std(0) + 1e-6)
   use = np.r_[:N, N + p : N + 2 * p]
   root = [np.linalg.cholesky(inverse(held[:, k, use], SHRINK)) for k in range(R)]
-  fit = single(fit._replace(factor=np.stack(root)))
+  fit = as_float32(fit._replace(factor=np.stack(root)))
   log = jax.jit(
     jax.vmap(lambda m: jnp.log(innovations.looks((m - fit.level) / fit.spread, fit) + 1e-6))
   )
   own = np.asarray(log(held))
-  return single(fit._replace(low=own.mean(0), wide=own.std(0) + 1e-6))
+  return as_float32(fit._replace(low=own.mean(0), wide=own.std(0) + 1e-6))
 
 
-def single(fit: innovations.Fit) -> innovations.Fit:
+def as_float32(fit: innovations.Fit) -> innovations.Fit:
   """In float32."""
   return innovations.Fit(*(x if x is None else np.float32(x) for x in fit))
 
@@ -137,17 +134,13 @@ def magnitudes(x: np.ndarray) -> np.ndarray:
 
 def weighed(fit: innovations.Fit, healthy: Set, faulty: Set, use: np.ndarray) -> innovations.Fit:
   """With weights learnt from the fault streams `use`, and their unit."""
-  t = np.arange(len(faulty.known))[:, None] - faulty.of.onset
-  at = faulty.known & use & (t >= AFTER) & (t % EVERY[1] == 0)
-  rows = np.arange(len(healthy.known))[:, None]
-  quiet = healthy.known & (rows >= SETTLED) & (rows % EVERY[0] == 0)
-  weight = LEAST + 2 ** (-np.broadcast_to(t, at.shape)[at] * faulty.of.control_s / HALF_S)
+  quiet, at, weight = rows(healthy, faulty, use)
   b = regress(magnitudes(healthy.inputs[quiet]), magnitudes(faulty.inputs[at]), weight)
   ones = np.ones(2 + 2 * R)
-  fit = single(fit._replace(weights=b[1:].reshape(2, -1), bias=b[0], units=ones))
+  fit = as_float32(fit._replace(weights=b[1:].reshape(2, -1), bias=b[0], units=ones))
   fit = fit._replace(bias=fit.bias - np.median(each(healthy, fit)[0][healthy.known]))
   units = [level(x, UNIT if k < 2 else RARE) for k, x in enumerate(each(healthy, fit))]
-  return single(fit._replace(units=np.array(units)))
+  return as_float32(fit._replace(units=np.array(units)))
 
 
 def each(held: Set, fit: innovations.Fit) -> np.ndarray:

@@ -10,7 +10,7 @@ import argparse
 import json
 import pathlib
 import sys
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -104,13 +104,21 @@ def regress(healthy: np.ndarray, faulty: np.ndarray, weight: np.ndarray) -> np.n
   return optimize.minimize(loss, begin, jac=True, method="L-BFGS-B", options={"maxiter": 300}).x
 
 
-def weighed(fit: learnt.Fit, healthy: Set, faulty: Set, use: np.ndarray) -> learnt.Fit:
-  """With weights learnt from the fault streams `use`, and units."""
+def rows(healthy: Any, faulty: Any, use: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+  """Rows that a fit takes, bool (T, S), of two sets with `known` and `of`: healthy ones and those of
+  the fault streams `use`; and the weights of the latter.
+  """
   t = np.arange(len(faulty.known))[:, None] - faulty.of.onset
   at = faulty.known & use & (t >= AFTER) & (t % EVERY[1] == 0)
-  rows = np.arange(len(healthy.known))[:, None]
-  quiet = healthy.known & (rows >= SETTLED) & (rows % EVERY[0] == 0)
+  step = np.arange(len(healthy.known))[:, None]
+  quiet = healthy.known & (step >= SETTLED) & (step % EVERY[0] == 0)
   weight = LEAST + 2 ** (-np.broadcast_to(t, at.shape)[at] * faulty.of.control_s / HALF_S)
+  return quiet, at, weight
+
+
+def weighed(fit: learnt.Fit, healthy: Set, faulty: Set, use: np.ndarray) -> learnt.Fit:
+  """With weights learnt from the fault streams `use`, and units."""
+  quiet, at, weight = rows(healthy, faulty, use)
   b = regress(features(healthy, quiet, fit), features(faulty, at, fit), weight)
   shape = (2, len(learnt.RATES), len(learnt.CHANNELS))
   fit = fit._replace(weights=b[1:].reshape(shape), bias=b[0], units=np.ones(2))

@@ -378,8 +378,9 @@ def leaderboard(results: pathlib.Path) -> str:
   ]
   if marked:
     rest = f" § no threshold gives that rate, alarms of the next lower one count with a probability that does: {'; '.join(marked)}.{rest}"
-  for name, on in fitted.items():
-    rest = f" ¶ {name}: fitted beforehand on {on}." + rest
+  for on in dict.fromkeys(fitted.values()):
+    named = joined(sorted(name for name, words in fitted.items() if words == on))
+    rest = f" ¶ {named}: fitted beforehand on {on}." + rest
   board = grid(
     (
       "detector",
@@ -1616,9 +1617,13 @@ def several_agents(results: pathlib.Path) -> str:
     )
   seeds = each[0][1]["arms"]["detector"]["seeds"]
   text = fill(f"""
-      Seeds 0 to {seeds - 1} of each agent; arm `detector`, where `none` is not named: streams that lose a tenth by the fault, streams with a false alarm before it, affected ones that alarm within 500
-      steps, median latency of all streams [steps] (a miss is infinite), affected ones recovered within 10,000 steps, median recovery [steps], reward per step of the affected over the last 2,000 steps
-      (interquartile means), streams that converged. Brackets: 95 %; of one agent Wilson or a bootstrap of its streams, of all a bootstrap of agents and then of their streams.""")
+      Seeds 0 to {seeds - 1} of each agent; arm `detector`, where `none` is not named: streams that
+      lose a tenth by the fault, streams with a false alarm before it, affected ones that alarm
+      within 500 steps, median latency of all streams [steps] (a miss is infinite), affected ones
+      recovered within 10,000 steps, median recovery [steps], reward per step of the affected over
+      the last 2,000 steps (interquartile means), streams that converged. Brackets: 95 %; of one
+      agent Wilson or a bootstrap of its streams, of all a bootstrap of agents and then of their
+      streams.""")
   return (
     text
     + "\n\n"
@@ -1965,7 +1970,8 @@ def schema(results: pathlib.Path) -> str:
       "ROBOT_innovations.parquet",
       {
         "stream, step": "as above",
-        f"{SIGNED}NAME": "float16, signed one-step error of the world model in a variable NAME of the observation, and in the reward, in their units",
+        f"{SIGNED}NAME": "float16, signed one-step error of the world model in a variable NAME of "
+        "the observation, and in the reward, in their units",
       },
     ),
     ("streams.parquet", META),

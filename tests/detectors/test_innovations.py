@@ -208,7 +208,9 @@ def streams(count, steps, shift, onset, fault, seed=0):
 
 
 def test_the_fit_finds_what_the_others_do_not_tell():
-  """A quarter of a deviation in one of two errors that are nearly one: 2.5 of what they differ by."""
+  """A quarter of a deviation in one of two errors that are nearly one: 2.5 of what they differ
+  by.
+  """
   grain = np.full(3, 2.0**-10)
   healthy = streams(6, 3000, 0.0, 3000, "")
   fit = fit_innovations.reference(healthy, grain)

@@ -45,7 +45,7 @@ def test_what_the_docs_say_of_it(shipped):
     "quadruped": 1,
   }
   files = sum(p.stat().st_size for p in shipped.folder.iterdir())
-  assert files <= 52e6
+  assert files <= 51e6  # goal 45e6, missed: every variable's error is kept
 
 
 def test_duckdb_reads_it(shipped, monkeypatch):
