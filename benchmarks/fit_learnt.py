@@ -105,8 +105,8 @@ def regress(healthy: np.ndarray, faulty: np.ndarray, weight: np.ndarray) -> np.n
 
 
 def rows(healthy: Any, faulty: Any, use: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-  """Rows that a fit takes, bool (T, S), of two sets with `known` and `of`: healthy ones and those of
-  the fault streams `use`; and the weights of the latter.
+  """Rows that a fit takes, bool (T, S), of two sets with `known` and `of`: healthy ones and those
+  of the fault streams `use`; and the weights of the latter.
   """
   t = np.arange(len(faulty.known))[:, None] - faulty.of.onset
   at = faulty.known & use & (t >= AFTER) & (t % EVERY[1] == 0)

@@ -1,5 +1,5 @@
 """Methods that are told the onset, as arms: what a method gains is not mixed with what the detector
-misses. `mjx-cl bench benchmarks/methods.toml` from the repository's root.
+misses. `mjx-cl run walker --arm benchmarks/methods.py:quiet` from the repository's root.
 """
 
 from mjx_cl.adapt.arms import ONSET, RULE, Arm
@@ -18,3 +18,8 @@ def calm() -> Arm:
 def guarded() -> Arm:
   """Old and new weights by turns."""
   return Arm("method `guarded`, told the onset", ONSET, RULE, method="guarded")
+
+
+def quiet() -> Arm:
+  """Acts without exploring from the onset on, and explores in dreams."""
+  return Arm("method `quiet`, told the onset", ONSET, RULE, method="quiet")

@@ -1,14 +1,16 @@
-"""How much of what the recordings hold detector `learnt` finds: oracles that are told the fault.
+"""How much of what the recordings hold detectors find: oracles that are told the fault.
 
   mjx-cl record benchmarks/oracle_channels.toml --out runs/streams-oracle
   python benchmarks/oracle_channels.py [--tuned DIR] [--robot ROBOT ...] [--out FILE]
 
-For each fault of the board two oracles: the likelihood ratio of OPR and RPR as autoregressions
-(leaderboard/oracle.py), and `learnt`'s averages of all twelve channels with weights fitted to this
-very fault (benchmarks/fit_learnt.py). Both are fitted on seeds 100 to 109 and scored on 0 to 9; the
-better on seeds 105 to 109, fitted on 100 to 104, is the oracle of the fault. Score: mean over
-streams of 100 2^(-latency / 5 s), 0 where missed within 20 s, at one alarm in 10,000 healthy steps
-of seeds 100 to 109.
+For each fault of the board four oracles, in the order of ORACLES: the likelihood ratio of OPR and
+RPR as autoregressions (leaderboard/oracle.py); `learnt`'s averages of all twelve channels with
+weights fitted to this very fault (benchmarks/fit_learnt.py); the same of detector `innovations`
+(benchmarks/fit_innovations.py); and that with weights for the averages of every signed error and
+its energy too. Each is fitted on seeds 100 to 109 and scored on 0 to 9; the best on seeds 105 to
+109, fitted on 100 to 104, is the oracle of the fault: of all four, and of the first two, which see
+no signed error. Score: mean over streams of 100 2^(-latency / 5 s), 0 where missed within 20 s, at
+one alarm in 10,000 healthy steps of seeds 100 to 109.
 """
 
 from __future__ import annotations
@@ -18,15 +20,17 @@ import json
 import pathlib
 import sys
 
+import jax.numpy as jnp
 import numpy as np
 
-from benchmarks import fit_learnt
-from mjx_cl.detectors import learnt
+from benchmarks import fit_innovations, fit_learnt
+from mjx_cl.detectors import innovations, learnt
 from mjx_cl.io import folders, runtime
 from mjx_cl.leaderboard import oracle
 from mjx_cl.leaderboard.streams import Streams, StreamSet
 from mjx_cl.scoring import autoregression
 
+ORACLES = ("two_channels", "all_channels", "innovations_weighed", "every_variable")
 FROM = 2_000  # control steps at the start of a stream in which nothing counts
 
 
@@ -59,6 +63,44 @@ def whole(fit, healthy, faulty, use):
   return lambda held: fit_learnt.scores(held, own)[1] > level
 
 
+def signed(fit, healthy, faulty, use):
+  """Alarms of detector `innovations`, its weights of this very fault: a function of
+  fit_innovations.Set -> bool (T, S).
+  """
+  own = fit_innovations.weighed(fit, healthy, faulty, use[None])
+  level = fit_learnt.level(fit_innovations.scores(healthy, own), fit_learnt.ARL0)
+  return lambda held: fit_innovations.scores(held, own) > level
+
+
+def everything(streams: Streams, fit: innovations.Fit) -> fit_innovations.Set:
+  """As fit_innovations.weighable, with the averages of every feature among the inputs."""
+
+  def each(averages):
+    x, marks = innovations.inputs(averages, fit)
+    u = ((averages - fit.level) / fit.spread)[:, innovations.N :].ravel()
+    return jnp.concatenate([x, jnp.clip(u, -innovations.MOST_U, innovations.MOST_U)]), marks
+
+  x, known = fit_innovations.samples(streams, fit)
+  return fit_innovations.Set(*fit_innovations.scan(x, known, fit, each), known, streams)
+
+
+def weighing(healthy, faulty, use):
+  """Alarms of the log odds of all inputs and their magnitudes: a function of
+  fit_innovations.Set -> bool (T, S).
+  """
+  quiet, at, weight = fit_learnt.rows(healthy, faulty, use[None])
+  wide = fit_innovations.magnitudes
+  b = fit_learnt.regress(wide(healthy.inputs[quiet]), wide(faulty.inputs[at]), weight)
+  odds = lambda held: np.where(held.known, wide(held.inputs) @ b[1:] + b[0], -np.inf)
+  level = fit_learnt.level(odds(healthy), fit_learnt.ARL0)
+  return lambda held: odds(held) > level
+
+
+def narrow(held: fit_innovations.Set, fit: innovations.Fit) -> fit_innovations.Set:
+  """With the inputs of the detector alone."""
+  return held._replace(inputs=held.inputs[..., : fit.weights.shape[1]])
+
+
 def main() -> None:
   parser = argparse.ArgumentParser(
     description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -67,7 +109,7 @@ def main() -> None:
     "--tuned", default="runs/streams-oracle", help="of the suite beside this file"
   )
   parser.add_argument("--robot", nargs="*", default=())
-  parser.add_argument("--out", default="results/learnt/oracle.json")
+  parser.add_argument("--out", default="results/innovations/oracle.json")
   given = parser.parse_args()
   runtime.setup()
   ships, tuned, rows = StreamSet(None), StreamSet(given.tuned), []
@@ -82,37 +124,50 @@ def main() -> None:
     level = fit_learnt.level(
       fit_learnt.scores(fit_learnt.averages(nominal, shipped), shipped).max(0), fit_learnt.ARL0
     )
+    loud = innovations.fit_of(ships.agent(robot))
+    nominal = ships.get(robot, ships.find(robot, "nominal", "tune"), signed=True)
+    more = everything(nominal, loud)
+    few = narrow(more, loud)
+    own_level = fit_learnt.level(fit_innovations.scores(few, loud), fit_learnt.ARL0)
     for key in ships.faults(robot):
-      known = tuned.get(robot, tuned.find(robot, "fault", "score", *key))
-      asked = ships.get(robot, ships.find(robot, "fault", "score", *key))
+      known = tuned.get(robot, tuned.find(robot, "fault", "score", *key), signed=True)
+      asked = ships.get(robot, ships.find(robot, "fault", "score", *key), signed=True)
       horizon = int(horizon_s / known.control_s)
       of = lambda fired, streams: fit_learnt.found(1.0 * fired, 0.5, streams, horizon_s)
       all_, half = np.ones(len(known.seed), bool), known.seed < 105
       held, other = (fit_learnt.averages(s, fit) for s in (known, asked))
+      many, mine = (everything(s, loud) for s in (known, asked))
       chosen = []
       for use in (half, all_):
-        first = pair(normal, x, known, use, horizon)
-        second = whole(fit, healthy, held, use)
-        streams, averages = (known, held) if use is half else (asked, other)
-        out = [of(first(streams), streams), of(second(averages), streams)]
+        streams, averages, errors = (known, held, many) if use is half else (asked, other, mine)
+        fired = [
+          pair(normal, x, known, use, horizon)(streams),
+          whole(fit, healthy, held, use)(averages),
+          signed(loud, few, narrow(many, loud), use)(narrow(errors, loud)),
+          weighing(more, many, use)(errors),
+        ]
+        out = [of(own, streams) for own in fired]
         chosen.append([float(s[~half].mean() if use is half else s.mean()) for s in out])
       own = fit_learnt.scores(fit_learnt.averages(asked, shipped), shipped).max(0)
+      loudest = fit_innovations.scores(narrow(mine, loud), loud) > own_level
       row = {
         "robot": robot,
         "fault": key[0],
         "severity": key[1],
         "learnt": float(of(own > level, asked).mean()),
-        "two_channels": chosen[1][0],
-        "all_channels": chosen[1][1],
-        "oracle": chosen[1][int(np.argmax(chosen[0]))],
+        "innovations": float(of(loudest, asked).mean()),
+        **dict(zip(ORACLES, chosen[1])),
+        "oracle": chosen[1][int(np.argmax(chosen[0][:2]))],
+        "oracle_signed": chosen[1][int(np.argmax(chosen[0]))],
       }
       rows.append(row)
-      shown = (f"{row[k]:6.1f}" for k in ("learnt", "two_channels", "all_channels", "oracle"))
+      shown = (f"{v:6.1f}" for v in list(row.values())[3:])
       print(f"{robot:10} {key[0]:18} {key[1]:5.2f}", *shown, flush=True)
   mean = lambda k, robot: float(np.mean([r[k] for r in rows if robot in ("", r["robot"])]))
   for robot in ["", *dict.fromkeys(r["robot"] for r in rows)]:
-    own, best = mean("learnt", robot), mean("oracle", robot)
-    print(f"{robot or 'all'}: learnt {own:.1f}, oracle {best:.1f}, share {own / best:.2f}")
+    for name, told in (("learnt", "oracle"), ("innovations", "oracle_signed")):
+      own, best = mean(name, robot), mean(told, robot)
+      print(f"{robot or 'all'}: {name} {own:.1f}, {told} {best:.1f}, share {own / best:.2f}")
   value = {"command": " ".join(["python", *sys.argv]), **runtime.provenance(), "rows": rows}
   out = pathlib.Path(given.out)
   out.parent.mkdir(parents=True, exist_ok=True)

@@ -3,7 +3,7 @@ benchmarks/thresholds.py [--board FOLDER ...] [--out FILE]
 
 Writes mjx_cl/detectors/thresholds.json from leaderboards' own files, of which the first that has a
 robot's detector counts: robot -> name on the board -> settings, threshold, ARL0 and the alarms that
-it was counted from. Left out are references, which look at nothing, the paper's rule, which has
+it was counted from; of boards of another agent than the robot's own the same by agent. Left out are references, which look at nothing, the paper's rule, which has
 figures of its own (`detectors.PAPER`), and what the board counted fewer than ten alarms of: a
 detector that no threshold brings to that rate stays silent, and one with too few rows has not been
 measured.
@@ -28,9 +28,9 @@ from mjx_cl.leaderboard import score
 FILE = pathlib.Path(detectors.__file__).parent / "thresholds.json"
 LEAST = 10  # alarms
 LATER = [
-  f"results/{name}/{robot}"
-  for name in ("learnt", "innovations")
-  for robot in ("car", "quadruped", "walker")
+  *(f"results/learnt/{robot}" for robot in ("car", "quadruped", "walker")),
+  *(f"results/innovations/{agent}" for agent in ("car", "quadruped", "quadruped-trot-2")),
+  *(f"results/innovations/{agent}" for agent in ("walker", "walker-2", "walker-3")),
 ]
 BOARDS = ["results/leaderboard_100k", *LATER]
 
@@ -76,9 +76,12 @@ def collect(folder: pathlib.Path) -> dict:
     }
   except (KeyError, TypeError):
     raise FileError(f"{folder / 'leaderboard.json'}: not a leaderboard's") from None
-  return head | {
-    "robots": {robot: dict(sorted(own.items())) for robot, own in sorted(robots.items())}
-  }
+  agents = about.get("agents", {})
+  out: dict[str, dict] = {"robots": {}, "agents": {}}
+  for robot, own in sorted(robots.items()):
+    agent = agents.get(robot, robot)
+    out["robots" if agent == robot else "agents"][agent] = dict(sorted(own.items()))
+  return head | out
 
 
 def joined(folders: list[pathlib.Path]) -> dict:
@@ -88,9 +91,10 @@ def joined(folders: list[pathlib.Path]) -> dict:
     if more["arl0"] != values["arl0"]:
       raise FileError(f"boards at ARL0 {values['arl0']:,} and {more['arl0']:,}; give those of one")
     values["command"] += f"; {more['command']}"
-    for robot, own in more["robots"].items():
-      known = values["robots"].get(robot, {})
-      values["robots"][robot] = dict(sorted((own | known).items()))
+    for kind in ("robots", "agents"):
+      for name, own in more[kind].items():
+        known = values[kind].get(name, {})
+        values[kind][name] = dict(sorted((own | known).items()))
   return values
 
 

@@ -627,6 +627,7 @@ def dreamer(results: pathlib.Path) -> str:
   )
 
 
+TROTS = ("", "-2", "-3")  # ends of the names of the quadrupeds that trot
 GOALS = {"velocity_error_m_s": 0.25, "fall_rate": 0.05}  # of the quadruped's agents
 
 
@@ -659,6 +660,10 @@ def agents(results: pathlib.Path) -> str:
       f"{late['fall_rate']})"
     )
 
+  trotting = lambda e: (
+    f"{walking(e)}; reference driver, same starts: {number(e['reference_velocity_error_m_s'], 3)} "
+    f"m/s, return {number(e['reference_return'])}, {e['reference_falls']} fall"
+  )
   falls = lambda e: f"{e['terminations']} terminations"
   tasks = (
     ("`walker`", "walker_agent/eval.json", trained("walker_agent"), falls),
@@ -680,11 +685,14 @@ def agents(results: pathlib.Path) -> str:
       trained("quadruped_agent", "then"),
       walking,
     ),
-    (
-      "`quadruped-trot`, from `quadruped`",
-      "quadruped_trot_agent/eval.json",
-      trained("quadruped_trot_agent"),
-      walking,
+    *(
+      (
+        f"`quadruped-trot{end}`",
+        f"quadruped_trot_agent/eval{end}.json",
+        trained("quadruped_trot_agent", f"curve{end}"),
+        trotting,
+      )
+      for end in TROTS
     ),
     ("`quadruped-cloned`", "quadruped_cloned/eval.json", trained("quadruped_cloned"), walking),
   )
@@ -1586,6 +1594,54 @@ def two_agents(results: pathlib.Path) -> str:
   )
 
 
+def methods_board(results: pathlib.Path) -> str:
+  """Methods of adaptation against each other: two tables."""
+  folder = results / "methods_board"
+  about = load(folder / "methods.json")
+  overall, rows = table(folder / "methods_overall.parquet"), table(folder / "methods.parquet")
+  robots = list(dict.fromkeys(r["robot"] for r in rows))
+  names = [r["method"] for r in overall]
+  ends = lambda r, key: None if r.get(f"{key}_low") is None else [r[f"{key}_low"], r[f"{key}_high"]]
+  shown = lambda r, key: f"{number(r[key], 0)} {span(ends(r, key), 0)}".strip()
+  first = [
+    (
+      f"`{r['method']}`",
+      shown(r, "score"),
+      *(shown(r, f"score_{robot}") for robot in robots),
+      "" if r["gain"] is None else shown(r, "gain"),
+      f"{r['harm']} of {r['settings']}",
+      f"{number(100 * r['harm_streams'], 0)} %",
+      f"{r['recovered']} of {r['affected']}",
+      number(r["falls"], 1),
+      number(r["updates"]),
+      number(r["wall_s"]),
+    )
+    for r in overall
+  ]
+  second = []
+  for robot, setting in dict.fromkeys((r["robot"], r["setting"]) for r in rows):
+    own = {r["method"]: r for r in rows if (r["robot"], r["setting"]) == (robot, setting)}
+    score = lambda name, own=own: shown(own[name], "score") if name in own else "-"
+    lost = f"{number(100 * own['none']['lost'], 0)} %"
+    second.append(
+      (setting, str(own["none"]["streams"]), lost, *(score(n) for n in names if n != "none"))
+    )
+  text = fill(f"""
+      {about["lives"]} lives. Score: 0 loses as much return as doing nothing, 100 loses none, below
+      0 is harm; mean over a robot's settings and over robots. Gain: score less that of the paper's
+      method (`detector`). Harm: settings in which more is lost than by doing nothing, by the paired
+      interval; worse: lives that lose a tenth of the reward more than doing nothing on the same
+      seed. Recovered: of the lives that lose a tenth without adaptation. Falls beyond those of
+      doing nothing, updates and seconds of a core are of a life. Brackets: 95 %, bootstrap over
+      seeds.""")
+  heads = ("method", "score", *robots, "gain", "harm", "worse", "recovered", "falls", "updates")
+  tables = [
+    grid((*heads, "time [s]"), first),
+    grid(("setting", "lives", "lost, `none`", *(f"`{n}`" for n in names if n != "none")), second),
+  ]
+  return "\n\n".join([text, *tables])
+
+
 def several_agents(results: pathlib.Path) -> str:
   """The paper's fault on walkers of several agents, together and apart."""
   held = load(results / "agents" / "bench.json")
@@ -1695,11 +1751,11 @@ def long_logs(results: pathlib.Path) -> str:
 def gait(results: pathlib.Path) -> str:
   """How the quadruped's agents walk at each pace."""
   rows = []
-  for folder, name in (
-    ("quadruped_agent", "quadruped"),
-    ("quadruped_trot_agent", "quadruped-trot"),
+  for file, name in (
+    ("quadruped_agent/gait.json", "quadruped"),
+    *((f"quadruped_trot_agent/gait{end}.json", f"quadruped-trot{end}") for end in TROTS),
   ):
-    for own in load(results / folder / "gait.json")["paces"]:
+    for own in load(results / file)["paces"]:
       rows.append(
         (
           f"`{name}`",
@@ -1918,6 +1974,7 @@ BLOCKS = {
   "in-loop": in_loop,
   "two-agents": two_agents,
   "several-agents": several_agents,
+  "methods": methods_board,
   "gradient": gradient,
   "raw-logs": raw_logs,
   "long-logs": long_logs,

@@ -184,6 +184,19 @@ _SHIPPED: dict[str, Arm] = {
     RULE,
     method="calm",
   ),
+  "quiet": Arm(
+    "as detector, but from the alarm on the robot does not explore; its dreams do",
+    ALARM,
+    RULE,
+    method="quiet",
+  ),
+  "quiet-guarded": Arm("as guarded, and as quiet", ALARM, RULE, method="quiet-guarded"),
+  "still": Arm(
+    "from the alarm on the robot does not explore, and learns nothing: quiet without learning",
+    ALARM,
+    RULE,
+    method="still",
+  ),
   "none": Arm("no adaptation; alarms are logged", NEVER, NO_END),
   "always": Arm("finetuning from the end of the warm-up on, without an end", AT_ONCE, NO_END),
   "periodic": Arm(

@@ -304,6 +304,8 @@ class Loop:
     replay = learn.fill(state.replay, rows, begins, begin.row, was == decide.ADAPTING)
     length, adapting = rows.reward.shape[0], phase.phase == decide.ADAPTING
     owed = learn.owing(agent, replay, adapting, state.owed, length, config)
+    if not all(method.learns for method in own):
+      owed = jnp.where(jnp.array([m.learns for m in own])[choices.method], owed, 0.0)
     number = jnp.floor(owed + 1e-6).astype(jnp.int32)
     train, acting = learn.begin(agent, state, keys, begins, choices.fresh, config.fresh_moments)
     counted = train.updates
@@ -327,9 +329,9 @@ class Loop:
       acting,
       train.params,
     )
-    acting, memory, weighed = _act(own, choices.method, state.memory, view)
+    acting, learner, memory, weighed = _act(own, choices.method, state.memory, view)
     # the robot keeps what it acts by when it is done
-    train = train._replace(params=choose(over, acting, train.params))
+    train = train._replace(params=choose(over, learner, train.params))
     # a stream that is done watches again, its reference refitted on the latest rows
     done = (decision == decide.STOP) | (decision == decide.END)
     refit = lambda d, p, s: watch.refit(self.detector, d, p, s)
@@ -353,22 +355,25 @@ class Loop:
 
 def _act(
   own: tuple[methods.Method, ...], which: jax.Array, memory: tuple[Any, ...], view: methods.View
-) -> tuple[Any, tuple[Any, ...], tuple[jax.Array, ...]]:
-  """What acts in the chunk to come by each stream's method, the memories of all, and what was
-  weighed where a method of the run weighs; leading (groups,).
+) -> tuple[Any, Any, tuple[Any, ...], tuple[jax.Array, ...]]:
+  """What acts in the chunk to come by each stream's method, what a learner that is done goes on
+  from, the memories of all, and what was weighed where a method of the run weighs; leading
+  (groups,).
   """
   answers = []
   for method, kept in zip(own, memory):
     act = lambda memory, view, method=method: _whole(method.act(memory, view))
     said = jax.vmap(act)(kept, view)
     same = lambda new, old: jnp.asarray(new, old.dtype)
-    answers.append(said._replace(memory=jax.tree.map(same, said.memory, kept)))
+    learner = said.params if said.learner is None else said.learner
+    answers.append(said._replace(memory=jax.tree.map(same, said.memory, kept), learner=learner))
   chosen: Any = answers[0]._replace(memory=())
   for i, said in enumerate(answers[1:], 1):
     chosen = choose(which == i, said._replace(memory=()), chosen)
   weighed = (chosen.back, chosen.earned, chosen.earns)
   weighs = any(method.weighs for method in own)
-  return chosen.params, tuple(a.memory for a in answers), weighed if weighs else ()
+  memories = tuple(a.memory for a in answers)
+  return chosen.params, chosen.learner, memories, weighed if weighs else ()
 
 
 def _whole(acts: methods.Acts) -> methods.Acts:

@@ -9,6 +9,7 @@ from typing import Any
 
 from mjx_cl.cli.flags import Leaderboard, Record
 from mjx_cl.cli.machines import WORKER
+from mjx_cl.cli.methods import do_methods
 from mjx_cl.cli.output import clock, command_line, emit, say
 from mjx_cl.cli.tables import console, table
 from mjx_cl.config import settings
@@ -72,7 +73,16 @@ def do_record(args: Record) -> None:
 
 
 def do_leaderboard(args: Leaderboard) -> None:
-  """Scores detectors on recorded streams, or exports the streams."""
+  """Scores detectors on recorded streams, or exports the streams; with --methods see there."""
+  if args.methods:
+    do_methods(args)
+    return
+  for flag, given in (
+    ("--arm", args.arm),
+    ("--seeds", args.seeds),
+    ("--beside", args.beside),
+  ):
+    require(not given, f"{flag} belongs to methods of adaptation; give --methods")
   on = cluster.of(args.on, args.address)
   check_own(args)
   held = streams.StreamSet(args.streams)
@@ -170,6 +180,7 @@ def about(held: streams.StreamSet, board: score.Board) -> dict:
     "seeds": {k: list(v) for k, v in held.suite.seeds.items()},
     "arl0_target": held.suite.arl0,
     "streams": held.config.get("command"),
+    "agents": {robot: held.agent(robot) for robot in sorted({r["robot"] for r in board.rows})},
   }
   if "kept" in held.config:
     out["kept"] = {robot: own.get("command") for robot, own in held.config["kept"].items()}

@@ -55,13 +55,13 @@ class Train(GpuMachines):
     env: Robot, see `mjx-cl list envs`.
     out: Folder for checkpoints, metrics.parquet and the agent.
     preset: Learner and schedule, see `mjx-cl list presets`.
-    demonstrator: A policy's .npz, `reference`: the robot's own driver (car), or `ppo`: train
-      one with brax; default: none.
+    demonstrator: A policy's .npz, `reference`: the robot's own driver (car, quadruped), or
+      `ppo`: train one with brax; default: none.
     agent: Start from this agent's weights, moments and counters; the replay is filled by
       acting.
     set: Settings of learner or schedule, name=value ... (updates=20000 lr=1e-4).
-    seeds: Agents trained side by side; their parameters share one program. On ray: a training of
-      its own each, in OUT/seed-N.
+    seeds: Agents trained side by side in one program, each in OUT/seed-N too. On ray: a training
+      of its own each.
     save_every_s: Seconds between checkpoints.
     track: Curves for other tools as well: tensorboard (OUT/tensorboard), csv (OUT/curves.csv).
     resume: Go on with a training that was cut off, with the settings it began with; `updates`
@@ -164,13 +164,23 @@ class Leaderboard(Machines):
   Ways in for a detector of one's own: a plug-in (entry point mjx_cl.detectors), --add with a Python
   class, --submit with a file of scores.
 
+  With --methods: methods of adaptation, on the lives that ship and, with --arm or a folder, on
+  one's own; writes methods*.parquet and methods.json.
+
   Example: mjx-cl leaderboard --robot walker --detector cusum ewma --out runs/leaderboard
 
   Attributes:
-    streams: Folder of `mjx-cl record`; default: the set that ships.
+    streams: Folder of `mjx-cl record`, with --methods of `mjx-cl bench methods`; default: what
+      ships.
     out: Result folder.
     overwrite: Replace an earlier board in --out, or files that --export left.
     robot: Only these robots of the set.
+    methods: Methods of adaptation in place of detectors.
+    arm: Methods to live suite `methods` with in --out first, as --arm of `mjx-cl run`: names or
+      FILE.py:make; goes on where it was cut off.
+    seeds: Of these lives, in place of the suite's.
+    beside: Folders of `mjx-cl bench` or `run --agent` whose lives take the place of the published
+      methods'.
     detector: Only these detectors, by their names on the board, or name@channel,
       path/to/file.py:factory, module:factory; `none`: only the oracles and one's own. Default:
       all.
@@ -182,7 +192,7 @@ class Leaderboard(Machines):
     threshold: Setting of --add that is calibrated, larger = fewer alarms; default: it runs as
       it is, and its own rate of false alarms is printed.
     submit: Parquet with the columns stream, step, score, for all streams that --export writes.
-    name: Name of --add or --submit on the board.
+    name: Name of --add, --submit or one --arm on the board.
     export: Only write the streams in full into this folder, one Parquet file per robot, for
       tools of one's own.
   """
@@ -191,6 +201,10 @@ class Leaderboard(Machines):
   out: str = "runs/leaderboard"
   overwrite: bool = False
   robot: tuple[str, ...] = ()
+  methods: bool = False
+  arm: tuple[str, ...] = ()
+  seeds: int | None = None
+  beside: tuple[str, ...] = ()
   detector: tuple[str, ...] = ()
   add: str | None = None
   set: tuple[str, ...] = ()
@@ -348,6 +362,7 @@ class Detect:
     rate: Samples (or steps of the column `step`) per second; default: from the column `time`,
       one of seconds (`time_s`) or time stamps.
     model: Of the nominal log: ar, or none (the columns themselves).
+    command: Columns that explain others and are not watched themselves, such as set points.
     refractory: Alarms of the charts that are closer than this are one event [s], in samples where
       the log has no clock; default: 10 s, 500 samples.
     inject: Also put faults into the nominal log: the smallest severity of each that is seen within
@@ -366,6 +381,7 @@ class Detect:
   arl0: float = 10_000
   rate: float | None = None
   model: str = "ar"
+  command: tuple[str, ...] = ()
   refractory: float | None = None
   inject: float | None = None
   logarithm: bool = False

@@ -25,6 +25,7 @@ def do_detect(args: Detect) -> None:
     args.model,
     args.refractory,
     args.inject,
+    args.command,
   )
   if out:
     results.write(result, out)

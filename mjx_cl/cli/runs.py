@@ -7,6 +7,7 @@ import re
 from collections.abc import Collection, Mapping, Sequence
 from typing import NamedTuple
 
+from mjx_cl.adapt import methods
 from mjx_cl.adapt.arms import ARMS
 from mjx_cl.cli import track
 from mjx_cl.cli.flags import Bench, Run
@@ -42,7 +43,7 @@ def do_run(args: Run) -> None:
   ):
     summary = run.execute(config, args.out, args.resume, args.overwrite, show, tell=say)
   idle = [name for name, arm in summary["arms"].items() if arm["updates_mean"] == 0]
-  learners = [name for name in idle if ARMS[name].learns]
+  learners = [name for name in idle if ARMS[name].learns and methods.of(ARMS[name]).learns]
   if learners:
     say(
       f"note: no stream of arm {', '.join(learners)} has finetuned: nothing is said of its method"

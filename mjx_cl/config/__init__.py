@@ -67,7 +67,7 @@ class AdaptConfig:
     ratio: Replayed steps per record collected after the alarm.
     start_windows: Windows that the replay must hold before the first update.
     lr: Learning rate while adapting; None: the agent's own.
-    policy_lr: Factor on the policy's steps while adapting; None: the agent's own.
+    policy_lr: Factor on the policy's steps while adapting; None: 1.
     anchor: Weight while adapting of the actions that the robot itself took; None: the agent's own.
     batch: Sequences of one update while adapting; fewer mean more updates at the same ratio. None:
       the agent's own.

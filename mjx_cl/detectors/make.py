@@ -14,21 +14,22 @@ from mjx_cl.detectors.base import Alarm, Detector, Real, Setting
 from mjx_cl.detectors.paper_rule import CALIBRATED, calibrated_rule, one_threshold, paper_rule
 from mjx_cl.detectors.rolling_sigma import rolling_sigma
 from mjx_cl.detectors.table import factory, split
-from mjx_cl.detectors.thresholds import Threshold, board
+from mjx_cl.detectors.thresholds import Threshold, board, of_agents
 from mjx_cl.errors import PluginError, UserError
 from mjx_cl.io.plugins import line
 
 
-def calibrated(name: str, robot: str, settings: dict) -> Threshold | None:
-  """The board's threshold of detector `name` with these settings on `robot`; a setting at its
-  default counts as none.
+def calibrated(name: str, robot: str, settings: dict, agent: str | None = None) -> Threshold | None:
+  """The board's threshold of detector `name` with these settings on `robot`, of the shipped `agent`
+  where it has one of its own; a setting at its default counts as none.
 
   None where a threshold is among the settings, or the board has no such robot or no detector that
   is set so. Those of paper_rule.PAPER have figures of their own.
   """
   use, channel = split(name)
   _check_channels(name, channel, settings.get("channel"))
-  rows = [row for row in board().get(robot, {}).values() if row["settings"]["use"] == use]
+  known = board().get(robot, {}) | of_agents().get(agent or robot, {})
+  rows = [row for row in known.values() if row["settings"]["use"] == use]
   own = settings | ({"channel": channel} if channel else {})
   for row in rows:
     if _told(use, own) == _told(use, row["settings"]):

@@ -31,7 +31,7 @@ import mujoco
 import numpy as np
 
 from mjx_cl import physics as physics_lib
-from mjx_cl.envs import anymal
+from mjx_cl.envs import anymal, trot
 from mjx_cl.types import EnvState, Model, Spec, Step, Var
 
 ACTION_SCALE, ISAAC_SCALE = 1.0, 0.5  # [rad] of an action of 1, here and in Isaac Lab
@@ -402,6 +402,11 @@ class Quadruped:
     moving = jnp.sum(before.physics.command**2) > 0.1**2
     height = jnp.exp(-(((p.qpos[2] - HEIGHT) / 0.08) ** 2))
     return (jnp.where(moving, pairs + lift, 2.0) + height) / 3
+
+  def reference(self, state: EnvState) -> jax.Array:
+    """Action (12,) of the driver that knows the robot's state, `trot`."""
+    p = state.physics
+    return trot.action(state.step, p.qpos, p.qvel, p.command, p.action)
 
   def noiseless(self, model: Model, state: EnvState) -> jax.Array:
     """The observation (48,) at `state` without its noise: what a demonstrator is shown."""

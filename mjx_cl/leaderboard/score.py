@@ -349,16 +349,16 @@ def write(board: Board, out: pathlib.Path | str, meta: dict) -> list[str]:
     meta |= {"fitted": beforehand, "notes": words}
   paths = [out / f"leaderboard{end}" for end in (".parquet", "_overall.parquet", ".html", ".json")]
   for path, rows in zip(paths, (board.rows, board.overall.rows)):
-    flat = [_flat(r) for r in rows]
-    keys = dict.fromkeys(k for r in flat for k in r)
-    tables.write_table(path, {k: [r.get(k) for r in flat] for k in keys})
+    plain = [flat(r) for r in rows]
+    keys = dict.fromkeys(k for r in plain for k in r)
+    tables.write_table(path, {k: [r.get(k) for r in plain] for k in keys})
   shown = [{k: v for k, v in r.items() if k not in HIDDEN} for r in board.rows]
   page.write(paths[2], shown, board.overall.rows, board.curves, board.faults, meta)
   tables.write_json(paths[3], meta)
   return [str(path) for path in paths]
 
 
-def _flat(row: dict) -> dict:
+def flat(row: dict) -> dict:
   """x_ci -> x_low, x_high."""
   out: dict = {}
   for k, v in row.items():

@@ -93,6 +93,7 @@ def detect(
   model: str = "ar",
   refractory: float | None = None,
   inject: float | None = None,
+  commands: tuple[str, ...] = (),
 ) -> Detection:
   """Calibrates detectors on one CSV file and runs them on another.
 
@@ -115,13 +116,26 @@ def detect(
     refractory: alarms of the charts closer than this are one event [s], in samples where there is
       no clock; default 10 s or 500 samples.
     inject: put faults into the nominal log, and say which are seen within so long, as refractory.
+    commands: columns that explain others in the model and are not watched.
   """
   names = list(dict.fromkeys(detectors))
   names = [*table(), *(n for n in names if n != "all")] if "all" in names else names
   names = list(dict.fromkeys(names))
   hosts = _hosts(arl0, rate, names, settings)
   log, nominal = read(path), read(nominal_path)
+  if commands and (names or model == "none"):
+    raise UserError(
+      "commands explain others in the model alone: leave out --detector and --model none"
+    )
   found, left = choose_columns(log, nominal, columns, path, nominal_path)
+  if commands:
+    told, _ = choose_columns(log, nominal, commands, path, nominal_path)
+    if twice := [name for name in columns if name in told]:
+      raise UserError(f"column {twice[0]} is watched or a command, not both")
+    found = [name for name in found if name not in told]
+    if not found:
+      raise UserError(f"all columns are commands; name fewer of: {', '.join(told)}")
+    found += told
   xs, past = (
     _samples(log, found, path, logarithm),
     _samples(nominal, found, nominal_path, logarithm),
@@ -131,11 +145,12 @@ def detect(
   names = _able(names, len(found), len(past), warmup, "all" not in detectors)
   seconds, rate = _clock(log, rate, len(xs))
   if not names:
-    judged = _judged(xs, past, found, Times(seconds, rate), arl0, model, refractory, inject, tell)
+    own = found[: len(found) - len(set(commands))]
+    judged = _judged(xs, past, own, Times(seconds, rate), arl0, model, refractory, inject, tell)
     notes = [*dict.fromkeys(nominal.notes + log.notes), *left, *judged.summary["notes"]]
     judged.summary.update(
-      log=str(path), nominal=str(nominal_path), columns=found, logarithm=logarithm, notes=notes,
-      ignored=sorted({*log.ignored, *nominal.ignored}),
+      log=str(path), nominal=str(nominal_path), columns=own, logarithm=logarithm, notes=notes,
+      ignored=sorted({*log.ignored, *nominal.ignored}), commands=found[len(own):],
     )  # fmt: skip
     return judged
   now, before_it = (
@@ -176,14 +191,14 @@ def _judged(
   inject: float | None,
   tell: Callable[[str], None],
 ) -> Detection:
-  """What the charts say of a log."""
+  """What the charts say of a log (T, C) whose columns beyond `names` are commands."""
   for what, value in (("refractory", refractory), ("inject", inject)):
     if value is not None and not 0 < value <= 1e9:
       raise UserError(f"{what} must lie in 0..1e9 seconds (or samples); got {value}")
   choose("model", model, dict.fromkeys(healthy.MODELS))
   tell("model of the nominal log")
   used, at = healthy.thinned(past)
-  own = verdict.calibrated(used, arl0, model)
+  own = verdict.calibrated(used, arl0, model, past.shape[1] - len(names))
   found = verdict.watch(own, xs)
   default = times.samples(10.0, 500) if times.rate else 500
   pause = times.samples(refractory, default)
@@ -216,7 +231,8 @@ def _judged(
         f"no fault could be put into the nominal log: {healthy.FOLDS} stretches of "
         f"{injection.BEFORE + within} samples without an alarm are needed"
       )
-  return Detection(said, xs, past, found.fired, found.scores, before, times.seconds)
+  shown, own_past = (x[:, : len(names)] for x in (xs, past))
+  return Detection(said, shown, own_past, found.fired, found.scores, before, times.seconds)
 
 
 def _said_of(own: Watch, names: list[str], known: np.ndarray, rows: int, arl0: float) -> list[str]:

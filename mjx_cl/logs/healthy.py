@@ -2,7 +2,8 @@
 
 Each column is predicted twice by ridge regression: from the present and recent past of the other
 columns (`others`: a sensor that is wrong stays wrong against its neighbours), and from the recent
-past of all (`past`: what changes from one sample to the next). Columns that drift while healthy,
+past of all (`past`: what changes from one sample to the next), to which belongs the present of
+commands, which predict and are not judged. Columns that drift while healthy,
 such as a battery's voltage, are taken relative to a slow average of their own first. Which columns
 predict which follows Gertler, "Fault Detection and Diagnosis in Engineering Systems" (1998),
 chapter 4, with regression in place of a physical model.
@@ -33,9 +34,10 @@ MODELS = ("ar", "none")
 
 
 class Healthy(NamedTuple):
-  """A nominal log's model; C columns.
+  """A nominal log's model; C columns, of which the first W are watched, the rest commands.
 
   Attributes:
+    watched: W.
     mean: (C,) of the nominal log.
     spread: (C,) its standard deviation.
     drifts: bool (C,), taken relative to its slow average.
@@ -43,12 +45,13 @@ class Healthy(NamedTuple):
     held: (C,) rows that a missing sample is replaced for.
     others: (FOLDS + 1, len(NOW) * C, C) weights, each fold's from the other folds, the last from
       all.
-    past: (FOLDS + 1, len(BEFORE) * C, C), likewise.
+    past: (FOLDS + 1, len(BEFORE) * C, C), likewise; where there are commands of lag 0 too.
     explained: (2, C) share of the variance that each prediction explains of folds it has not seen.
-    middle: (2, C) mean of the residuals.
-    scale: (2, C) their standard deviation.
+    middle: (2, W) mean of the residuals.
+    scale: (2, W) their standard deviation.
   """
 
+  watched: int
   mean: np.ndarray
   spread: np.ndarray
   drifts: np.ndarray
@@ -102,10 +105,10 @@ def known(x: np.ndarray, longest: np.ndarray) -> np.ndarray:
 
 
 def judged(residuals: np.ndarray, x: np.ndarray, longest: np.ndarray) -> np.ndarray:
-  """Residuals (2, T, C) of x (T, C), where a sample is missing those of the last known one, nan in
+  """Residuals (2, T, W) of x (T, C), where a sample is missing those of the last known one, nan in
   rows that are not `known`.
   """
-  there = np.isfinite(x)
+  there = np.isfinite(x[:, : residuals.shape[-1]])
   at = np.maximum.accumulate(np.where(there, np.arange(len(x))[:, None], 0), 0)
   found = np.take_along_axis(residuals, at[None], 1)
   found[:, ~known(x, longest)] = np.nan
@@ -143,9 +146,9 @@ def lagged(z: np.ndarray, lags: tuple[int, ...]) -> np.ndarray:
 
 
 def _predicted(weights: np.ndarray, lags: tuple[int, ...], z: np.ndarray) -> np.ndarray:
-  """Prediction of z (T, C) or (B, T, C)."""
+  """Prediction of the columns of `weights` (F, W) from z (T, C) or (B, T, C)."""
   if not weights.any():
-    return np.zeros_like(z)
+    return np.zeros((*z.shape[:-1], weights.shape[1]))
   parts = []
   for begin in range(0, z.shape[-2], ROWS):
     from_ = max(0, begin - max(lags))
@@ -155,16 +158,17 @@ def _predicted(weights: np.ndarray, lags: tuple[int, ...], z: np.ndarray) -> np.
 
 
 def residuals(model: Healthy, z: np.ndarray, fold: int = -1) -> np.ndarray:
-  """(2, ..., T, C): what z, from `standard`, deviates from both predictions, in deviations; nan
-  where the past is unknown.
+  """(2, ..., T, W): what z (..., T, C), from `standard`, deviates from both predictions, in
+  deviations; nan where the past is unknown.
   """
+  own = model.watched
   found = np.stack(
     [
-      z - _predicted(weights[fold], lags, z)
-      for weights, lags in ((model.others, NOW), (model.past, BEFORE))
+      z[..., :own] - _predicted(weights[fold][:, :own], lags, z)
+      for weights, lags in ((model.others, NOW), (model.past, _before(model.watched, z)))
     ]
   )
-  shape = (2, *[1] * (z.ndim - 1), z.shape[-1])
+  shape = (2, *[1] * (z.ndim - 1), own)
   found -= model.middle.reshape(shape)
   found /= model.scale.reshape(shape)
   found[..., : max(*NOW, *BEFORE), :] = np.nan
@@ -178,7 +182,7 @@ def folds(rows: int) -> list[slice]:
 
 
 def unseen(model: Healthy, z: np.ndarray) -> np.ndarray:
-  """(2, N, C) residuals of the nominal log, each fold by the weights of the others."""
+  """(2, N, W) residuals of the nominal log, each fold by the weights of the others."""
   parts = []
   for k, share in enumerate(folds(len(z))):
     begin = max(0, share.start - 2 * max(*NOW, *BEFORE))
@@ -195,14 +199,24 @@ def drifting(x: np.ndarray) -> np.ndarray:
   return means.var(0) > DRIFTS * np.maximum(x.var(0), 1e-300)
 
 
-def _solved(gram: np.ndarray, target: np.ndarray, ridge: float, own: bool) -> np.ndarray:
+def _before(watched: int, z: np.ndarray) -> tuple[int, ...]:
+  """Lags of `past`, of z (..., C)."""
+  return BEFORE if watched == z.shape[-1] else (0, *BEFORE)
+
+
+def _solved(
+  gram: np.ndarray, target: np.ndarray, ridge: float, own: bool, present: int
+) -> np.ndarray:
   """Weights (F, C) of ridge regression on features with Gram matrix (F, F); with `own` of False no
-  column's own features are used for it.
+  column's own features are used for it; the first `present` features are used for none.
   """
   size, columns = target.shape
   penalty = ridge * np.trace(gram) / size
   if own:
-    return np.linalg.solve(gram + penalty * np.eye(size), target)
+    weights, use = np.zeros_like(target), np.arange(size) >= present
+    own_gram = gram[np.ix_(use, use)] if present else gram
+    weights[use] = np.linalg.solve(own_gram + penalty * np.eye(use.sum()), target[use])
+    return weights
   weights = np.zeros_like(target)
   for c in range(columns):
     use = np.arange(size) % columns != c
@@ -212,7 +226,9 @@ def _solved(gram: np.ndarray, target: np.ndarray, ridge: float, own: bool) -> np
   return weights
 
 
-def _regression(z: np.ndarray, lags: tuple[int, ...], own: bool) -> tuple[np.ndarray, np.ndarray]:
+def _regression(
+  z: np.ndarray, lags: tuple[int, ...], own: bool, present: int = 0
+) -> tuple[np.ndarray, np.ndarray]:
   """(weights (FOLDS + 1, F, C), share of variance explained in folds that were left out (C,)); the
   ridge is the one of RIDGES that explains most, and a column is left without prediction where it
   explains less than USEFUL.
@@ -231,27 +247,29 @@ def _regression(z: np.ndarray, lags: tuple[int, ...], own: bool) -> tuple[np.nda
   total, aim = np.sum(grams, 0), np.sum(targets, 0)
   best: tuple[float, np.ndarray, np.ndarray] | None = None
   for ridge in RIDGES:
-    each = [_solved(total - gram, aim - target, ridge, own) for gram, target in zip(grams, targets)]
+    solved = lambda gram, target, ridge=ridge: _solved(gram, target, ridge, own, present)
+    each = [solved(total - gram, aim - target) for gram, target in zip(grams, targets)]
     left = np.zeros(z.shape[1])  # sum of squares of what is not explained
     for weights, gram, target, share in zip(each, grams, targets, folds(len(z))):
       square = (z[share] ** 2).sum(0)
       left += square - 2 * (weights * target).sum(0) + (weights * (gram @ weights)).sum(0)
     explained = 1 - left / np.maximum((z**2).sum(0), 1e-300)
-    score = float(np.clip(explained, 0, 1).sum())
+    score = float(np.clip(explained, 0, 1)[: present or None].sum())  # commands foretell themselves
     if best is None or score > best[0]:
-      best = score, explained, np.stack([*each, _solved(total, aim, ridge, own)])
+      best = score, explained, np.stack([*each, solved(total, aim)])
   assert best is not None
   _, explained, weights = best
   weights[:, :, explained < USEFUL] = 0.0
   return weights, np.clip(explained, 0, 1)
 
 
-def fit(x: np.ndarray, model: str = "ar") -> tuple[Healthy, np.ndarray]:
+def fit(x: np.ndarray, model: str = "ar", commands: int = 0) -> tuple[Healthy, np.ndarray]:
   """The model of a nominal log, and its `unseen` residuals as `judged`.
 
   Args:
     x: (N, C), missing samples nan, no column constant.
     model: "ar", or "none": no prediction, the columns themselves.
+    commands: of the columns the last so many predict and are not watched.
 
   Raises:
     UserError: too much of the log is missing.
@@ -268,15 +286,16 @@ def fit(x: np.ndarray, model: str = "ar") -> tuple[Healthy, np.ndarray]:
   slow = max(10, min(SLOW, len(x) // 10))
   level = _levelled((x - mean) / spread, drifts, slow)
   spread = spread * level.std(0)
-  one = np.ones((2, columns))
+  own = columns - commands
+  none, one = np.zeros((2, columns)), np.ones((2, own))
   blank = lambda lags: np.zeros((FOLDS + 1, len(lags) * columns, columns))
   fitted = Healthy(
-    mean, spread, drifts, slow, longest, blank(NOW), blank(BEFORE), 0 * one, 0 * one, one
+    own, mean, spread, drifts, slow, longest, blank(NOW), blank(_before(own, x)), none, 0 * one, one
   )  # fmt: skip
   z = standard(fitted, x)
   if model == "ar" and len(x) >= 20 * columns + 200:
     others, first = _regression(z, NOW, False)
-    past, second = _regression(z, BEFORE, True)
+    past, second = _regression(z, _before(own, z), True, own if commands else 0)
     fitted = fitted._replace(others=others, past=past, explained=np.stack([first, second]))
   found = judged(unseen(fitted, z), samples, longest)
   middle, scale = np.nanmean(found, 1), np.maximum(np.nanstd(found, 1), 1e-9)

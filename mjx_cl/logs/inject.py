@@ -78,7 +78,7 @@ def smallest(
   Args:
     own: from verdict.calibrated, on `past`.
     past: (N, C) the nominal log, none missing.
-    names: of the columns.
+    names: of the columns that are watched.
     within: samples.
     seed: of noise and dropout.
 

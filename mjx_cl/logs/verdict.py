@@ -30,9 +30,9 @@ class Watch(NamedTuple):
     model: see healthy.
     scales: of the charts.
     tails: chart -> distribution of its healthy maxima.
-    thresholds: chart -> (C,), of `joint` (1,).
-    unseen: (2, N, C) residuals of the nominal log.
-    means: (C, C) inverse covariance of the healthy averages over the middle span.
+    thresholds: chart -> (W,), of `joint` (1,).
+    unseen: (2, N, W) residuals of the nominal log.
+    means: (W, W) inverse covariance of the healthy averages over the middle span.
   """
 
   model: healthy.Healthy
@@ -43,11 +43,12 @@ class Watch(NamedTuple):
   means: np.ndarray
 
 
-def calibrated(past: np.ndarray, arl0: float, model: str = "ar") -> Watch:
+def calibrated(past: np.ndarray, arl0: float, model: str = "ar", commands: int = 0) -> Watch:
   """Watches for what deviates from a nominal log (N, C), missing samples nan, each chart with one
-  alarm in `arl0` healthy samples on average.
+  alarm in `arl0` healthy samples on average; the last `commands` columns are not watched, W others
+  are.
   """
-  fitted, unseen = healthy.fit(past, model)
+  fitted, unseen = healthy.fit(past, model, commands)
   scales = charts.scales(unseen)
   tails = {name: charts.tail(score) for name, score in charts.scores(unseen, scales).items()}
   thresholds = {name: tail.threshold(arl0) for name, tail in tails.items()}
@@ -58,8 +59,8 @@ class Found(NamedTuple):
   """What the charts show of a log.
 
   Attributes:
-    residuals: (2, T, C).
-    scores: chart -> (T, C), of `joint` (T, 1).
+    residuals: (2, T, W).
+    scores: chart -> (T, W), of `joint` (T, 1).
     fired: chart -> bool, likewise: the score rises above its threshold.
     above: bool (T,), some score is.
     known: bool (T,), the sample is judged.
@@ -92,7 +93,7 @@ def _in_parts(own: Watch, xs: np.ndarray, rows: int = ROWS, kind: Any = np.float
   difference; residuals and scores are kept as `kind`.
   """
   warm = WARM * max(SPANS[-1], own.model.slow if own.model.drifts.any() else 0)
-  total, columns = xs.shape
+  total, columns = len(xs), own.model.watched
   size = {name: 1 if name == "joint" else columns for name in CHARTS}
   found = Found(
     np.empty((2, total, columns), kind),
@@ -159,14 +160,15 @@ def _series(own: Watch, found: Found, chart: str, c: int, at: int) -> np.ndarray
 
 
 def _moved(own: Watch, shift: np.ndarray) -> list[tuple[int, float]]:
-  """(column, deviations that it moved by) that explain a shift of the residuals (C,), the first
+  """(column, deviations that it moved by) that explain a shift of the residuals (W,), the first
   most.
 
   One of a column by itself shifts its own residual by one and those it predicts by minus its
   weights.
   """
   columns = len(shift)
-  gains = own.model.others[-1].reshape(len(healthy.NOW), columns, columns).sum(0)
+  every = len(own.model.mean)
+  gains = own.model.others[-1].reshape(len(healthy.NOW), every, every).sum(0)[:columns, :columns]
   effect = (np.eye(columns) - gains.T) / own.model.scale[0][:, None]
   root = np.linalg.cholesky(own.means).T
   left, seen = root @ shift, root @ effect

@@ -27,7 +27,7 @@ def watching(config: RunConfig) -> str | None:
   ):
     return None
   robot = known_as(envs.make(config.env, config.physics))
-  found = detectors.calibrated(config.detector, robot, config.settings)
+  found = detectors.calibrated(config.detector, robot, config.settings, config.agent)
   if found is None:
     default = inspect.signature(build).parameters.get("threshold")
     own = "its own default threshold" + (
@@ -40,9 +40,11 @@ def watching(config: RunConfig) -> str | None:
     )
   steps = found.arl0 * found.alarms
   low, high = (steps / n for n in reversed(intervals.poisson(found.alarms)))
+  shared = found == detectors.calibrated(config.detector, robot, config.settings)
+  agent = robot if shared else config.agent
   plain = {f.name: (f.default,) for f in dataclasses.fields(RunConfig)} | {
     "env": (robot,),
-    "agent": (None, robot),
+    "agent": (None, robot) if shared else (config.agent,),
   }
   other = [
     k
@@ -50,7 +52,7 @@ def watching(config: RunConfig) -> str | None:
     if getattr(config, k) not in plain[k]
   ]
   return (
-    f"detector {config.detector} at threshold {found.value:.6g}, at which the shipped {robot} "
+    f"detector {config.detector} at threshold {found.value:.6g}, at which the shipped {agent} "
     f"gave {found.alarms} false alarms in {steps:,.0f} healthy control steps, "
     f"one in {found.arl0:,.0f} [{low:,.0f}, {high:,.0f}]"
     + (f"; this run has another {' and '.join(other)}" if other else "")

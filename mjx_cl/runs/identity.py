@@ -62,9 +62,8 @@ def threshold_of(config: RunConfig) -> detectors.Threshold | None:
   """
   if "threshold" in config.settings or detectors.split(config.detector)[0] in detectors.PAPER:
     return None
-  return detectors.calibrated(
-    config.detector, known_as(envs.make(config.env, config.physics)), config.settings
-  )
+  robot = known_as(envs.make(config.env, config.physics))
+  return detectors.calibrated(config.detector, robot, config.settings, config.agent)
 
 
 def identity(config: RunConfig) -> dict:

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mjx_cl.adapt import decide
+from mjx_cl.adapt import decide, methods
 from mjx_cl.adapt.arms import ARMS, FOREVER
 from mjx_cl.config import CHUNK, AdaptConfig, RunConfig
 from mjx_cl.faults.presets import becomes, changes
@@ -148,7 +148,7 @@ def expected(
     steps = length(config, arm, now - stands.since, most)
     out.append(Spell(stands.since, min(steps, config.steps - stands.since)))
     free = stands.since + int(steps)
-  if stands.phase == decide.ABORTED or not own.learns:
+  if stands.phase == decide.ABORTED or not (own.learns and methods.of(own).learns):
     return out
   prompt, latency, late = NOTICES.get(config.env, ANY)
   mean = length(config, arm, -1, most)

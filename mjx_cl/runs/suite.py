@@ -253,14 +253,22 @@ def by_agent(parts: Iterable[Part]) -> dict[str, dict[str, Part]]:
   """
   groups: dict[tuple[str, str], dict[str, Part]] = {}
   for part in parts:
-    whose = re.search(r"(?:^|(?<=/)|,)agent=([^,]*),?", part.name)
+    name, whose = apart(part.name)
     if whose and part.config.agent:
-      name = (part.name[: whose.start()] + "," + part.name[whose.end() :]).strip(",/")
-      name = name.replace("/,", "/")
       alike = repr(dataclasses.replace(part.config, agent=None))
       groups.setdefault((name, alike), {})[part.config.agent] = part
   several = [(name, own) for (name, _), own in groups.items() if len(own) > 1]
   return {name or next(iter(own.values())).config.env: own for name, own in several}
+
+
+def apart(name: str) -> tuple[str, str | None]:
+  """The name of a part without its agent, and the agent as it stands there or None."""
+  whose = re.search(r"(?:^|(?<=/)|,)agent=([^,]*),?", name)
+  if whose is None:
+    return name, None
+  return (name[: whose.start()] + "," + name[whose.end() :]).strip(",/").replace("/,", "/"), whose[
+    1
+  ]
 
 
 def finished(out: pathlib.Path, part: Part) -> bool:

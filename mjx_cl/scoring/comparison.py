@@ -66,10 +66,9 @@ def overall(rows: list[dict], reps: int = REPS) -> Overall:
   blocks = next(iter(rivals.values()), {})
   scored = lambda t, b: b in t and t[b]["cost_standard"] is not None
   shared = [b for b in blocks if all(scored(t, b) for t in rivals.values())]
-  ranks = stats.rankdata(
-    [[-t[b]["cost_standard"] for t in rivals.values()] for b in shared], axis=-1
-  )
-  mean = dict(zip(rivals, ranks.mean(0))) if shared else {}
+  scores = np.array([[t[b]["cost_standard"] for t in rivals.values()] for b in shared], float)
+  ranks, critical, p = ranked(scores.reshape(len(shared), len(rivals)))
+  mean = dict(zip(rivals, ranks))
   out = [
     {"detector": name, "blocks": len(own)}
     | _means(list(own.values()), reps)
@@ -79,14 +78,30 @@ def overall(rows: list[dict], reps: int = REPS) -> Overall:
   ]
   worst_if_none = lambda r: -np.inf if r["cost_standard"] is None else r["cost_standard"]
   out.sort(key=worst_if_none, reverse=True)
-  n, k = len(shared), len(rivals)
+  return Overall(out, critical, p, len(shared))
+
+
+def ranked(scores: np.ndarray) -> tuple[np.ndarray, float | None, float | None]:
+  """Mean ranks of rivals, 1 = best, ties share; Nemenyi's critical difference of two of them at 5
+  %, and Friedman's chance of ranks this uneven, as in `overall`.
+
+  Args:
+    scores: (blocks, rivals), more is better.
+
+  Returns:
+    (ranks, difference, chance); no ranks without a block, None for fewer than two blocks or rivals.
+  """
+  n, k = scores.shape
+  if not n:
+    return np.array([]), None, None
+  ranks = stats.rankdata(-scores, axis=-1)
   if n < 2 or k < 2:
-    return Overall(out, None, None, n)
+    return ranks.mean(0), None, None
   spread = (ranks - (k + 1) / 2).sum(0)
   within = ((ranks - (k + 1) / 2) ** 2).sum() / (k - 1)
   p = float(special.chdtrc(k - 1, (spread**2).sum() / within)) if within else 1.0
   q = float(stats.studentized_range.ppf(0.95, k, np.inf)) / 2**0.5
-  return Overall(out, q * (k * (k + 1) / (6 * n)) ** 0.5, p, n)
+  return ranks.mean(0), q * (k * (k + 1) / (6 * n)) ** 0.5, p
 
 
 def _block(row: dict) -> tuple[str, str, float]:

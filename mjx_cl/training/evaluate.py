@@ -27,8 +27,9 @@ def evaluate(
     episodes, return_mean, return_iqm, return_ci (95 % bootstrap of the IQM over episodes of this
     one agent), returns, terminations, and where the environment measures them (env.measure), means
     over the steps of all episodes with their bootstrap interval over episodes: of the quadruped
-    velocity_error_m_s and fall_rate; of the car mean_speed_m_s, collision_rate and
-    reference_speed_m_s, the reference driver's mean speed from the same starts on the same tracks.
+    velocity_error_m_s and fall_rate; of the car mean_speed_m_s and collision_rate. Of a robot with
+    a reference driver the same for it, from the same starts: reference_return,
+    reference_velocity_error_m_s or reference_speed_m_s, reference_falls or reference_collisions.
   """
   fault = faults.make("none", env)
   rollout = Rollout(env, agent, fault, repeat, deterministic)
@@ -67,9 +68,10 @@ def evaluate(
     out |= {
       "reference_return": float(reference.mean()),
       "reference_return_ci": intervals.interval(reference, np.mean),
-      **per_step("reference_speed_m_s", sums["mean_speed_m_s"], steps),
-      **counted("reference_collisions", ended),
+      **counted(f"reference_{(rate or 'termination_rate').removesuffix('_rate')}s", ended),
     }
+    for name, value in sums.items():
+      out |= per_step("reference_" + name.removeprefix("mean_"), value, steps)
   return out
 
 

@@ -167,26 +167,43 @@ def _begun(path: pathlib.Path, seeds: int) -> dict[str, Any]:
 
 
 def clear(out: pathlib.Path) -> None:
-  """Removes the agent and the demonstrator that an earlier training wrote, nothing else; the rest:
+  """Removes the agents and the demonstrator that an earlier training wrote, nothing else; the rest:
   run.clear.
   """
   for path in (
     out / "agent/agent.npz",
     out / "agent/card.json",
+    *out.glob("seed-*/agent/agent.npz"),
+    *out.glob("seed-*/agent/card.json"),
     *(out / "demonstrator").glob("policy*.npz"),
   ):
     path.unlink(missing_ok=True)
 
 
 def export(trainer: Trainer, count: int = 20) -> dict[str, Any]:
-  """Writes OUT/agent of the first seed that has not failed: weights, moments, counters, and the
-  card with its returns. Returns the card.
+  """Writes an agent of every seed that has not failed, with weights, moments, counters, and the
+  card with its returns: the first to OUT/agent, of several each to OUT/seed-N/agent too, N counting
+  from the training's seed. Returns the card of the first.
   """
-  sound = min(set(range(trainer.seeds)) - set(trainer.failed))
-  train = jax.tree.map(lambda x: jax.device_put(x[sound], jax.devices()[0]), trainer.state.train)
-  scores = evaluate.evaluate(
-    trainer.env, trainer.plain, train.params, count, 0, trainer.config.repeat
-  )
+  sound = sorted(set(range(trainer.seeds)) - set(trainer.failed))
+  about = _told(trainer)
+  cards = []
+  for g in sound:
+    train = jax.tree.map(lambda x: jax.device_put(x[g], jax.devices()[0]), trainer.state.train)
+    scores = evaluate.evaluate(
+      trainer.env, trainer.plain, train.params, count, 0, trainer.config.repeat
+    )
+    cards.append(about | {"eval": {"first_seed": 0, **scores}, **runtime.provenance()})
+    if g == sound[0]:
+      agents.save(trainer.out / "agent", train, cards[0])
+    if trainer.seeds > 1:
+      own = cards[-1] | {"group": g}
+      agents.save(trainer.out / f"seed-{about['seed'] + g}" / "agent", train, own)
+  return cards[0]
+
+
+def _told(trainer: Trainer) -> dict[str, Any]:
+  """What the cards of a training's seeds have in common."""
   phases = {}
   for name in dict.fromkeys(row["phase"] for row in trainer.rows):
     mine = [row for row in trainer.rows if row["phase"] == name]
@@ -201,15 +218,11 @@ def export(trainer: Trainer, count: int = 20) -> dict[str, Any]:
   kept = json.loads(json.dumps(trainer.about))
   if kept["train"]["demonstrator"]:
     kept["train"]["demonstrator"] = pathlib.Path(kept["train"]["demonstrator"]).name
-  card = {
+  return {
     **kept,
     "updates": trainer.updates,
     "records": trainer.rows[-1]["records"],
     "seconds": round(trainer.seconds),
     "phases": phases,
     "demonstrator_return": trainer.expert_return or None,
-    "eval": {"first_seed": 0, **scores},
-    **runtime.provenance(),
   }
-  agents.save(trainer.out / "agent", train, card)
-  return card

@@ -13,6 +13,7 @@ import types
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import quick
@@ -578,3 +579,32 @@ def test_learning_curve_names_its_axes_and_covers_no_line(tmp_path, monkeypatch,
   np.testing.assert_array_equal(table["updates"], 8 * np.arange(2, chunks + 1, 2))
   np.testing.assert_array_equal(then["records"], 64 * (chunks + np.arange(2, chunks + 1, 2)))
   np.testing.assert_array_equal(then["seconds"], 2 * (chunks / seeds + np.arange(2, chunks + 1, 2)))
+
+
+def test_won_back_is_a_mean_of_agents_and_refuses_what_lost_nothing(tmp_path, capsys):
+  """By hand: shares 0.5 and 1 of one agent, 0 and 0.5 of another; two agents bound the interval."""
+
+  def part(name, finals, none=0.4):
+    rows = [
+      {"stream": k, "seed": k % 2, "arm": arm, "onset": 9, "reward_pre": 0.8, "reward_final": final}
+      for k, (arm, final) in enumerate(
+        [*(("oracle", x) for x in finals), ("none", none), ("none", none)]
+      )
+    ]
+    pq.write_table(pa.Table.from_pylist(rows), tmp_path / name / "runs.parquet")
+
+  won_back = load("won_back")
+  for name, finals in (("a", (0.6, 0.8)), ("b", (0.4, 0.6))):
+    (tmp_path / name).mkdir()
+    part(name, finals)
+  won_back.main(str(tmp_path))
+  oracle, none = map(json.loads, capsys.readouterr().out.splitlines())
+  assert oracle["won_back"] == pytest.approx(0.5) and oracle["streams"] == 4
+  # a draw is a mean of four shares: 1 in 64 is 0, 1 in 64 is 1, 4 in 64 each lie 0.125 within
+  assert oracle["won_back_ci"] == pytest.approx([0.125, 0.875])
+  assert none["won_back"] == 0 and none["more"] == pytest.approx(-0.5)
+  part("b", (0.8, 0.8), none=0.79)
+  with pytest.raises(SystemExit, match="b/runs.parquet: seed 0 loses less than a tenth"):
+    won_back.main(str(tmp_path))
+  with pytest.raises(SystemExit, match="holds no parts"):
+    won_back.main(str(tmp_path / "a"))

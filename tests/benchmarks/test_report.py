@@ -52,8 +52,8 @@ SOURCES = {
       for file in ("eval.json", "curve.parquet")
     ),
     "quadruped_agent/eval.json",
-    "quadruped_trot_agent/eval.json",
-    "quadruped_trot_agent/curve.parquet",
+    *(f"quadruped_trot_agent/eval{end}.json" for end in ("", "-2", "-3")),
+    *(f"quadruped_trot_agent/curve{end}.parquet" for end in ("", "-2", "-3")),
     "quadruped_cloned/eval.json",
     "quadruped_agent/then.parquet",
     "quadruped_cloned/curve.parquet",
@@ -102,10 +102,17 @@ SOURCES = {
   ),
   "two-agents": ("walker_gear/summary.json", "walker_plain/summary.json"),
   "several-agents": ("agents/bench.json",),
+  "methods": tuple(
+    f"methods_board/{file}"
+    for file in ("methods.json", "methods.parquet", "methods_overall.parquet")
+  ),
   "gradient": ("policy_gradient.json",),
   "raw-logs": ("raw_logs.json", "innovations.json"),
   "long-logs": ("long_log.json",),
-  "gait": ("quadruped_agent/gait.json", "quadruped_trot_agent/gait.json"),
+  "gait": (
+    "quadruped_agent/gait.json",
+    *(f"quadruped_trot_agent/gait{end}.json" for end in ("", "-2", "-3")),
+  ),
   "quadruped": (
     "quadruped_agent/finetuning/none/config.json",
     *(f"quadruped_agent/finetuning/{run}/curve.json" for run in ("none", "expert")),
@@ -699,9 +706,10 @@ CONSTANTS = {
   "in-loop": {"95", "500", "2,000", "10,000", "1", "2", "3"},
   "two-agents": {"95", "500", "10,000", "2,000"},
   "several-agents": {"95", "500", "10,000", "2,000", "0", "2", "3"},  # the last of names
+  "methods": {"0", "100", "95"},
   "gradient": {"95"},
   "raw-logs": {"1"},
-  "gait": {"20"},
+  "gait": {"20", "2", "3"},  # of names too
   "quadruped": {"95", "8"},
   "ppo": {"95", "3"},
 }

@@ -188,7 +188,7 @@ def test_list(mjx):
     "arms": set(ARMS),
     "sizes": set(SIZES),
     "suites": {"leaderboard", "leaderboard-100k"},
-    "benches": {"again", "arms", "full", "loop", "paper", "quick", "stop", "study"},
+    "benches": {"again", "arms", "full", "loop", "methods", "paper", "quick", "stop", "study"},
     "fault-presets": set(presets.PRESETS),
     "schedules": set(presets.SCHEDULES),
   }

@@ -464,6 +464,14 @@ def test_one_threshold_for_both_residuals_is_both_thresholds_in_proportion(robot
   )
 
 
+def test_an_agent_has_its_own_threshold_where_one_was_found():
+  of = lambda name, agent: detectors.calibrated(name, "walker", {}, agent)
+  values = [of("innovations", agent).value for agent in (None, "walker", "walker-2", "walker-3")]
+  own = [pytest.approx(x, rel=1e-9) for x in (1.58344566822052, 1.474637746810913)]
+  assert values == [values[0], values[0], *own]
+  assert of("cusum", "walker-2") == of("cusum", None)
+
+
 @pytest.mark.parametrize("robot", detectors.board())
 def test_what_stands_on_the_board_takes_its_threshold_from_there(robot):
   """For just the board's settings, however they are written; whoever names a threshold keeps it."""

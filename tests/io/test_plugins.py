@@ -384,6 +384,13 @@ def test_a_detector_in_the_loop_has_the_boards_threshold(tmp_path, monkeypatch):
     ),
     ("walker", "kswin", {}, "its own default threshold"),
     ("car", "bfar", {"settings": {"rate": 0.5}}, "--set threshold=..."),
+    (
+      "walker",
+      "innovations",
+      {"agent": "walker-2"},
+      "1.58345, at which the shipped walker-2 gave 12",
+    ),
+    ("walker", "ewma", {"agent": "walker-2"}, "shipped walker gave"),
     ("walker", "ewma", {"settings": {"threshold": 3.0}}, None),
     ("walker", "ewma", {"arms": ("none", "oracle")}, None),
     ("walker", "never", {}, None),

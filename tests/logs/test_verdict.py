@@ -123,6 +123,70 @@ def test_without_a_model_the_columns_themselves_are_watched(logs, tmp_path):
     assert found["columns"][0]["by"] == pytest.approx(1.5, abs=0.3)
 
 
+def driven(samples, seed, about, since=None):
+  """A joint that follows a set point, its motor, and the set point, which changes every second and
+  lies around `about`; from sample `since` on joint and motor stand off by 0.1.
+  """
+  rng = np.random.default_rng(seed)
+  told = about + np.repeat(rng.normal(size=samples // HZ + 1), HZ)[:samples]
+  joint = np.zeros(samples)
+  for t in range(1, samples):
+    joint[t] = joint[t - 1] + 0.2 * (told[t - 1] - joint[t - 1])
+  noise = lambda: 0.02 * rng.normal(size=samples)
+  motor = 2.0 * (told - joint) + noise()
+  off = 0.1 * (np.arange(samples) >= (samples if since is None else since))
+  return np.stack([joint + off + noise(), motor + off, told], 1)
+
+
+def test_commands_explain_and_are_not_watched(tmp_path, mjx):
+  """A robot told to stand elsewhere has not changed; one that stands other than told has."""
+  columns = ["joint", "motor", "set_point"]
+  past = save(tmp_path / "past.csv", driven(12_000, 0, 0), columns)
+  more = save(tmp_path / "more.csv", driven(6_000, 1, 5), columns)
+  wrong = save(tmp_path / "wrong.csv", driven(6_000, 2, 5, 3_000), columns)
+  told = dict(commands=("set_point",))
+  assert detect.detect(more, past).summary["verdict"]["changed"]
+  said = detect.detect(more, past, **told).summary
+  assert not said["verdict"]["changed"]
+  assert said["columns"] == columns[:2] and said["commands"] == columns[2:]
+  found = detect.detect(wrong, past, **told, inject=2).summary
+  assert found["verdict"]["changed"] and abs(found["verdict"]["begin"] - 3_000) < HZ
+  assert {c["column"] for c in found["verdict"]["columns"]} <= {"joint", "motor"}
+  assert {row["column"] for row in found["inject"]["faults"]} == {"joint", "motor"}
+  code, out, _ = mjx(wrong, "--nominal", past, "--command", "set_point", "--out", tmp_path / "out")
+  assert code == 0 and "changed from" in out and "joint" in out and "set_point" not in out
+  assert "set_point" not in (tmp_path / "out" / "alarms.csv").read_text()
+
+
+def test_a_command_predicts_at_once_and_changes_nothing_else():
+  """The motor's next sample rests on what the joint is told now; what others tell is as without."""
+  x = driven(8_000, 3, 0)
+  (own, _), (whole, _) = healthy.fit(x, commands=1), healthy.fit(x)
+  z = healthy.standard(own, x)
+  found = [healthy.residuals(m, z)[..., :2] * m.scale[:, None, :2] for m in (own, whole)]
+  np.testing.assert_array_equal(own.others[..., :2], whole.others[..., :2])
+  jumps = 100 + np.flatnonzero(np.diff(x[100:, 2]) != 0) + 1
+  size = [float(np.abs(f[1, jumps, 1] * own.spread[1]).mean()) for f in found]
+  assert size[0] < 0.15 < 1.0 < size[1]  # noise of 0.02 and twice the joint's; a jump of 2 sqrt(2)
+  before = own.past[-1].reshape(-1, 3, 3)
+  assert not before[0, :2].any() and before[0, 2, 1] != 0  # of the present the command alone
+
+
+@pytest.mark.parametrize(
+  "more, words",
+  (
+    (["--command", "speed"], "has no column 'speed'"),
+    (["--command", *NAMES], "all columns are commands; name fewer of: hip_encoder"),
+    (["--command", "pitch", "--column", "pitch", "heat"], "pitch is watched or a command, not"),
+    (["--command", "pitch", "--model", "none"], "leave out --detector and --model none"),
+    (["--command", "pitch", "--detector", "cusum"], "leave out --detector and --model none"),
+  ),
+)
+def test_a_command_that_cannot_be_one_is_one_line(logs, mjx, more, words):
+  code, out, err = mjx(logs[0], "--nominal", logs[2], *more)
+  assert code == 2 and words in err and err.count("\n") == 1 and not out
+
+
 def test_an_alarm_needs_a_clear_score(watched):
   """In expectation: standard residuals, the levels exceed their thresholds as often as asked."""
   _, own = watched

@@ -1139,9 +1139,9 @@ def test_published_figures_are_drawn_anew(tmp_path, mjx):  # noqa: F811
 
 
 def test_a_detector_without_a_fit_of_its_agent_is_refused_before_anything_is_lived():
-  config = RunConfig("walker", detector="innovations", agent="walker-2")
+  config = RunConfig("walker", detector="innovations", agent="walker-plain")
   with pytest.raises(
-    UserError, match="part a: detector 'innovations' has no fit of agent 'walker-2'"
+    UserError, match="part a: detector 'innovations' has no fit of agent 'walker-plain'"
   ):
     costs.check(suites.Part("a", config), costs.Robots())
   costs.check(

@@ -1,5 +1,6 @@
 """Several seeds in one program: as a loop over them, spread over devices, and one that fails alone."""
 
+import dataclasses
 import os
 import pathlib
 import subprocess
@@ -14,6 +15,7 @@ from mjx_cl.config import PRESETS, TrainConfig, replace
 from mjx_cl.dreamer.agent import CAUSES, Weights, culprit
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.io import checkpoints, runtime
+from mjx_cl.training import agents, files
 from mjx_cl.training import trainer as train
 
 DREAMER = replace(PRESETS["tiny"].dreamer, batch=4, length=8, imagine=4)
@@ -180,6 +182,31 @@ def test_a_seed_that_fails_stops_alone_and_is_named(
   assert again.failed == hurt.failed
   again.step()
   assert same(seed(again.state.train, 1), frozen)
+
+
+def test_every_sound_seed_leaves_its_agent(short_walker, tmp_path):
+  trainer = make_trainer(short_walker, tmp_path)
+  for _ in range(2):
+    trainer.step()
+  trainer.failed[0] = "for the test"
+  trainer.about = {"env": "walker", "preset": "tiny", "command": "", "seed": 5, "repeat": 1}
+  trainer.about |= {"dreamer": dataclasses.asdict(DREAMER), "train": dataclasses.asdict(CONFIG)}
+  card = files.export(trainer, 1)
+  folders = sorted(p.parent.name for p in tmp_path.glob("seed-*/agent"))
+  assert folders == ["seed-6", "seed-7", "seed-8"]
+  for g, folder in enumerate(folders, 1):
+    kept = agents.of(short_walker, str(tmp_path / folder / "agent"))
+    ours = jax.tree.leaves(seed(trainer.state.train.params, g))
+    assert all(map(np.array_equal, jax.tree.leaves(kept.train.params), ours))
+    assert kept.card["group"] == g and kept.card["updates"] == trainer.updates
+  first = agents.of(short_walker, str(tmp_path / "agent"))
+  same = agents.of(short_walker, str(tmp_path / "seed-6/agent"))
+  assert all(
+    map(np.array_equal, jax.tree.leaves(first.train.params), jax.tree.leaves(same.train.params))
+  )
+  assert first.card == card and same.card == card | {"group": 1}
+  files.clear(tmp_path)
+  assert not list(tmp_path.glob("**/agent.npz")) and not list(tmp_path.glob("**/card.json"))
 
 
 def test_when_every_seed_fails_the_training_ends(short_walker, tmp_path, monkeypatch):

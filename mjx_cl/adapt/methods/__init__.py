@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from mjx_cl.adapt.arms import ARMS, Arm
-from mjx_cl.adapt.methods import calm, guarded, rollback, staged, world_model
+from mjx_cl.adapt.methods import calm, guarded, quiet, rollback, staged, world_model
 from mjx_cl.adapt.methods.base import PAPER, Acts, Method, Update, View, average, follow
 from mjx_cl.adapt.settling import SIGNALS
 from mjx_cl.dreamer.agent import Agent, TrainState
@@ -40,6 +40,9 @@ METHODS: dict[str, Method] = {
   "world-model": world_model.METHOD,
   "staged": staged.METHOD,
   "calm": calm.METHOD,
+  "quiet": quiet.METHOD,
+  "quiet-guarded": quiet.GUARDED,
+  "still": quiet.STILL,
 }
 
 
@@ -99,6 +102,8 @@ def check(name: str, method: Method, agent: Agent) -> None:
   if not isinstance(acts, Acts):
     raise PluginError(f"arm {name!r}: act of its method must give an Acts")
   like("act", acts.params, params, "the parameters")
+  if acts.learner is not None:
+    like("what act gives the learner", acts.learner, params, "the parameters")
   shapes = lambda tree: [x.shape for x in jax.tree.leaves(tree)]
   if form(acts.memory) != form(memory) or shapes(acts.memory) != shapes(memory):
     raise PluginError(f"arm {name!r}: act of its method must keep structure and shapes of memory")

@@ -49,13 +49,13 @@ class Acts(NamedTuple):
   """What a method answers.
 
   Attributes:
-    params: that act, and predict, in the chunk to come; where an adaptation is over the learner
-      goes on from them too.
+    params: that act, and predict, in the chunk to come.
     memory: of the method.
     back: bool (), the weights of before the adaptation are put back: a row `rollback` of
       events.parquet, with the two that follow.
     earned: float32 (), mean reward a step of the weights of before.
     earns: float32 (), of the learner's.
+    learner: parameters that the learner goes on from where an adaptation is over; None: `params`.
   """
 
   params: Any
@@ -63,6 +63,7 @@ class Acts(NamedTuple):
   back: jax.Array | bool = False
   earned: jax.Array | float = jnp.nan
   earns: jax.Array | float = jnp.nan
+  learner: Any = None
 
 
 # (agent, memory, state, batch, key) -> (state', metrics, latents), as Agent.update
@@ -99,6 +100,7 @@ class Method:
     hides: memory -> bool (): the chunk was not lived by what learns, the stop rule looks away.
     copies: sets of parameters that the memory holds, for the memory that a run says it takes.
     weighs: `act` fills back, earned and earns.
+    learns: updates are taken; False: none are, `act` alone does something.
   """
 
   init: Callable[[Any], Any] = lambda params: ()
@@ -108,6 +110,7 @@ class Method:
   hides: Callable[[Any], jax.Array] | None = None
   copies: int = 0
   weighs: bool = False
+  learns: bool = True
 
 
 PAPER = Method()

@@ -8,9 +8,8 @@ import jax
 import jax.numpy as jnp
 
 from mjx_cl.adapt.methods.base import Acts, Method, View, follow
+from mjx_cl.adapt.methods.quiet import still
 from mjx_cl.adapt.trees import choose
-
-LOW = -20.0  # a head that says it has the least deviation, whatever the state
 
 
 class Calm(NamedTuple):
@@ -26,13 +25,6 @@ class Calm(NamedTuple):
 def init(params: Any) -> Calm:
   """Of a stream that has not begun to learn."""
   return Calm(params, jnp.bool_(False))
-
-
-def still(params: Any) -> Any:
-  """The parameters, the policy's deviation at its least (0.1 of the action's range) everywhere."""
-  head = params["pol"]["std"]
-  head = {"kernel": jnp.zeros_like(head["kernel"]), "bias": jnp.full_like(head["bias"], LOW)}
-  return {**params, "pol": {**params["pol"], "std": head}}
 
 
 def act(calm: Calm, view: View) -> Acts:

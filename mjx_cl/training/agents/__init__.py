@@ -155,7 +155,8 @@ def load(
     act_size: variables of its action.
     agents_of: robot with the same observation, action and reward, whose agents fit too; None: that
       of the class registered under this name.
-    departures: fields of its DreamerConfig to go on with otherwise, e.g. lr; None: its own.
+    departures: fields of its DreamerConfig to go on with otherwise, e.g. lr; None: its own, of
+      policy_lr and model_lr 1.
 
   Raises:
     UserError: an agent of another robot or an unknown name.
@@ -174,8 +175,10 @@ def load(
   card, config = read_card(folder)
   if card["env"] not in (env_name, related):
     raise UserError(f"agent {name!r} was trained on {card['env']!r}, not on {env_name!r}")
-  # whatever goes on from here does so at full learning rate
-  other = {"warmup": 0} | {k: v for k, v in departures.items() if v is not None}
+  # whatever goes on from here does so at full learning rate, whatever its last stage held still
+  other = {"warmup": 0, "policy_lr": 1.0, "model_lr": 1.0} | {
+    k: v for k, v in departures.items() if v is not None
+  }
   config = dataclasses.replace(config, **other)
   agent = Agent(config, obs_size, act_size)
   like = jax.eval_shape(agent.init, jax.random.key(0))

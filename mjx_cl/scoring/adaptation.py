@@ -1,0 +1,369 @@
+"""Methods of adaptation against each other: how much of the return that a fault takes each wins
+back, at what price.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mjx_cl.errors import UserError
+from mjx_cl.scoring import comparison, intervals, survival
+
+NOTHING, PAPER = "none", "detector"  # arm whose score is 0, and that of the paper's method
+TENTH = 0.1  # of the reward before the fault
+REPS = 5_000  # bootstrap draws
+EXACT = 12  # pairs up to which every choice of signs is counted
+KEYS = ("robot", "setting", "method", "agent", "seed")
+
+
+class Board(NamedTuple):
+  """Methods against each other.
+
+  Attributes:
+    rows: a dict for each method x setting, see `of_setting`.
+    overall: a dict for each method, best score first, see `board`.
+    critical_difference: mean ranks further apart differ at 5 % (Nemenyi); None for fewer than two
+      methods or settings.
+    friedman_p: chance of ranks this uneven if all methods were alike.
+  """
+
+  rows: list[dict]
+  overall: list[dict]
+  critical_difference: float | None
+  friedman_p: float | None
+
+
+def share_lost(life: dict, nothing: dict) -> float:
+  """Return lost after the onset, of what the reward before the fault would have brought; that
+  reward is of arm `none` of the same agent and seed, which no false alarm cuts short. nan where it
+  was not above 0, or is not known.
+  """
+  if None in (life["reward_pre"], life["return_lost"], nothing["reward_pre"]):
+    return np.nan
+  earned = life["reward_pre"] * life["steps"] - life["return_lost"]
+  full = nothing["reward_pre"] * life["steps"]
+  return 1 - earned / full if full > 0 else np.nan
+
+
+def board(lives: list[dict]) -> Board:
+  """Scores of every method.
+
+    lost = return lost after the onset / (reward before x steps after)
+    score of a setting = 100 (1 - mean lost / mean lost of arm `none`), over the same agents and
+      seeds: 0 does nothing, 100 has the reward of before the fault at once, below 0 is worse than
+      nothing
+    score of a robot = mean over its settings;  score = mean over robots
+
+  Intervals are 95 %: a bootstrap of agents and then of their seeds, drawn with all settings of a
+  robot and for all methods alike, nowhere narrower than that of the seeds alone, since few agents
+  differ by chance less than agents do. Seeds that arm `none` lacks do not count.
+
+  Args:
+    lives: dicts with KEYS, reward_pre, return_lost, return_lost_healthy, onset, steps (from there
+      on), affected, recovery_step, terminations, false_alarms, updates, wall_s, as in
+      runs.parquet; of arm `none` each setting must have some.
+
+  Returns:
+    Board. Rows of `overall`: method, score, score_ci, and for each robot score_ROBOT,
+    score_ROBOT_ci; gain, gain_ci, gain_ROBOT, gain_ROBOT_ci: its score less that of the paper's
+    method, over the settings, agents and seeds of both; settings; harm: settings in which it loses
+    more than `none`, by the paired interval; harm_holm: the same by a sign-flip test at 5 %, lives
+    taken as independent, after Holm's correction; harm_streams: share of streams that lose more
+    than `none` of the same seed by a tenth of the reward before; falls: in the whole life, beyond
+    `none`; updates, wall_s: a stream; false_alarms: share of streams with one before the onset;
+    healthy_lost: reward lost before the onset beyond `none` [share]; mean_rank: over the settings
+    that all have, by the scores over the agents and seeds that all have there.
+
+  Raises:
+    UserError: two lives of one method, setting, agent and seed, or a setting without `none`.
+  Reference: Agarwal et al. 2021, NeurIPS 34 (score normalised by two references, bootstrap over
+  runs); Holm 1979, Scandinavian Journal of Statistics 6, 65-70; Demsar 2006, Journal of Machine
+  Learning Research 7, 1-30.
+  """
+  held: dict[tuple[str, str], dict[str, dict[tuple, dict]]] = {}
+  for life in lives:
+    of = held.setdefault((life["robot"], life["setting"]), {}).setdefault(life["method"], {})
+    unit = (life["agent"], life["seed"])
+    if unit in of:
+      raise UserError(f"two lives of {', '.join(str(life[k]) for k in KEYS)}")
+    of[unit] = life
+  for (robot, setting), own in held.items():
+    if NOTHING not in own:
+      raise UserError(f"setting {setting} of {robot} has no arm {NOTHING!r} to compare with")
+  names = list(dict.fromkeys(life["method"] for life in lives))
+  robots = dict.fromkeys(robot for robot, _ in held)
+  drawn = {robot: _Draws(held, robot, seed) for seed, robot in enumerate(robots)}
+  rows = [
+    {"robot": robot, "setting": setting, "method": name} | of_setting(own[name], own[NOTHING])
+    for (robot, setting), own in held.items()
+    for name in names
+    if name in own
+  ]
+  for row in rows:
+    draws = drawn[row["robot"]]
+    row["score_ci"] = draws.ends(draws.scores([row["setting"]], row["method"]), row["streams"])
+    row["beyond_ci"] = draws.ends(draws.beyond(row["setting"], row["method"]), row["streams"])
+  overall = [_overall(name, rows, held, drawn) for name in names]
+  rivals = [name for name in names if name != NOTHING]
+  full = []
+  for own in held.values():
+    alike = [u for u in own[NOTHING] if all(u in own.get(name, {}) for name in rivals)]
+    some = {name: {u: of[u] for u in alike} for name, of in own.items() if alike}
+    scores = [of_setting(some[name], some[NOTHING])["score"] for name in rivals if some]
+    if scores and None not in scores:
+      full.append(scores)
+  ranks, critical, p = comparison.ranked(np.array(full, float).reshape(len(full), len(rivals)))
+  place = dict(zip(rivals, ranks))
+  for row in overall:
+    row["mean_rank"] = intervals.finite(place.get(row["method"]))
+  overall.sort(key=lambda r: -np.inf if r["score"] is None else r["score"], reverse=True)
+  return Board(rows, overall, critical, p)
+
+
+def of_setting(lives: dict[tuple, dict], nothing: dict[tuple, dict]) -> dict[str, Any]:
+  """What one method does in one setting, beside `none`; both by agent and seed.
+
+  Returns:
+    streams: pairs; agents; score; lost, lost_none: mean shares; beyond: mean of the pairs'
+    differences in lost, beyond_p (sign flips); worse: pairs that lose more than `none` by a tenth;
+    affected: those of which recovery is known; recovered: of these; recovery_steps: mean time to
+    recovery up to the longest that could be seen, those that take longer counted as that, with
+    recovery_steps_ci; falls, false_alarms, healthy_lost, updates, wall_s: as `board`.
+  """
+  shared = [unit for unit in nothing if unit in lives]
+  own, other = [lives[u] for u in shared], [nothing[u] for u in shared]
+  lost, none = (
+    np.array([share_lost(life, ref) for life, ref in zip(of, other)]) for of in (own, other)
+  )
+  beyond = lost - none
+  known = np.isfinite(beyond)
+  lost, none, beyond = lost[known], none[known], beyond[known]
+  mean = lambda x: float(np.mean(x)) if len(x) else None
+  # a run without arm `none` does not know whether its streams are affected, nor when they recover
+  hit = [life for life, ref in zip(own, other) if ref["affected"] and life["affected"] is not None]
+  score = None if not len(none) or none.mean() <= 0 else 100 * (1 - lost.mean() / none.mean())
+  before = lambda life: (life["reward_pre"] or 0.0) * life["onset"]
+  return {
+    "streams": len(shared),
+    "agents": len({agent for agent, _ in shared}),
+    "score": intervals.finite(score),
+    "lost": mean(lost),
+    "lost_none": mean(none),
+    "beyond": mean(beyond),
+    "beyond_p": sign_flips(beyond),
+    "worse": int(np.sum(beyond > TENTH)),
+    "affected": len(hit),
+    "recovered": sum(life["recovery_step"] is not None for life in hit),
+    **_time(hit),
+    "falls": mean([a["terminations"] - b["terminations"] for a, b in zip(own, other)]),
+    "false_alarms": sum(life["false_alarms"] > 0 for life in own),
+    "healthy_lost": mean(
+      [
+        (a["return_lost_healthy"] - b["return_lost_healthy"]) / before(b)
+        for a, b in zip(own, other)
+        if None not in (a["return_lost_healthy"], b["return_lost_healthy"]) and before(b) > 0
+      ]
+    ),
+    "updates": mean([life["updates"] for life in own]),
+    "wall_s": mean([life["wall_s"] for life in own if life["wall_s"] is not None]),
+  }
+
+
+def _time(hit: list[dict]) -> dict[str, Any]:
+  """Restricted mean time to recovery of affected streams, and its interval."""
+  if not hit:
+    return {"recovery_steps": None, "recovery_steps_ci": None}
+  seen = np.array([life["recovery_step"] is not None for life in hit])
+  last = max(1, min(life["steps"] for life in hit) - survival.recovery.HOLD)
+  time = np.array(
+    [
+      last if r is None else min(last, r - life["onset"])
+      for life in hit
+      for r in [life["recovery_step"]]
+    ],
+    float,
+  )
+  mean, ends = survival.restricted_mean(time, seen, last)
+  return {"recovery_steps": mean, "recovery_steps_ci": ends}
+
+
+def sign_flips(x: np.ndarray) -> float | None:
+  """Two-sided chance of a mean as far from 0 if each value's sign were a coin's: over all choices
+  of signs up to EXACT values, else over 20,000. None for fewer than two.
+  """
+  if len(x) < 2:
+    return None
+  if len(x) <= EXACT:
+    signs = np.array(list(itertools.product((-1, 1), repeat=len(x))))
+  else:
+    signs = np.random.default_rng(0).choice((-1, 1), (20_000, len(x)))
+    signs[0] = 1  # what was seen is one of them
+  means = np.abs(signs @ x)
+  return float(np.mean(means >= abs(x.sum()) * (1 - 1e-12)))
+
+
+def holm(p: list[float | None], level: float = 0.05) -> list[bool]:
+  """Which hypotheses Holm's procedure rejects; None is never rejected, and not counted."""
+  known = sorted((value, i) for i, value in enumerate(p) if value is not None)
+  out = [False] * len(p)
+  for k, (value, i) in enumerate(known):
+    if value > level / (len(known) - k):
+      break
+    out[i] = True
+  return out
+
+
+class _Draws:
+  """Bootstrap of one robot's agents and seeds.
+
+  Attributes:
+    units: (agent, seed) of arm `none` in any of the robot's settings.
+    counts: how often each draw holds each unit, (2, REPS, units): agents and then seeds, and seeds
+      alone; of one agent the two are alike.
+  """
+
+  def __init__(self, held: dict, robot: str, seed: int) -> None:
+    self.settings = {setting: own for (whose, setting), own in held.items() if whose == robot}
+    self.units = sorted({u for own in self.settings.values() for u in own[NOTHING]})
+    groups: dict[str, list[int]] = {}
+    for k, (agent, _) in enumerate(self.units):
+      groups.setdefault(agent, []).append(k)
+    random, n = np.random.default_rng(seed), len(self.units)
+    drawn = random.integers(0, n, (REPS, n))
+    flat = np.stack([np.bincount(row, minlength=n) for row in drawn])
+    nested = flat
+    if len(groups) > 1:
+      own, nested = list(groups.values()), np.zeros_like(flat)
+      for row, agents in zip(nested, random.integers(0, len(own), (REPS, len(own)))):
+        for a in agents:
+          np.add.at(row, np.array(own[a])[random.integers(0, len(own[a]), len(own[a]))], 1)
+    self.counts = np.stack([nested, flat])
+
+  @functools.cached_property
+  def _lost(self) -> dict[tuple[str, str], np.ndarray]:
+    """(setting, method) -> share lost of each unit, nan where there is none."""
+    return {
+      (setting, name): np.array(
+        [
+          share_lost(of[u], own[NOTHING][u]) if u in of and u in own[NOTHING] else np.nan
+          for u in self.units
+        ]
+      )
+      for setting, own in self.settings.items()
+      for name, of in own.items()
+    }
+
+  def scores(self, settings: list[str], method: str, beside: str = NOTHING) -> np.ndarray:
+    """Mean score over settings in every draw, (2, REPS), of the units that `beside` has too; nan
+    where a draw holds none.
+    """
+    out = []
+    for setting in settings:
+      own, none = self._lost[setting, method], self._lost[setting, NOTHING]
+      known = np.isfinite(own) & np.isfinite(none) & np.isfinite(self._lost[setting, beside])
+      sums = [self.counts[..., known] @ x[known] for x in (own, none)]
+      with np.errstate(divide="ignore", invalid="ignore"):
+        out.append(np.where(sums[1] > 0, 100 * (1 - sums[0] / sums[1]), np.nan))
+    return np.mean(out, 0)
+
+  def beyond(self, setting: str, method: str) -> np.ndarray:
+    """Mean of what is lost beyond `none` in every draw, (2, REPS)."""
+    x = self._lost[setting, method] - self._lost[setting, NOTHING]
+    known = np.isfinite(x)
+    held = self.counts[..., known]
+    with np.errstate(divide="ignore", invalid="ignore"):
+      return held @ x[known] / held.sum(-1)
+
+  def ends(self, drawn: np.ndarray, pairs: int) -> list[float | None] | None:
+    """Interval of what was drawn, of so many pairs."""
+    return wider(drawn[:, np.isfinite(drawn).all(0)]) if pairs > 1 else None
+
+
+def wider(drawn: np.ndarray) -> list[float | None] | None:
+  """The ends of the wider of two bootstraps, (2, REPS)."""
+  found = intervals.ends(drawn) if drawn.size else [None, None]
+  if found[0] is None or found[1] is None:
+    return None
+  low, high = zip(*found)
+  return [None if None in pair else pick(pair) for pick, pair in ((min, low), (max, high))]
+
+
+def _overall(name: str, rows: list[dict], held: dict, drawn: dict[str, _Draws]) -> dict[str, Any]:
+  """A row of `overall`."""
+  own = [r for r in rows if r["method"] == name]
+  robots = {
+    robot: [r for r in own if r["robot"] == robot and r["score"] is not None]
+    for robot in dict.fromkeys(r["robot"] for r in own)
+  }
+  robots = {robot: of for robot, of in robots.items() if of}
+
+  def mean(key: str, of: list[dict] = own) -> float | None:
+    known = [r[key] for r in of if r[key] is not None]
+    return float(np.mean(known)) if known else None
+
+  out: dict[str, Any] = {"method": name}
+  each = {robot: mean("score", of) for robot, of in robots.items()}
+  out["score"] = float(np.mean(list(each.values()))) if each else None
+  sampled = {r: drawn[r].scores([x["setting"] for x in of], name) for r, of in robots.items()}
+  fewest = min((r["streams"] for r in own), default=0)
+
+  def ends(of: list[np.ndarray]) -> list[float | None] | None:
+    values = np.mean(of, 0) if of else np.zeros((2, 0))
+    values = values[:, np.isfinite(values).all(0)]
+    return wider(values) if fewest > 1 and values.size else None
+
+  out["score_ci"] = ends(list(sampled.values()))
+  for robot in robots:
+    out |= {f"score_{robot}": each[robot], f"score_{robot}_ci": ends([sampled[robot]])}
+  out |= _gain(name, robots, held, drawn, ends)
+  streams = sum(r["streams"] for r in own)
+  hurt = holm([r["beyond_p"] for r in own])
+  return out | {
+    "settings": len(own),
+    "streams": streams,
+    "agents": max((r["agents"] for r in own), default=0),
+    "harm": sum(r["beyond_ci"] is not None and (r["beyond_ci"][0] or 0) > 0 for r in own),
+    "harm_holm": sum(h and r["beyond"] > 0 for h, r in zip(hurt, own)),
+    "harm_streams": sum(r["worse"] for r in own) / streams if streams else None,
+    "recovered": sum(r["recovered"] for r in own),
+    "affected": sum(r["affected"] for r in own),
+    "falls": mean("falls"),
+    "false_alarms": sum(r["false_alarms"] for r in own) / streams if streams else None,
+    "healthy_lost": mean("healthy_lost"),
+    "updates": mean("updates"),
+    "wall_s": mean("wall_s"),
+  }
+
+
+def _gain(name: str, robots: dict, held: dict, drawn: dict[str, _Draws], ends: Any) -> dict:
+  """Score less that of the paper's method, over the settings and units of both: gain, gain_ci, of
+  all robots and of each.
+  """
+  out: dict[str, Any] = {"gain": None, "gain_ci": None}
+  if name == PAPER:
+    return out
+  means, sampled = [], []
+  for robot, of in robots.items():
+    scores, settings = [], []
+    for row in of:
+      own = held[robot, row["setting"]]
+      both = own[name].keys() & own.get(PAPER, {}).keys() & own[NOTHING].keys()
+      two: list[Any] = [
+        of_setting({u: own[m][u] for u in both}, own[NOTHING])["score"] if both else None
+        for m in (name, PAPER)
+      ]
+      if None not in two:
+        scores.append(two[0] - two[1])
+        settings.append(row["setting"])
+    if settings:
+      means.append(float(np.mean(scores)))
+      one, other = drawn[robot], (name, PAPER)
+      sampled.append(one.scores(settings, *other) - one.scores(settings, *other[::-1]))
+      out |= {f"gain_{robot}": means[-1], f"gain_{robot}_ci": ends(sampled[-1:])}
+  if means:
+    out |= {"gain": float(np.mean(means)), "gain_ci": ends(sampled)}
+  return out

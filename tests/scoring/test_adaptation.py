@@ -1,0 +1,193 @@
+"""The board of methods by hand."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from mjx_cl.errors import UserError
+from mjx_cl.scoring import adaptation
+
+STEPS = 1_000  # after the onset
+
+
+def life(method, seed, lost, robot="walker", setting="gear", agent="walker", **other):
+  """One that loses the share `lost` of a reward of 0.5 a step."""
+  own = {
+    "robot": robot,
+    "setting": setting,
+    "method": method,
+    "agent": agent,
+    "seed": seed,
+    "reward_pre": 0.5,
+    "return_lost": lost * 0.5 * STEPS,
+    "return_lost_healthy": 0.0,
+    "onset": 400,
+    "steps": STEPS,
+    "affected": lost > 0.1,
+    "recovery_step": None,
+    "terminations": 0,
+    "false_alarms": 0,
+    "updates": 10,
+    "wall_s": 2.0,
+  }
+  return own | other
+
+
+def lives(lost, **other):
+  """{method: shares lost, by seed} as lives."""
+  return [
+    life(method, seed, x, **other) for method, of in lost.items() for seed, x in enumerate(of)
+  ]
+
+
+NONE = [0.4, 0.2, 0.3, 0.5, 0.1, 0.3]
+HALF = [x / 2 for x in NONE]
+
+
+def of(board, method):
+  return next(r for r in board.overall if r["method"] == method)
+
+
+def test_scores_by_hand():
+  """A mean over settings and then over robots, of ratios of mean losses."""
+  some = lives({"none": NONE, "detector": [0.3, 0.2, 0.3, 0.3, 0.0, 0.1], "mine": HALF})
+  more = lives({"none": [0.5, 0.7], "detector": [0.6, 0.9], "mine": [0.3, 0.3]}, setting="payload")
+  car = lives({"none": [0.2, 0.2], "detector": [0.1, 0.1], "mine": [0.0, 0.1]}, robot="car")
+  board = adaptation.board(some + more + car)
+  detector, mine = of(board, "detector"), of(board, "mine")
+  walker = [100 * (1 - 1.2 / 1.8), 100 * (1 - 1.5 / 1.2)]
+  assert detector["score_walker"] == pytest.approx(np.mean(walker))
+  assert detector["score"] == pytest.approx((np.mean(walker) + 50) / 2)
+  assert mine["score_walker"] == pytest.approx((50 + 50) / 2) and mine["score_car"] == 75
+  assert mine["gain"] == pytest.approx(62.5 - detector["score"])
+  assert mine["gain_car"] == pytest.approx(25) and "gain_car" not in detector
+  assert of(board, "none")["score"] == 0
+  assert [r["method"] for r in board.overall] == ["mine", "detector", "none"]
+  assert mine["mean_rank"] == 1 and detector["mean_rank"] == 2  # `none` takes no rank
+  assert board.critical_difference == pytest.approx(1.96 * (2 * 3 / 6 / 3) ** 0.5, rel=1e-3)
+
+
+def test_half_of_every_loss_has_no_interval_and_a_difference_is_paired():
+  board = adaptation.board(lives({"none": NONE, "mine": HALF}))
+  assert of(board, "mine")["score_ci"] == pytest.approx([50, 50])
+  row = next(r for r in board.rows if r["method"] == "mine")
+  assert row["beyond"] == pytest.approx(-0.15) and row["beyond_ci"][1] < 0
+  assert row["beyond_p"] == pytest.approx(2 / 2**6)  # all six one way
+
+
+def test_harm_is_told_by_pairs_and_corrected():
+  worse = [x + 0.15 for x in NONE]
+  one = lives({"none": NONE, "bad": worse})
+  many = one + [
+    x
+    for k in range(3)
+    for x in lives({"none": NONE, "bad": [NONE[0] + (-1) ** k * 0.01, *NONE[1:]]}, setting=f"{k}")
+  ]
+  bad = of(adaptation.board(one), "bad")
+  assert (bad["harm"], bad["harm_holm"], bad["harm_streams"]) == (1, 1, 1.0)
+  bad = of(adaptation.board(many), "bad")  # four tests: 0.031 is above 0.05 / 4
+  assert (bad["settings"], bad["harm"], bad["harm_holm"], bad["harm_streams"]) == (4, 1, 0, 0.25)
+
+
+def test_agents_are_drawn_too():
+  """Two agents that differ, whose seeds do not: the interval is that of agents."""
+  both = lives({"none": [0.4] * 6, "mine": [0.1] * 6}, agent="a")
+  both += lives({"none": [0.4] * 6, "mine": [0.3] * 6}, agent="b")
+  row = of(adaptation.board(both), "mine")
+  assert row["score"] == pytest.approx(50) and row["agents"] == 2
+  assert row["score_ci"] == pytest.approx([25, 75])
+
+
+def test_robots_are_drawn_apart():
+  """Two robots whose losses mirror each other by seed: a mean of two independent draws."""
+  own = [0.0, 0.1, 0.2, 0.3]
+  both = lives({"none": [0.4] * 4, "mine": own})
+  both += lives({"none": [0.4] * 4, "mine": own[::-1]}, robot="car")
+  row = of(adaptation.board(both), "mine")
+  low, high = row["score_ci"]
+  one = row["score_walker_ci"][1] - row["score_walker_ci"][0]
+  assert 0.5 * one < high - low < 0.9 * one  # about one / sqrt(2)
+
+
+def test_a_method_of_fewer_seeds_is_compared_on_those():
+  """The paper's method on the first three seeds alone, under another name, gains nothing."""
+  paper = [0.3, 0.2, 0.3, 0.3, 0.0, 0.1]
+  board = adaptation.board(lives({"none": NONE, "detector": paper, "mine": paper[:3]}))
+  row = of(board, "mine")
+  assert row["gain"] == pytest.approx(0) and row["gain_ci"] == pytest.approx([0, 0], abs=1e-9)
+  assert row["mean_rank"] == of(board, "detector")["mean_rank"] == 1.5
+  single = of(adaptation.board(lives({"none": NONE, "mine": [0.1]})), "mine")
+  assert single["score_ci"] is None and single["score"] == pytest.approx(75)
+
+
+def test_the_reward_before_is_that_of_none():
+  """A false alarm that cuts a method's own window short does not move what it lost."""
+  some = lives({"none": NONE, "mine": HALF})
+  for x in some:
+    if x["method"] == "mine":  # as much is earned, said from a window of another mean
+      x["return_lost"] += (0.6 - 0.5) * STEPS
+      x["reward_pre"] = 0.6
+  assert of(adaptation.board(some), "mine")["score"] == pytest.approx(50)
+
+
+def test_what_is_not_known_does_not_count():
+  some = lives({"none": NONE, "mine": HALF})
+  some[6] |= {"reward_pre": None, "return_lost": None, "return_lost_healthy": None}
+  row = next(r for r in adaptation.board(some).rows if r["method"] == "mine")
+  assert row["lost_none"] == pytest.approx(sum(NONE[1:]) / 5)
+  for x in some:  # lived without arm `none`: nobody knows when it recovers
+    if x["method"] == "mine":
+      x["affected"] = None
+  row = next(r for r in adaptation.board(some).rows if r["method"] == "mine")
+  assert (row["affected"], row["recovered"]) == (0, 0)
+
+
+def test_what_it_costs():
+  lost = {"none": [0.3, 0.3, 0.0], "mine": [0.1, 0.1, 0.1]}
+  own = lives(lost)
+  for x in own:
+    if x["method"] == "mine":
+      x |= {"terminations": 3, "false_alarms": int(x["seed"] == 1), "return_lost_healthy": 20.0}
+      x |= {"recovery_step": 900 if x["seed"] == 0 else None}
+  row = next(r for r in adaptation.board(own).rows if r["method"] == "mine")
+  assert (row["falls"], row["false_alarms"], row["updates"], row["wall_s"]) == (3, 1, 10, 2)
+  assert row["healthy_lost"] == pytest.approx(20 / (0.5 * 400))
+  assert (row["affected"], row["recovered"]) == (2, 1)  # the third loses nothing without it
+
+
+def test_time_to_recovery_is_a_restricted_mean():
+  """Of two that take 500 and 1,500 steps and one that never does within 3,000 that can be seen."""
+  own = [life("none", k, 0.3, steps=5_000) for k in range(3)]
+  when = [900, 1_900, None]
+  own += [life("mine", k, 0.1, steps=5_000, recovery_step=when[k]) for k in range(3)]
+  row = next(r for r in adaptation.board(own).rows if r["method"] == "mine")
+  assert row["recovery_steps"] == pytest.approx((500 + 1_500 + 3_000) / 3)
+
+
+@pytest.mark.parametrize("n", (5, 9))
+def test_sign_flips_count_every_choice(n):
+  x = np.random.default_rng(n).normal(0.4, 1, n)
+  count = sum(
+    abs(sum(s * v for s, v in zip(signs, x))) >= abs(x.sum()) - 1e-9
+    for signs in itertools.product((-1, 1), repeat=n)
+  )
+  assert adaptation.sign_flips(x) == pytest.approx(count / 2**n)
+  assert adaptation.sign_flips(x[:1]) is None
+
+
+def test_holm_by_hand():
+  p = [0.04, 0.001, None, 0.012, 0.03]  # against 0.0125, 0.0167, 0.025: the third stops it
+  assert adaptation.holm(p) == [False, True, False, True, False]
+
+
+def test_what_cannot_be_compared_is_said():
+  with pytest.raises(UserError, match="setting gear of walker has no arm 'none'"):
+    adaptation.board(lives({"mine": HALF}))
+  with pytest.raises(UserError, match="two lives of walker, gear, none, walker, 0"):
+    adaptation.board(lives({"none": NONE}) * 2)
+
+
+def test_no_score_where_the_fault_costs_nothing():
+  board = adaptation.board(lives({"none": [0.0] * 3, "mine": [0.1] * 3}))
+  assert of(board, "mine")["score"] is None and of(board, "mine")["harm"] == 1
