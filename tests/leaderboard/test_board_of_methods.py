@@ -261,7 +261,7 @@ def test_a_setting_without_a_severity_has_its_section(tmp_path):
 def test_the_page_shows_every_method_and_every_life(browser, tmp_path):  # noqa: F811
   lives = methods.of_folder(STEADY)
   methods_page.write(tmp_path / "x.html", adaptation.board(lives), lives, {})
-  browser.driver.get((tmp_path / "x.html").as_uri())
+  browser.open(tmp_path / "x.html")
   count = lambda css: browser.driver.find_elements("css selector", css)
   assert [x.text.splitlines()[0] for x in count("tbody th")][-1] == "none"
   assert len(count("tbody tr")) == 5

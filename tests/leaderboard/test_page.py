@@ -409,9 +409,14 @@ class Browser:
     self.driver = driver
 
   def open(self, file, hash=""):
-    """Loads the file anew at a hash."""
+    """Loads the file anew at a hash. A busy machine's driver can answer before the page is there."""
+    from selenium.webdriver.support.wait import WebDriverWait
+
     self.driver.get("about:blank")
     self.driver.get(f"{file.as_uri()}{hash}")
+    WebDriverWait(self.driver, 120).until(
+      lambda _: self.js("return location.protocol == 'file:' && document.readyState == 'complete'")
+    )
     return self
 
   def all(self, selector):
