@@ -23,3 +23,8 @@ def guarded() -> Arm:
 def quiet() -> Arm:
   """Acts without exploring from the onset on, and explores in dreams."""
   return Arm("method `quiet`, told the onset", ONSET, RULE, method="quiet")
+
+
+def swift() -> Arm:
+  """As quiet, but learns from the first records on, follows sooner and ends later."""
+  return Arm("method `swift`, told the onset", ONSET, RULE, method="swift")

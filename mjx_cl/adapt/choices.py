@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import NamedTuple
 
 import jax
@@ -44,6 +44,7 @@ class Choices(NamedTuple):
     methods: of the run.
     fresh: bool, every start draws new parameters; None: no arm of the run does, and the program
       goes without the drawing.
+    settings: float32, values of AdaptConfig by name, of those that a method of the run sets.
   """
 
   listens: jax.Array
@@ -53,6 +54,21 @@ class Choices(NamedTuple):
   method: jax.Array
   methods: Methods
   fresh: jax.Array | None
+  settings: dict[str, jax.Array] = {}
+
+
+def settings(own: Sequence[methods.Method], config: AdaptConfig) -> dict[str, jax.Array]:
+  """`Choices.settings` of streams with these methods: a method's own value where the run's is the
+  default, else the run's; nan: the agent's.
+  """
+  values = {}
+  for name in (f.name for f in fields(methods.Settings)):
+    wanted = [getattr(method.settings, name) for method in own]
+    run = getattr(config, name)
+    if run == getattr(AdaptConfig, name) and any(x is not None for x in wanted):
+      other = np.nan if run is None else run
+      values[name] = jnp.asarray([other if x is None else x for x in wanted], jnp.float32)
+  return values
 
 
 def choices(
@@ -99,4 +115,5 @@ def choices(
     jnp.asarray([own.index(methods.of(arm)) for arm in arms], jnp.int32),
     Methods(own),
     flags(lambda a: a.fresh) if any(arm.fresh for arm in arms) else None,
+    settings([methods.of(arm) for arm in arms], config),
   )

@@ -168,6 +168,24 @@ def decide(
   )
 
 
+def regained(
+  state: PhaseState, acceptance: jax.Array | float, regain: jax.Array | float
+) -> jax.Array:
+  """What the mean reward must reach before an adaptation may converge, float32 (groups,).
+
+    max(acceptance, m - (1 - regain) |m|),  m = mean reward before the first adaptation
+    acceptance                              where regain = 0
+
+  Args:
+    state: of the streams, leading (groups,).
+    acceptance: float32 () or (groups,), level of the task.
+    regain: float32 () or (groups,), in [0, 1].
+  """
+  before = state.mean[:, SIGNALS.index("reward")]
+  level = before - (1.0 - regain) * jnp.abs(before)
+  return jnp.maximum(acceptance, jnp.where(regain > 0, level, -jnp.inf))
+
+
 def give_up(
   phase: PhaseState, decision: jax.Array, was: jax.Array, failed: jax.Array, signals: jax.Array
 ) -> tuple[PhaseState, jax.Array]:

@@ -290,6 +290,8 @@ class Loop:
     if acceptance is None or config.acceptance is not None:
       acceptance = self.spec.acceptance if config.acceptance is None else config.acceptance
     _, least = self.spec.posture or (0, -jnp.inf)
+    setting = lambda name: choices.settings.get(name, getattr(config, name))
+    acceptance = decide.regained(state.phase, acceptance, setting("regain"))
     signals = seen.signals
     own = choices.methods.all
     for i, (method, memory) in enumerate(zip(own, state.memory)):
@@ -303,14 +305,15 @@ class Loop:
 
     replay = learn.fill(state.replay, rows, begins, begin.row, was == decide.ADAPTING)
     length, adapting = rows.reward.shape[0], phase.phase == decide.ADAPTING
-    owed = learn.owing(agent, replay, adapting, state.owed, length, config)
+    pace = setting("ratio"), setting("start_windows")
+    owed = learn.owing(agent, replay, adapting, state.owed, length, *pace)
     if not all(method.learns for method in own):
       owed = jnp.where(jnp.array([m.learns for m in own])[choices.method], owed, 0.0)
     number = jnp.floor(owed + 1e-6).astype(jnp.int32)
     train, acting = learn.begin(agent, state, keys, begins, choices.fresh, config.fresh_moments)
-    counted = train.updates
+    counted, lr = train.updates, choices.settings.get("lr")
     train, replay, failed = learn.learn(
-      agent, train, replay, draws, number, own, choices.method, state.memory
+      agent, train, replay, draws, number, own, choices.method, state.memory, lr
     )
     taken = train.updates - counted
     phase, decision = decide.give_up(phase, decision, was, failed, seen.signals)
@@ -325,7 +328,7 @@ class Loop:
       jnp.nanmean(phase.ring[:, :, decide.SIGNALS.index("reward")], 1),
       seen.signals,
       taken,
-      jnp.where(number > 0, config.average, 0.0),
+      jnp.where(number > 0, setting("average"), 0.0),
       acting,
       train.params,
     )

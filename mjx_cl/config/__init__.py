@@ -38,6 +38,7 @@ from mjx_cl.errors import require
 # decisions between two rounds of updates, of a training as of a run, where the stop rule looks as
 # often
 CHUNK = 64
+FINETUNING_LR = 1e-4  # of an agent whose card names none
 # settings by name; on the command line --set name=value ...
 Settings = Annotated[
   dict,
@@ -66,7 +67,7 @@ class AdaptConfig:
   Attributes:
     ratio: Replayed steps per record collected after the alarm.
     start_windows: Windows that the replay must hold before the first update.
-    lr: Learning rate while adapting; None: the agent's own.
+    lr: Learning rate while adapting; None: that of the agent's card (`finetuning_lr`), else 1e-4.
     policy_lr: Factor on the policy's steps while adapting; None: 1.
     anchor: Weight while adapting of the actions that the robot itself took; None: the agent's own.
     batch: Sequences of one update while adapting; fewer mean more updates at the same ratio. None:
@@ -83,6 +84,8 @@ class AdaptConfig:
     near: Residuals also count as settled up to so many times their nominal mean.
     least: Steps of adaptation before it may converge [control steps].
     acceptance: Mean reward per control step that counts as recovered; None: the robot's own.
+    regain: Share of the mean reward before the first alarm that must be back as well before an
+      adaptation may converge; 0: acceptance alone.
     give_up: Steps after which an adaptation without settling in sight may be aborted: the reward
       has not risen for a third of this length and is below acceptance; a quarter later also where
       it is acceptable but a signal will not settle [control steps].
@@ -97,7 +100,7 @@ class AdaptConfig:
 
   ratio: float = 16.0
   start_windows: int = 1024
-  lr: float | None = 1e-4
+  lr: float | None = None
   policy_lr: float | None = None
   anchor: float | None = None
   batch: int | None = 4
@@ -111,6 +114,7 @@ class AdaptConfig:
   near: float = 1.25
   least: int = 6000
   acceptance: float | None = None
+  regain: float = 0.0
   give_up: int = 12_000
   budget: int = 19_000
   warmup: int = 1000
@@ -155,7 +159,7 @@ class AdaptConfig:
       self.acceptance is None or math.isfinite(self.acceptance),
       f"acceptance must be finite; got {self.acceptance}",
     )
-    fraction(self, "average")
+    fraction(self, "average", "regain")
     require(self.patience >= 4, f"patience must be at least 4 chunks; got {self.patience}")
     require(
       self.last_starts is None or self.last_starts == 0 or self.last_starts >= 2,

@@ -16,9 +16,10 @@ from test_arms import EAGER, STEPS, hand_rows, scripted
 
 from mjx_cl.adapt import decide, methods
 from mjx_cl.adapt.arms import ALARM, ARMS, RULE, Arm
+from mjx_cl.adapt.choices import settings as settings_of
 from mjx_cl.adapt.loop import Loop, choices
-from mjx_cl.adapt.methods import Acts, Method, staged
-from mjx_cl.config import PRESETS, RunConfig
+from mjx_cl.adapt.methods import Acts, Method, Settings, staged
+from mjx_cl.config import PRESETS, AdaptConfig, RunConfig
 from mjx_cl.dreamer.agent import Agent
 from mjx_cl.errors import PluginError, UserError
 from mjx_cl.rollout.monitor import Monitor
@@ -291,3 +292,61 @@ def test_a_run_knows_the_file_of_its_arm(example):
   config = settings.check(RunConfig("walker", arms=("none", example)))
   files = identity.identity(config)["files"]
   assert set(files) == {example} and len(files[example]) == 64
+
+
+def test_settings_of_a_method_stand_above_defaults_alone():
+  """Where the run's value is the default the method's own counts, in its streams alone."""
+  own = [methods.PAPER, Method(settings=Settings(start_windows=256, regain=0.9))]
+  said = settings_of(own, AdaptConfig())
+  assert {k: v.tolist() for k, v in said.items()} == {
+    "start_windows": [1024.0, 256.0],
+    "regain": [0.0, np.float32(0.9)],
+  }
+  assert set(settings_of(own, AdaptConfig(start_windows=512))) == {"regain"}
+  assert settings_of([methods.PAPER] * 2, AdaptConfig()) == {}
+  with pytest.raises(UserError, match="ratio must be above 0"):
+    Settings(ratio=0.0)
+
+
+def test_a_loop_lives_by_the_settings_of_a_method():
+  """Its own rate of the moving average; the run's `start_windows`, which is no default, stands."""
+  settings = Settings(average=1.0, start_windows=10_000)
+  ARMS.members["eager"] = lambda: Arm("", ALARM, RULE, method=Method(settings=settings))
+  try:
+    states, digests = live(three("eager"))
+  finally:
+    del ARMS.members["eager"]
+  before = states[END - 1]  # still adapting
+  apart = lambda g: max(
+    np.abs(x[g] - y[g]).max()
+    for x, y in zip(jax.tree.leaves(before.acting), jax.tree.leaves(before.train.params))
+  )
+  assert apart(0) < 1e-6 < 1e-4 < apart(1)  # a + (p - a) is p but for rounding
+  assert digests[-1].updates[0] == digests[-1].updates[1] > 0
+
+
+def test_a_method_learns_at_a_rate_of_its_own():
+  """A hundredth of the agent's: it comes about a hundredth as far, and the paper's as ever."""
+  slow = Settings(lr=AGENT.config.lr / 100)
+  ARMS.members["slow"] = lambda: Arm("", ALARM, RULE, method=Method(settings=slow))
+  try:
+    states, digests = live(three("slow"))
+  finally:
+    del ARMS.members["slow"]
+  flat = lambda state, g: np.concatenate([x[g].ravel() for x in jax.tree.leaves(state)])
+  first, last = states[0].train.params, states[-1].train.params
+  moved = [np.linalg.norm(flat(last, g) - flat(first, g)) for g in range(2)]
+  assert digests[-1].updates[0] == digests[-1].updates[1] > 0
+  # steps of LaProp are as long as the rate; the two learn from the same records, by other draws
+  assert 0.005 < moved[0] / moved[1] < 0.02, moved
+
+
+def test_what_must_be_back_by_hand():
+  state = decide.init(LASTING)._replace(mean=jnp.array([0, 0, 0.75, 0, 0, 0.0]))
+  poor = state._replace(mean=state.mean.at[2].set(-2.0))
+  both = jax.tree.map(lambda *x: jnp.stack(x), state, poor)
+  level = lambda accepted, regain: decide.regained(both, accepted, regain).tolist()
+  assert level(0.48, 0.0) == pytest.approx([0.48, 0.48])
+  assert level(0.48, 0.9) == pytest.approx([0.675, 0.48])
+  assert level(-9.0, 0.9) == pytest.approx([0.675, -2.2])
+  assert level(-9.0, jnp.array([0.0, 1.0])) == pytest.approx([-9.0, -2.0])

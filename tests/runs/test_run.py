@@ -10,6 +10,7 @@ import json
 import math
 import os
 import pathlib
+import shutil
 import signal
 import subprocess
 import sys
@@ -887,6 +888,23 @@ def test_agents_round_trip(tiny, tmp_path, same):
 def test_load_overrides_how_it_goes_on(saved):
   config = agents.load(str(saved), "walker", 24, 6, lr=1e-5, last_starts=4).agent.config
   assert (config.lr, config.last_starts, config.warmup) == (1e-5, 4, 0)
+
+
+def test_an_agent_is_finetuned_at_the_rate_of_its_card(saved, tmp_path):
+  """Where a run names none: the card's, else 1e-4; what loads an agent otherwise keeps its own."""
+  shutil.copytree(saved, tmp_path / "agent")
+  load = lambda **given: agents.load(str(tmp_path / "agent"), "walker", 24, 6, **given)
+  rate = lambda **given: load(**given).agent.config.lr
+  own = json.loads((saved / "card.json").read_text())["dreamer"]["lr"]
+  assert (rate(), rate(lr=None), rate(lr=2e-5)) == (own, 1e-4, 2e-5)
+  card = json.loads((saved / "card.json").read_text())
+  for said, wrong in ((3e-5, False), (0.0, True), ("slow", True), (-1.0, True)):
+    (tmp_path / "agent/card.json").write_text(json.dumps(card | {"finetuning_lr": said}))
+    if wrong:
+      with pytest.raises(FileError, match="is not an agent's card: .*finetuning_lr"):
+        load()
+    else:
+      assert (rate(), rate(lr=None), rate(lr=2e-5)) == (own, said, 2e-5)
 
 
 @pytest.mark.parametrize("name", agents.shipped())

@@ -12,7 +12,16 @@ import jax.numpy as jnp
 
 from mjx_cl.adapt.arms import ARMS, Arm
 from mjx_cl.adapt.methods import calm, guarded, quiet, rollback, staged, world_model
-from mjx_cl.adapt.methods.base import PAPER, Acts, Method, Update, View, average, follow
+from mjx_cl.adapt.methods.base import (
+  PAPER,
+  Acts,
+  Method,
+  Settings,
+  Update,
+  View,
+  average,
+  follow,
+)
 from mjx_cl.adapt.settling import SIGNALS
 from mjx_cl.dreamer.agent import Agent, TrainState
 from mjx_cl.errors import PluginError, choose
@@ -23,6 +32,7 @@ __all__ = [
   "PAPER",
   "Acts",
   "Method",
+  "Settings",
   "Update",
   "View",
   "average",
@@ -41,6 +51,7 @@ METHODS: dict[str, Method] = {
   "staged": staged.METHOD,
   "calm": calm.METHOD,
   "quiet": quiet.METHOD,
+  "swift": quiet.SWIFT,
   "quiet-guarded": quiet.GUARDED,
   "still": quiet.STILL,
 }

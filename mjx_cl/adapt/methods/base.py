@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from mjx_cl.config import AdaptConfig
 from mjx_cl.dreamer.agent import Agent, TrainState
 from mjx_cl.dreamer.state import Record
 
@@ -84,6 +85,29 @@ def average(memory: Any, view: View) -> Acts:
 
 
 @dataclass(frozen=True)
+class Settings:
+  """What a method wants otherwise than AdaptConfig's default, see there; None: the run's. A value
+  that a run is given and that is not the default stands above it.
+
+  Attributes:
+    ratio: Replayed steps per record collected after the alarm.
+    start_windows: Windows that the replay must hold before the first update.
+    average: Rate per chunk of the moving average of the weights that acts.
+    regain: Share of the reward before the alarm that must be back before it may converge.
+    lr: Learning rate; without effect on an `update` of the method's own.
+  """
+
+  ratio: float | None = None
+  start_windows: int | None = None
+  average: float | None = None
+  regain: float | None = None
+  lr: float | None = None
+
+  def __post_init__(self) -> None:
+    AdaptConfig(**{k: v for k, v in vars(self).items() if v is not None})  # its ranges
+
+
+@dataclass(frozen=True)
 class Method:
   """How a stream learns and acts once an adaptation has begun; before, every stream acts by the
   agent that it came with. All functions are pure, of one stream, and traced by JAX.
@@ -101,6 +125,7 @@ class Method:
     copies: sets of parameters that the memory holds, for the memory that a run says it takes.
     weighs: `act` fills back, earned and earns.
     learns: updates are taken; False: none are, `act` alone does something.
+    settings: in which it differs from the defaults of AdaptConfig.
   """
 
   init: Callable[[Any], Any] = lambda params: ()
@@ -111,6 +136,7 @@ class Method:
   copies: int = 0
   weighs: bool = False
   learns: bool = True
+  settings: Settings = Settings()
 
 
 PAPER = Method()

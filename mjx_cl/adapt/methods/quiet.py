@@ -1,5 +1,5 @@
-"""Methods of the arms `quiet`, `quiet-guarded` and `still`: the robot does not explore from the
-alarm on.
+"""Methods of the arms `quiet`, `swift`, `quiet-guarded` and `still`: the robot does not explore
+from the alarm on.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from mjx_cl.adapt.methods import guarded
-from mjx_cl.adapt.methods.base import PAPER, Acts, Method, View
+from mjx_cl.adapt.methods.base import PAPER, Acts, Method, Settings, View
 from mjx_cl.adapt.trees import choose
 
 LOW = -20.0  # a head that says it has the least deviation, whatever the state
@@ -74,5 +74,8 @@ def quiet(method: Method) -> Method:
 
 
 METHOD = quiet(PAPER)
+SWIFT = dataclasses.replace(
+  quiet(PAPER), settings=Settings(start_windows=64, average=0.2, regain=0.9)
+)
 GUARDED = quiet(guarded.METHOD)
 STILL = quiet(Method(learns=False))

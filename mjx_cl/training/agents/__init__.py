@@ -17,7 +17,14 @@ import ml_dtypes
 import numpy as np
 
 from mjx_cl import envs
-from mjx_cl.config import MOST_REPEAT, DreamerConfig, field_kinds, kinds, recorded
+from mjx_cl.config import (
+  FINETUNING_LR,
+  MOST_REPEAT,
+  DreamerConfig,
+  field_kinds,
+  kinds,
+  recorded,
+)
 from mjx_cl.dreamer.agent import Agent, TrainState
 from mjx_cl.errors import FileError, UserError, require
 from mjx_cl.io import arrays, folders, tables
@@ -25,7 +32,12 @@ from mjx_cl.io import arrays, folders, tables
 HERE = pathlib.Path(__file__).parent
 _HALF = "|bfloat16"  # suffix of a moment that is stored as the upper half of its float32
 # what a card must hold besides `dreamer`; where it has no `repeat` that is 1
-CARD = {"env": "str", "repeat": "int", "updates": "int | None"}
+CARD = {
+  "env": "str",
+  "repeat": "int",
+  "updates": "int | None",
+  "finetuning_lr": "float | None",
+}
 
 
 class Trained(NamedTuple):
@@ -129,6 +141,8 @@ def read_card(folder: pathlib.Path) -> tuple[dict, DreamerConfig]:
     kinds(where, CARD, held)
     fits = 1 <= held["repeat"] <= MOST_REPEAT
     require(fits, f"repeat must lie in 1..{MOST_REPEAT}; got {held['repeat']}")
+    rate = held.get("finetuning_lr")
+    require(rate is None or 0 < rate < 1, f"finetuning_lr must lie between 0 and 1; got {rate}")
     require(isinstance(held["dreamer"], dict), "dreamer must be a table of settings")
     dreamer = recorded(DreamerConfig, held["dreamer"])
     field_kinds(where, DreamerConfig, dreamer, "dreamer.")
@@ -155,8 +169,9 @@ def load(
     act_size: variables of its action.
     agents_of: robot with the same observation, action and reward, whose agents fit too; None: that
       of the class registered under this name.
-    departures: fields of its DreamerConfig to go on with otherwise, e.g. lr; None: its own, of
-      policy_lr and model_lr 1.
+    departures: fields of its DreamerConfig to go on with otherwise, e.g. batch; None: its own, but
+      lr: the rate of its card for finetuning, else FINETUNING_LR. Not given: its own, of policy_lr
+      and model_lr 1.
 
   Raises:
     UserError: an agent of another robot or an unknown name.
@@ -176,6 +191,8 @@ def load(
   if card["env"] not in (env_name, related):
     raise UserError(f"agent {name!r} was trained on {card['env']!r}, not on {env_name!r}")
   # whatever goes on from here does so at full learning rate, whatever its last stage held still
+  if departures.get("lr", 0.0) is None:
+    departures["lr"] = card.get("finetuning_lr") or FINETUNING_LR
   other = {"warmup": 0, "policy_lr": 1.0, "model_lr": 1.0} | {
     k: v for k, v in departures.items() if v is not None
   }
