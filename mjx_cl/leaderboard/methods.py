@@ -7,7 +7,7 @@ import json
 import pathlib
 from typing import Any
 
-from mjx_cl.config import RunConfig
+from mjx_cl.config import FINETUNING_LR, AdaptConfig, RunConfig
 from mjx_cl.errors import FileError, UserError, choose, require
 from mjx_cl.io import folders, tables
 from mjx_cl.leaderboard import methods_page
@@ -97,9 +97,14 @@ def of_folder(folder: pathlib.Path | str, robots: tuple[str, ...] = ()) -> list[
 
 
 def settings(config: dict) -> str:
-  """What of a run's settings must be alike, as JSON."""
+  """What of a run's settings must be alike, as JSON. A setting of adaptation that the run is older
+  than has its default; a learning rate that is the agent's own is None.
+  """
   names = [f.name for f in dataclasses.fields(RunConfig) if f.name not in FREE]
-  return json.dumps({k: config.get(k) for k in names}, sort_keys=True)
+  adapt = dataclasses.asdict(AdaptConfig()) | (config.get("adapt") or {})
+  own = (config.get("agent_card") or {}).get("finetuning_lr") or FINETUNING_LR
+  adapt["lr"] = None if adapt["lr"] == own else adapt["lr"]
+  return json.dumps({k: config.get(k) for k in names} | {"adapt": adapt}, sort_keys=True)
 
 
 def _part(setting: str, config: dict, rows: list[dict]) -> list[dict]:
@@ -152,8 +157,10 @@ def joined(published: list[dict], own: list[dict], name: str | None = None) -> l
   there = {(life["robot"], life["setting"]): life for life in published}
   for life in own:
     other = there.get((life["robot"], life["setting"]))
-    if other is not None and life["settings"] != other["settings"]:
-      two = [json.loads(x["settings"]) for x in (life, other)]
+    if other is None:
+      continue
+    two = [json.loads(settings(json.loads(x["settings"]))) for x in (life, other)]
+    if two[0] != two[1]:
       raise UserError(
         f"setting {life['setting']} was run with another {', '.join(folders.differing(*two))} than "
         f"the published one: it takes suite {SUITE!r} as it ships"

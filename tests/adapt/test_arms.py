@@ -51,6 +51,7 @@ NAMES = (
   "staged",
   "calm",
   "quiet",
+  "swift",
   "quiet-guarded",
   "still",
   "none",
@@ -67,7 +68,17 @@ NAMES = (
 )
 
 
-LIKE = {"rollback", "guarded", "staged", "calm", "quiet", "quiet-guarded", "still", "world-model"}
+LIKE = {
+  "rollback",
+  "guarded",
+  "staged",
+  "calm",
+  "quiet",
+  "swift",
+  "quiet-guarded",
+  "still",
+  "world-model",
+}
 HEARD = LIKE | {"detector", "no-fault"}
 
 # ---- table ---------------------------------------------------------------------------------------
@@ -98,6 +109,7 @@ def test_choices_of_all_arms():
     "staged": [],
     "calm": [],
     "quiet": [],
+    "swift": [],
     "quiet-guarded": [],
     "still": [],
     "randomised": [],
@@ -389,6 +401,7 @@ def spans(story):
     "staged": heard,
     "calm": heard,
     "quiet": heard,
+    "swift": [(37, 2, 8, ABORT_BUDGET)],  # 90 % of the reward before do not come back
     "quiet-guarded": heard,
     "still": heard,
     "none": [],
@@ -421,7 +434,7 @@ def test_when_an_arm_starts_and_ends(story, name):
 def test_detectors_hear_the_same_until_they_are_refitted(story):
   fired = np.concatenate([d.fired for d in story.digests])
   for g, name in enumerate(NAMES):
-    end = [c for _, _, c, _ in spans(story)[name] if c is not None]
+    end = [c for _, _, c, how in spans(story)[name] if c is not None and how != ABORT_BUDGET]
     assert list(np.flatnonzero(fired[:, g])) == [
       a for a in ALARMS if not end or a < (end[0] + 1) * STEPS
     ], name

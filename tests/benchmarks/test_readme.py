@@ -91,24 +91,18 @@ def test_the_table_is_that_of_results():
     ]
     for row in rows
   )
-  agents = list((ROOT / "results/agents").glob("agent=*/runs.parquet"))
-  lived = [r for path in agents for r in parquet.read_table(path).to_pylist() if r["affected"]]
-  soon = lambda arm: sum(
-    r["recovery_step"] is not None and r["recovery_step"] - r["onset"] <= 10_000
-    for r in lived
-    if r["arm"] == arm
+  lives = parquet.read_table(ROOT / "results/agents_innovations/methods_lives.parquet").to_pylist()
+  lives = [x for x in lives if x["affected"]]
+  soon = lambda method: sum(
+    x["recovery_step"] is not None and x["recovery_step"] - x["onset"] <= 1e4
+    for x in lives
+    if x["method"] == method
   )
-  own = [r for r in lived if r["arm"] == "detector"]
-  heard = sum(r["latency_steps"] is not None and r["latency_steps"] <= 500 for r in own)
-  n = len(own)
-  lives = parquet.read_table(ROOT / "results/agents_quiet/methods_lives.parquet").to_pylist()
-  quiet = [x for x in lives if x["method"] == "quiet" and x["affected"]]
-  back = sum(
-    x["recovery_step"] is not None and x["recovery_step"] - x["onset"] <= 1e4 for x in quiet
-  )
-  assert len(quiet) == n
-  assert walker == [heard, n, 500, soon("detector"), n, 10_000, back, n, soon("none"), n]
-  assert rows[0][4] == f"20 seeds of each of {len(agents)} agents, {n} affected"
+  own = [x for x in lives if x["method"] == "swift"]
+  heard = sum(x["latency_steps"] is not None and x["latency_steps"] <= 500 for x in own)
+  n, seeds = len(own), len({x["seed"] for x in lives})
+  assert walker == [heard, n, 500, soon("swift"), n, 10_000, soon("none"), n]
+  assert rows[0][4] == f"{seeds} seeds of each of {len({x['agent'] for x in own})} agents"
   n, noticed, latency, back, without = counts("paper/car")
   assert car == [noticed, 10, latency, back, n, without, n]
   n, noticed, latency, back, _ = counts("paper/car", 1)
