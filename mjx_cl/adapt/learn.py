@@ -151,9 +151,9 @@ def learn(
       key_sample, key_update = jax.random.split(jax.random.fold_in(keys[g], i))
       replay, data, address = replay_lib.sample(replay, key_sample, c.batch, c.length + 1, only=g)
       own = tuple(take(kept, g) for kept in memory)
-      weights = Weights()
+      weights: tuple[Weights, ...] = ()  # None: 1
       if lr is not None:
-        weights = Weights(lr=jnp.where(jnp.isnan(lr[g]), 1.0, lr[g] / c.lr))
+        weights = (Weights(lr=jnp.where(jnp.isnan(lr[g]), 1.0, lr[g] / c.lr)),)
       learnt, latents, bad = _update(
         agent, methods, which[g], own, take(train, g), data, key_update, weights
       )
@@ -182,13 +182,13 @@ def _update(
   before: TrainState,
   data: Record,
   key: jax.Array,
-  weights: Weights,
+  weights: tuple[Weights, ...],
 ) -> tuple[TrainState, tuple[jax.Array, jax.Array], jax.Array]:
   """One update of one stream by method `which` (): (state', latents, what is at fault)."""
 
   def by(method: Method | None, own: Any) -> tuple[TrainState, Any, jax.Array]:
     if method is None or method.update is None:
-      learnt, metrics, latents = agent.update(before, data, key, weights)
+      learnt, metrics, latents = agent.update(before, data, key, *weights)
     else:
       learnt, metrics, latents = method.update(agent, own, before, data, key)
     return learnt, latents, culprit(metrics)

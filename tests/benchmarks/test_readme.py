@@ -92,7 +92,7 @@ def test_the_table_is_that_of_results():
     for row in rows
   )
   lives = parquet.read_table(ROOT / "results/agents_innovations/methods_lives.parquet").to_pylist()
-  lives = [x for x in lives if x["affected"]]
+  seeds, lives = len({x["seed"] for x in lives}), [x for x in lives if x["affected"]]
   soon = lambda method: sum(
     x["recovery_step"] is not None and x["recovery_step"] - x["onset"] <= 1e4
     for x in lives
@@ -100,7 +100,7 @@ def test_the_table_is_that_of_results():
   )
   own = [x for x in lives if x["method"] == "swift"]
   heard = sum(x["latency_steps"] is not None and x["latency_steps"] <= 500 for x in own)
-  n, seeds = len(own), len({x["seed"] for x in lives})
+  n = len(own)
   assert walker == [heard, n, 500, soon("swift"), n, 10_000, soon("none"), n]
   assert rows[0][4] == f"{seeds} seeds of each of {len({x['agent'] for x in own})} agents"
   n, noticed, latency, back, without = counts("paper/car")

@@ -14,6 +14,7 @@ from test_transfer import agent, saved  # noqa: F401  fixtures: a tiny agent of 
 
 from mjx_cl.cli import app
 from mjx_cl.cli import methods as methods_cli
+from mjx_cl.config import RunConfig
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.leaderboard import methods, methods_page
 from mjx_cl.runs import bench, suite
@@ -225,7 +226,8 @@ def test_lives_that_ship_are_of_the_suite_that_ships():
   for x in lives:
     config = parts[x["setting"]]
     assert x["robot"] == config.env and x["seed"] < config.seeds
-    assert x["settings"] == methods.settings(dataclasses.asdict(config)), x["setting"]
+    lived = methods.settings(json.loads(x["settings"]))  # settings that came since: their defaults
+    assert lived == methods.settings(dataclasses.asdict(config)), x["setting"]
     assert np.isfinite([x["return_lost"], x["reward_pre"]]).all()
   methods.whole(lives)
 
@@ -270,3 +272,15 @@ def test_the_page_shows_every_method_and_every_life(browser, tmp_path):  # noqa:
   width = "return [document.documentElement.scrollWidth, window.innerWidth]"
   needs, has = browser.driver.execute_script(width)
   assert needs <= has
+
+
+def test_settings_of_a_run_are_alike_whenever_it_was_lived():
+  """What the run is older than has its default; a rate that is the agent's own is none."""
+  now = dataclasses.asdict(RunConfig("walker"))
+  adapt = {k: v for k, v in now["adapt"].items() if k != "regain"}
+  then = now | {"adapt": adapt | {"lr": 1e-4}}
+  assert methods.settings(now) == methods.settings(then)
+  other = now | {"adapt": now["adapt"] | {"lr": 3e-5}}
+  assert methods.settings(now) != methods.settings(other)
+  assert methods.settings(now) == methods.settings(other | {"agent_card": {"finetuning_lr": 3e-5}})
+  assert methods.settings(now) != methods.settings(now | {"adapt": adapt | {"regain": 0.9}})
