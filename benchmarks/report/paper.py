@@ -323,8 +323,8 @@ def setup(experiment: Experiment, config: dict) -> list[str]:
     **dataclasses.asdict(author),
     **card["dreamer"],
   }  # a card older than a setting has its default
-  if "lr" in adapt and adapt["lr"] is None:
-    dreamer["lr"] = card.get("finetuning_lr") or FINETUNING_LR
+  if "lr" in adapt and adapt["lr"] in (None, FINETUNING_LR):  # gives way to the card's
+    adapt = adapt | {"lr": card.get("finetuning_lr") or FINETUNING_LR}
   own = lambda name: adapt[name] if adapt.get(name) is not None else dreamer[name]
   pairs = [
     (card["dreamer"]["size"], author.size, "{} in place of {}"),

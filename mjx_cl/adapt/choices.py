@@ -66,7 +66,7 @@ def settings(own: Sequence[methods.Method], config: AdaptConfig) -> dict[str, ja
     wanted = [getattr(method.settings, name) for method in own]
     run = getattr(config, name)
     if run == getattr(AdaptConfig, name) and any(x is not None for x in wanted):
-      other = np.nan if run is None else run
+      other = np.nan if name == "lr" else run
       values[name] = jnp.asarray([other if x is None else x for x in wanted], jnp.float32)
   return values
 

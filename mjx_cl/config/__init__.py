@@ -67,7 +67,8 @@ class AdaptConfig:
   Attributes:
     ratio: Replayed steps per record collected after the alarm.
     start_windows: Windows that the replay must hold before the first update.
-    lr: Learning rate while adapting; None: that of the agent's card (`finetuning_lr`), else 1e-4.
+    lr: Learning rate while adapting; the default, or None, gives way to that of the agent's card
+      (`finetuning_lr`) where it names one.
     policy_lr: Factor on the policy's steps while adapting; None: 1.
     anchor: Weight while adapting of the actions that the robot itself took; None: the agent's own.
     batch: Sequences of one update while adapting; fewer mean more updates at the same ratio. None:
@@ -100,7 +101,7 @@ class AdaptConfig:
 
   ratio: float = 16.0
   start_windows: int = 1024
-  lr: float | None = None
+  lr: float | None = FINETUNING_LR
   policy_lr: float | None = None
   anchor: float | None = None
   batch: int | None = 4
