@@ -768,10 +768,9 @@ def test_publishing_a_part_keeps_the_others(mjx, refused, tmp_path):  # noqa: F8
     "recovery.png",
     "ratio.png",
   }
-  assert (
-    json.loads((to / "suite.json").read_text())["parts"][gone]
-    == json.loads(before["suite.json"])["parts"][gone]
-  )
+  held = json.loads(before["suite.json"])["parts"][gone]
+  held["adapt"] = dataclasses.asdict(AdaptConfig()) | held["adapt"]  # it is older than some
+  assert json.loads((to / "suite.json").read_text())["parts"][gone] == held
   assert (
     "holds suite 'full', not 'quick'"
     in refused(2, "bench", "quick", "--out", tmp_path / "q", "--publish", to)
