@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mjx_cl.config import FINETUNING_LR, DreamerConfig
+from mjx_cl.config import DreamerConfig, finetuning_lr
 from mjx_cl.errors import FileError
 from mjx_cl.scoring import intervals
 
@@ -323,8 +323,7 @@ def setup(experiment: Experiment, config: dict) -> list[str]:
     **dataclasses.asdict(author),
     **card["dreamer"],
   }  # a card older than a setting has its default
-  if "lr" in adapt and adapt["lr"] in (None, FINETUNING_LR):  # gives way to the card's
-    adapt = adapt | {"lr": card.get("finetuning_lr") or FINETUNING_LR}
+  adapt = adapt | {"lr": finetuning_lr(adapt.get("lr"), card)}
   own = lambda name: adapt[name] if adapt.get(name) is not None else dreamer[name]
   pairs = [
     (card["dreamer"]["size"], author.size, "{} in place of {}"),

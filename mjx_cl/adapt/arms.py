@@ -191,8 +191,8 @@ _SHIPPED: dict[str, Arm] = {
     method="quiet",
   ),
   "swift": Arm(
-    "as quiet, but learning begins after some 130 decisions in place of 1,090, what acts follows "
-    "twice as fast, and it ends only where 90 % of the reward before is back",
+    "as quiet, but it learns from some 130 decisions after the alarm on, in place of 1,090, and "
+    "until 90 % of the reward before is back",
     ALARM,
     RULE,
     method="swift",

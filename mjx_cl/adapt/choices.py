@@ -59,15 +59,14 @@ class Choices(NamedTuple):
 
 def settings(own: Sequence[methods.Method], config: AdaptConfig) -> dict[str, jax.Array]:
   """`Choices.settings` of streams with these methods: a method's own value where the run's is the
-  default, else the run's; nan: the agent's.
+  default, else the run's.
   """
   values = {}
   for name in (f.name for f in fields(methods.Settings)):
     wanted = [getattr(method.settings, name) for method in own]
     run = getattr(config, name)
     if run == getattr(AdaptConfig, name) and any(x is not None for x in wanted):
-      other = np.nan if name == "lr" else run
-      values[name] = jnp.asarray([other if x is None else x for x in wanted], jnp.float32)
+      values[name] = jnp.asarray([run if x is None else x for x in wanted], jnp.float32)
   return values
 
 

@@ -15,7 +15,7 @@ from mjx_cl.adapt.trees import choose, put, take
 from mjx_cl.dreamer import replay as replay_lib
 from mjx_cl.dreamer.agent import Agent, TrainState, culprit
 from mjx_cl.dreamer.replay import Replay
-from mjx_cl.dreamer.state import Record, Weights
+from mjx_cl.dreamer.state import Record
 from mjx_cl.keys import OfAdaptation
 from mjx_cl.rollout.scan import Row, records
 
@@ -51,8 +51,8 @@ def owing(
   start_windows: jax.Array | float,
 ) -> jax.Array:
   """Updates that are due after a chunk of `rows`, float32 (groups,): `ratio` replayed records a
-  row, while an adaptation runs whose replay holds `start_windows`; what is left of `owed` counts
-  on. ratio, start_windows: () or (groups,).
+  row, while an adaptation runs whose replay holds `start_windows`, () or (groups,); what is left of
+  `owed` counts on.
   """
   c = agent.config
   windows = jax.vmap(lambda r: replay_lib.windows(r, c.length + 1))(replay)
@@ -115,7 +115,6 @@ def learn(
   methods: tuple[Method, ...],
   which: jax.Array,
   memory: tuple[Any, ...],
-  lr: jax.Array | None = None,
 ) -> tuple[TrainState, Replay, jax.Array]:
   """`number` (groups,) updates for each stream. Nested loops with their own trip counts: the
   carry is changed in place, so a stream without an update costs neither arithmetic nor a copy
@@ -132,7 +131,6 @@ def learn(
     methods: of the run.
     which: int32 (groups,), which of them is the stream's.
     memory: of each method, leading (groups,).
-    lr: float32 (groups,), learning rates; nan, or None: the agent's.
 
   Returns:
     (train', replay', int32 (groups,): what was at fault, see agent.culprit).
@@ -151,11 +149,8 @@ def learn(
       key_sample, key_update = jax.random.split(jax.random.fold_in(keys[g], i))
       replay, data, address = replay_lib.sample(replay, key_sample, c.batch, c.length + 1, only=g)
       own = tuple(take(kept, g) for kept in memory)
-      weights: tuple[Weights, ...] = ()  # None: 1
-      if lr is not None:
-        weights = (Weights(lr=jnp.where(jnp.isnan(lr[g]), 1.0, lr[g] / c.lr)),)
       learnt, latents, bad = _update(
-        agent, methods, which[g], own, take(train, g), data, key_update, weights
+        agent, methods, which[g], own, take(train, g), data, key_update
       )
       replay = replay_lib.refresh(replay, address, latents)
       return i + 1, put(train, g, learnt), replay, bad
@@ -182,13 +177,12 @@ def _update(
   before: TrainState,
   data: Record,
   key: jax.Array,
-  weights: tuple[Weights, ...],
 ) -> tuple[TrainState, tuple[jax.Array, jax.Array], jax.Array]:
   """One update of one stream by method `which` (): (state', latents, what is at fault)."""
 
   def by(method: Method | None, own: Any) -> tuple[TrainState, Any, jax.Array]:
     if method is None or method.update is None:
-      learnt, metrics, latents = agent.update(before, data, key, *weights)
+      learnt, metrics, latents = agent.update(before, data, key)
     else:
       learnt, metrics, latents = method.update(agent, own, before, data, key)
     return learnt, latents, culprit(metrics)

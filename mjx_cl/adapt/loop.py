@@ -305,15 +305,15 @@ class Loop:
 
     replay = learn.fill(state.replay, rows, begins, begin.row, was == decide.ADAPTING)
     length, adapting = rows.reward.shape[0], phase.phase == decide.ADAPTING
-    pace = setting("ratio"), setting("start_windows")
-    owed = learn.owing(agent, replay, adapting, state.owed, length, *pace)
+    enough = setting("start_windows")
+    owed = learn.owing(agent, replay, adapting, state.owed, length, config.ratio, enough)
     if not all(method.learns for method in own):
       owed = jnp.where(jnp.array([m.learns for m in own])[choices.method], owed, 0.0)
     number = jnp.floor(owed + 1e-6).astype(jnp.int32)
     train, acting = learn.begin(agent, state, keys, begins, choices.fresh, config.fresh_moments)
-    counted, lr = train.updates, choices.settings.get("lr")
+    counted = train.updates
     train, replay, failed = learn.learn(
-      agent, train, replay, draws, number, own, choices.method, state.memory, lr
+      agent, train, replay, draws, number, own, choices.method, state.memory
     )
     taken = train.updates - counted
     phase, decision = decide.give_up(phase, decision, was, failed, seen.signals)

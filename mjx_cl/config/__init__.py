@@ -38,7 +38,7 @@ from mjx_cl.errors import require
 # decisions between two rounds of updates, of a training as of a run, where the stop rule looks as
 # often
 CHUNK = 64
-FINETUNING_LR = 1e-4  # of an agent whose card names none
+FINETUNING_LR = 1e-4  # of agents whose card names none
 # settings by name; on the command line --set name=value ...
 Settings = Annotated[
   dict,
@@ -60,6 +60,11 @@ def named(fault: str) -> bool:
   return "/" in fault and ":" not in fault
 
 
+def finetuning_lr(lr: float | None, card: dict) -> float | None:
+  """`lr`, of which the default gives way to `finetuning_lr` of an agent's card."""
+  return card.get("finetuning_lr") or lr if lr == FINETUNING_LR else lr
+
+
 @dataclass(frozen=True)
 class AdaptConfig:
   """When adaptation starts, how it runs and when it ends.
@@ -67,8 +72,8 @@ class AdaptConfig:
   Attributes:
     ratio: Replayed steps per record collected after the alarm.
     start_windows: Windows that the replay must hold before the first update.
-    lr: Learning rate while adapting; the default, or None, gives way to that of the agent's card
-      (`finetuning_lr`) where it names one.
+    lr: Learning rate while adapting; the default gives way to `finetuning_lr` of the agent's card,
+      where it names one; None: that of the agent's training.
     policy_lr: Factor on the policy's steps while adapting; None: 1.
     anchor: Weight while adapting of the actions that the robot itself took; None: the agent's own.
     batch: Sequences of one update while adapting; fewer mean more updates at the same ratio. None:

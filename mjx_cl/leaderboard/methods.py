@@ -7,7 +7,7 @@ import json
 import pathlib
 from typing import Any
 
-from mjx_cl.config import FINETUNING_LR, AdaptConfig, RunConfig
+from mjx_cl.config import AdaptConfig, RunConfig
 from mjx_cl.errors import FileError, UserError, choose, require
 from mjx_cl.io import folders, tables
 from mjx_cl.leaderboard import methods_page
@@ -98,12 +98,10 @@ def of_folder(folder: pathlib.Path | str, robots: tuple[str, ...] = ()) -> list[
 
 def settings(config: dict) -> str:
   """What of a run's settings must be alike, as JSON. A setting of adaptation that the run is older
-  than has its default; a learning rate that is the agent's own is None.
+  than has its default.
   """
   names = [f.name for f in dataclasses.fields(RunConfig) if f.name not in FREE]
   adapt = dataclasses.asdict(AdaptConfig()) | (config.get("adapt") or {})
-  own = (config.get("agent_card") or {}).get("finetuning_lr") or FINETUNING_LR
-  adapt["lr"] = None if adapt["lr"] == own else adapt["lr"]
   return json.dumps({k: config.get(k) for k in names} | {"adapt": adapt}, sort_keys=True)
 
 

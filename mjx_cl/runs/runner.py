@@ -18,7 +18,7 @@ from mjx_cl.adapt import methods
 from mjx_cl.adapt.arms import ARMS, FOREVER, never_stops
 from mjx_cl.adapt.loop import Choices, Digest, Programs, choices
 from mjx_cl.adapt.state import cut
-from mjx_cl.config import CHUNK, AdaptConfig, RunConfig
+from mjx_cl.config import CHUNK, RunConfig
 from mjx_cl.dreamer.agent import CAUSES, EXPLODED
 from mjx_cl.errors import FileError
 from mjx_cl.faults.presets import becomes, changes
@@ -100,8 +100,6 @@ class Runner:
     self.robots = [self.env] if self.other is None else [self.env, self.other]
     adapt = ("lr", "policy_lr", "anchor", "last_starts", "batch")
     departures = {name: getattr(config.adapt, name) for name in adapt}
-    if departures["lr"] == AdaptConfig.lr:
-      departures["lr"] = None  # the card's, where it names one
     self.trained = agents.of(self.env, config.agent, **departures)
     self.repeat = self.trained.repeat
     self.others = arm_agents(config, self.env)

@@ -68,17 +68,7 @@ NAMES = (
 )
 
 
-LIKE = {
-  "rollback",
-  "guarded",
-  "staged",
-  "calm",
-  "quiet",
-  "swift",
-  "quiet-guarded",
-  "still",
-  "world-model",
-}
+LIKE = {*NAMES[1 : NAMES.index("none")], "world-model"}
 HEARD = LIKE | {"detector", "no-fault"}
 
 # ---- table ---------------------------------------------------------------------------------------

@@ -92,17 +92,25 @@ def test_the_table_is_that_of_results():
     for row in rows
   )
   lives = parquet.read_table(ROOT / "results/agents_innovations/methods_lives.parquet").to_pylist()
-  seeds, lives = len({x["seed"] for x in lives}), [x for x in lives if x["affected"]]
-  soon = lambda method: sum(
-    x["recovery_step"] is not None and x["recovery_step"] - x["onset"] <= 1e4
-    for x in lives
-    if x["method"] == method
+  own = [x for x in lives if x["method"] == "swift" and x["affected"]]
+  still = [x for x in lives if x["method"] == "none" and x["affected"]]
+  theirs = [
+    r
+    for path in (ROOT / "results/agents").glob("agent=*/runs.parquet")
+    for r in parquet.read_table(path).to_pylist()
+    if r["arm"] == "detector"
+  ]
+  paper = [r for r in theirs if r["affected"]]
+  soon = lambda lived: sum(
+    r["recovery_step"] is not None and r["recovery_step"] - r["onset"] <= 10_000 for r in lived
   )
-  own = [x for x in lives if x["method"] == "swift"]
+  seeds = lambda lived: len({r["seed"] for r in lived})
   heard = sum(x["latency_steps"] is not None and x["latency_steps"] <= 500 for x in own)
   n = len(own)
-  assert walker == [heard, n, 500, soon("swift"), n, 10_000, soon("none"), n]
-  assert rows[0][4] == f"{seeds} seeds of each of {len({x['agent'] for x in own})} agents"
+  back = [soon(own), n, 10_000, soon(paper), len(paper)]
+  assert walker == [heard, n, 500, *back, soon(still), n]
+  many = f"{seeds(lives)} or {seeds(theirs)} seeds of each of {len({x['agent'] for x in own})}"
+  assert rows[0][4] == f"{many} agents"
   n, noticed, latency, back, without = counts("paper/car")
   assert car == [noticed, 10, latency, back, n, without, n]
   n, noticed, latency, back, _ = counts("paper/car", 1)

@@ -1065,12 +1065,11 @@ def test_what_differs_from_the_papers_setup():
   ]
   same = json.loads(json.dumps(CONFIG)) | {"detector": "rolling_sigma_plain", "onset": 9000}
   same["adapt"] |= {"batch": None, "lr": None, "average": 1.0, "least": 1}
-  same["agent_card"] = {"finetuning_lr": 4e-5, "dreamer": {"size": "size12m", "batch": 16}}
+  same["agent_card"] = {"dreamer": {"size": "size12m", "batch": 16, "lr": 4e-5}}
   assert paper.setup(dog, same) == ["MuJoCo in place of Isaac Lab"]
   assert paper.setup(walker, same) == ["onset 9,000 in place of 5,000"]
-  same["agent_card"] = {"dreamer": same["agent_card"]["dreamer"]}
-  assert paper.setup(walker, same)[0] == "learning rate 0.0001 in place of 4e-05"
-  same["agent_card"] |= {"finetuning_lr": 4e-5}
+  slower = CONFIG | {"agent_card": CONFIG["agent_card"] | {"finetuning_lr": 3e-5}}
+  assert paper.setup(walker, slower)[2] == "learning rate 3e-05 in place of 4e-05"
   same["agent_card"]["dreamer"] |= {"horizon": 33, "policy_lr": 0.5}
   assert paper.setup(dog, same) == [
     "the policy's own steps 0.5 times as long",

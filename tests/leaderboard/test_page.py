@@ -409,7 +409,7 @@ class Browser:
     self.driver = driver
 
   def open(self, file, hash=""):
-    """Loads the file anew at a hash. A busy machine's driver can answer before the page is there."""
+    """Loads the file anew at a hash; a busy machine's driver can answer before it is there."""
     from selenium.webdriver.support.wait import WebDriverWait
 
     self.driver.get("about:blank")

@@ -891,12 +891,14 @@ def test_load_overrides_how_it_goes_on(saved):
 
 
 def test_an_agent_is_finetuned_at_the_rate_of_its_card(saved, tmp_path):
-  """Where a run names none: the card's, else 1e-4; what loads an agent otherwise keeps its own."""
+  """The default gives way to the card's; None, and what does not finetune, keep the agent's own."""
   shutil.copytree(saved, tmp_path / "agent")
   load = lambda **given: agents.load(str(tmp_path / "agent"), "walker", 24, 6, **given)
   rate = lambda **given: load(**given).agent.config.lr
   own = json.loads((saved / "card.json").read_text())["dreamer"]["lr"]
-  assert (rate(), rate(lr=None), rate(lr=2e-5)) == (own, 1e-4, 2e-5)
+  assert own != AdaptConfig.lr == 1e-4
+  rates = lambda: (rate(), rate(lr=None), rate(lr=AdaptConfig.lr), rate(lr=2e-5))
+  assert rates() == (own, own, 1e-4, 2e-5)
   card = json.loads((saved / "card.json").read_text())
   for said, wrong in ((3e-5, False), (0.0, True), ("slow", True), (-1.0, True)):
     (tmp_path / "agent/card.json").write_text(json.dumps(card | {"finetuning_lr": said}))
@@ -904,7 +906,7 @@ def test_an_agent_is_finetuned_at_the_rate_of_its_card(saved, tmp_path):
       with pytest.raises(FileError, match="is not an agent's card: .*finetuning_lr"):
         load()
     else:
-      assert (rate(), rate(lr=None), rate(lr=2e-5)) == (own, said, 2e-5)
+      assert rates() == (own, own, said, 2e-5)
 
 
 @pytest.mark.parametrize("name", agents.shipped())

@@ -90,18 +90,14 @@ class Settings:
   that a run is given and that is not the default stands above it.
 
   Attributes:
-    ratio: Replayed steps per record collected after the alarm.
     start_windows: Windows that the replay must hold before the first update.
     average: Rate per chunk of the moving average of the weights that acts.
     regain: Share of the reward before the alarm that must be back before it may converge.
-    lr: Learning rate; without effect on an `update` of the method's own.
   """
 
-  ratio: float | None = None
   start_windows: int | None = None
   average: float | None = None
   regain: float | None = None
-  lr: float | None = None
 
   def __post_init__(self) -> None:
     AdaptConfig(**{k: v for k, v in vars(self).items() if v is not None})  # its ranges

@@ -18,10 +18,10 @@ import numpy as np
 
 from mjx_cl import envs
 from mjx_cl.config import (
-  FINETUNING_LR,
   MOST_REPEAT,
   DreamerConfig,
   field_kinds,
+  finetuning_lr,
   kinds,
   recorded,
 )
@@ -169,9 +169,8 @@ def load(
     act_size: variables of its action.
     agents_of: robot with the same observation, action and reward, whose agents fit too; None: that
       of the class registered under this name.
-    departures: fields of its DreamerConfig to go on with otherwise, e.g. batch; None: its own, but
-      lr: the rate of its card for finetuning, else FINETUNING_LR. Not given: its own, of policy_lr
-      and model_lr 1.
+    departures: fields of its DreamerConfig to go on with otherwise, e.g. lr, see
+      config.finetuning_lr; None: its own, of policy_lr and model_lr 1.
 
   Raises:
     UserError: an agent of another robot or an unknown name.
@@ -191,8 +190,7 @@ def load(
   if card["env"] not in (env_name, related):
     raise UserError(f"agent {name!r} was trained on {card['env']!r}, not on {env_name!r}")
   # whatever goes on from here does so at full learning rate, whatever its last stage held still
-  if departures.get("lr", 0.0) is None:
-    departures["lr"] = card.get("finetuning_lr") or FINETUNING_LR
+  departures |= {"lr": finetuning_lr(departures.get("lr"), card)}
   other = {"warmup": 0, "policy_lr": 1.0, "model_lr": 1.0} | {
     k: v for k, v in departures.items() if v is not None
   }
