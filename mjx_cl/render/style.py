@@ -20,6 +20,7 @@ ARMS = {
   "staged": "#a6761d",
   "calm": "#1b9e9e",
   "quiet": "#e7298a",
+  "swift": "#6b8e23",
   "quiet-guarded": "#8c1c5a",
   "still": "#c9a9bb",
   "always": ORANGE,
