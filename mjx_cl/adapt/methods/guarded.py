@@ -12,15 +12,19 @@ from mjx_cl.adapt.phases import ADAPTING
 from mjx_cl.adapt.trees import choose
 
 TURN, SKIP, KEPT = 4, 1, 12  # chunks of a turn, of its first that do not count, of those that do
+FEW = 4  # chunks of each side from which on a difference may be clear
+OFTEN, RARE = 4, 16  # one of so many turns is the other side's; RARE: the learner clearly leads
 
 
 class Guard(NamedTuple):
   """Two sets of weights that act by turns while an adaptation runs.
 
-  From the first update on, turns of TURN chunks: in three of four acts the side that earns more, in
-  the fourth the other. A side's worth is its mean reward over its last KEPT chunks, the first SKIP
-  of each turn left out, since the robot comes to them from the other's hands; until both have KEPT
-  of them the learner's leads. What acts is what predicts. When the adaptation ends, however it
+  From the first update on, turns of TURN chunks: one side leads, in every fourth turn acts the
+  other. A side's worth is its mean reward over its last KEPT chunks, the first SKIP of each turn
+  left out, since the robot comes to them from the other's hands. The learner's leads, unless the
+  old clearly earn more: by two standard errors of the difference of both means (Welch's), of FEW
+  chunks each at least. Where the learner's clearly earn more the old act in every sixteenth turn
+  alone. What acts is what predicts. When the adaptation ends, however it
   does, the side that earned more stays, the learner's where they are equal or nothing is known.
   The idea is that of high confidence policy improvement (Thomas, Theocharous and Ghavamzadeh 2015,
   https://proceedings.mlr.press/v37/thomas15.html), here with means in place of bounds.
@@ -68,11 +72,14 @@ def act(guard: Guard, view: View) -> Acts:
   number = guard.counts.at[side].add(counts.astype(jnp.int32))
   earned, earns = jnp.nanmean(rewards, 1)
   worse = earns < earned  # False where either is unknown
+  spread = jnp.nanvar(rewards, 1) / jnp.maximum(jnp.minimum(number, KEPT) - 1, 1)  # of a mean
+  clear = jnp.all(number >= FEW) & ((earns - earned) ** 2 > 4 * spread.sum())
   back = view.over & guard.learnt & worse
   age = jnp.where(guard.learnt, guard.age + 1, 0)
   learnt = (guard.learnt | (view.taken > 0)) & ~view.begins & ~view.over
-  leads = jnp.all(number >= KEPT) & worse  # `old` does
-  other = (age // TURN) % 4 == 3
+  leads = clear & worse  # `old` does
+  period = jnp.where(clear & ~worse, RARE, OFTEN)
+  other = (age // TURN) % period == period - 1
   acts = learnt & jnp.where(other, ~leads, leads)
   old = choose(view.begins, new, guard.old)
   after = Guard(
