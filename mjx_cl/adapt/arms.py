@@ -198,6 +198,7 @@ _SHIPPED: dict[str, Arm] = {
     method="swift",
   ),
   "quiet-guarded": Arm("as guarded, and as quiet", ALARM, RULE, method="quiet-guarded"),
+  "swift-guarded": Arm("as guarded, and as swift", ALARM, RULE, method="swift-guarded"),
   "still": Arm(
     "from the alarm on the robot does not explore, and learns nothing: quiet without learning",
     ALARM,

@@ -22,6 +22,7 @@ ARMS = {
   "quiet": "#e7298a",
   "swift": "#6b8e23",
   "quiet-guarded": "#8c1c5a",
+  "swift-guarded": "#33470f",
   "still": "#c9a9bb",
   "always": ORANGE,
   "world-model": "#E69F00",

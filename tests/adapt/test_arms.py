@@ -53,6 +53,7 @@ NAMES = (
   "quiet",
   "swift",
   "quiet-guarded",
+  "swift-guarded",
   "still",
   "none",
   "always",
@@ -101,6 +102,7 @@ def test_choices_of_all_arms():
     "quiet": [],
     "swift": [],
     "quiet-guarded": [],
+    "swift-guarded": [],
     "still": [],
     "randomised": [],
     "no-fault": [],
@@ -393,6 +395,7 @@ def spans(story):
     "quiet": heard,
     "swift": [(37, 2, 8, ABORT_BUDGET)],  # 90 % of the reward before do not come back
     "quiet-guarded": heard,
+    "swift-guarded": [(37, 2, 8, ABORT_BUDGET)],
     "still": heard,
     "none": [],
     "always": [(20, 1, None, None)],

@@ -53,6 +53,7 @@ METHODS: dict[str, Method] = {
   "quiet": quiet.METHOD,
   "swift": quiet.SWIFT,
   "quiet-guarded": quiet.GUARDED,
+  "swift-guarded": quiet.SWIFT_GUARDED,
   "still": quiet.STILL,
 }
 

@@ -1,5 +1,5 @@
-"""Methods of the arms `quiet`, `swift`, `quiet-guarded` and `still`: the robot does not explore
-from the alarm on.
+"""Methods of the arms `quiet`, `swift`, `quiet-guarded`, `swift-guarded` and `still`: the robot
+does not explore from the alarm on.
 """
 
 from __future__ import annotations
@@ -74,8 +74,8 @@ def quiet(method: Method) -> Method:
 
 
 METHOD = quiet(PAPER)
-SWIFT = dataclasses.replace(
-  quiet(PAPER), settings=Settings(start_windows=64, average=0.2, regain=0.9)
-)
 GUARDED = quiet(guarded.METHOD)
+SOON = Settings(start_windows=64, average=0.2, regain=0.9)
+SWIFT = dataclasses.replace(quiet(PAPER), settings=SOON)
+SWIFT_GUARDED = dataclasses.replace(quiet(guarded.METHOD), settings=SOON)
 STILL = quiet(Method(learns=False))
