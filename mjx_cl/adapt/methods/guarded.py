@@ -11,23 +11,29 @@ from mjx_cl.adapt.methods.base import Acts, Method, View, follow
 from mjx_cl.adapt.phases import ADAPTING
 from mjx_cl.adapt.trees import choose
 
-TURN, SKIP, KEPT = 4, 1, 12  # chunks of a turn, of its first that do not count, of those that do
+TURN, SKIP = 4, 1  # chunks of a turn, and of its first that do not count
+KEPT = 12, 6  # chunks that count, of the old weights, which stay, and of the new, which change
 FEW = 4  # chunks of each side from which on a difference may be clear
-OFTEN, RARE = 4, 16  # one of so many turns is the other side's; RARE: the learner clearly leads
 
 
 class Guard(NamedTuple):
   """Two sets of weights that act by turns while an adaptation runs.
 
-  From the first update on, turns of TURN chunks: one side leads, in every fourth turn acts the
-  other. A side's worth is its mean reward over its last KEPT chunks, the first SKIP of each turn
-  left out, since the robot comes to them from the other's hands. The learner's leads, unless the
-  old clearly earn more: by two standard errors of the difference of both means (Welch's), of FEW
-  chunks each at least. Where the learner's clearly earn more the old act in every sixteenth turn
-  alone. What acts is what predicts. When the adaptation ends, however it
-  does, the side that earned more stays, the learner's where they are equal or nothing is known.
-  The idea is that of high confidence policy improvement (Thomas, Theocharous and Ghavamzadeh 2015,
-  https://proceedings.mlr.press/v37/thomas15.html), here with means in place of bounds.
+  From the first update on, turns of TURN chunks. One side leads, and of every `period` turns one is
+  the other's. A side's worth is its mean reward over its last KEPT chunks, the first SKIP of each
+  turn left out, since the robot comes to them from the other's hands. The learner's leads, unless
+  the old clearly earn more: by two standard errors of the difference of the means (Welch's), of
+  FEW chunks each at least.
+
+    period  =  2    while a side has fewer chunks
+               4    where nothing is clear
+               16   where the learner's clearly earn more
+               4, 8, then 16   where the old do, the longer the more often in a row they did
+
+  What acts is what predicts. When the adaptation ends, however it does, the side that earned more
+  stays, the learner's where they are equal or nothing is known. The idea is that of high confidence
+  policy improvement (Thomas, Theocharous and Ghavamzadeh 2015,
+  https://proceedings.mlr.press/v37/thomas15.html), here by turns and without its bounds.
 
   Attributes:
     old: the parameters that acted when the adaptation began.
@@ -35,8 +41,11 @@ class Guard(NamedTuple):
     learnt: bool (), an update has been taken since.
     age: int32 (), chunks since the first update.
     acts: bool (), `old` acts in the chunk to come.
-    rewards: float32 (2, KEPT), rewards a step of the last chunks that count, of `old` and of `new`;
-      nan where there are none yet.
+    other: bool (), it is the turn of the side that does not lead.
+    waits: int32 (), turns since such a turn.
+    losses: int32 (), turns of the learner's in a row after which the old clearly earned more.
+    rewards: float32 (2, KEPT[0]), rewards a step of the last chunks that count, of `old` and of
+      `new`; nan where there are none yet.
     counts: int32 (2,), chunks that have counted.
   """
 
@@ -45,6 +54,9 @@ class Guard(NamedTuple):
   learnt: jax.Array
   age: jax.Array
   acts: jax.Array
+  other: jax.Array
+  waits: jax.Array
+  losses: jax.Array
   rewards: jax.Array
   counts: jax.Array
 
@@ -52,7 +64,8 @@ class Guard(NamedTuple):
 def init(params: Any) -> Guard:
   """Of a stream that has not begun to learn."""
   no, none = jnp.bool_(False), jnp.int32(0)
-  return Guard(params, params, no, none, no, jnp.full((2, KEPT), jnp.nan), jnp.zeros(2, jnp.int32))
+  nothing = jnp.full((2, max(KEPT)), jnp.nan)
+  return Guard(params, params, no, none, no, no, none, none, nothing, jnp.zeros(2, jnp.int32))
 
 
 def hides(guard: Guard) -> jax.Array:
@@ -67,31 +80,40 @@ def act(guard: Guard, view: View) -> Acts:
   # before the first update `old` acts, whatever `acts` says
   side = jnp.where(guard.learnt & ~guard.acts, 1, 0)
   counts = adapting & (~guard.learnt | (guard.age % TURN >= SKIP))
-  at = guard.counts[side] % KEPT
+  at = guard.counts[side] % jnp.array(KEPT)[side]
   rewards = guard.rewards.at[side, at].set(jnp.where(counts, view.reward, guard.rewards[side, at]))
   number = guard.counts.at[side].add(counts.astype(jnp.int32))
   earned, earns = jnp.nanmean(rewards, 1)
   worse = earns < earned  # False where either is unknown
-  spread = jnp.nanvar(rewards, 1) / jnp.maximum(jnp.minimum(number, KEPT) - 1, 1)  # of a mean
-  clear = jnp.all(number >= FEW) & ((earns - earned) ** 2 > 4 * spread.sum())
+  held = jnp.minimum(number, jnp.array(KEPT))
+  spread = jnp.nanvar(rewards, 1) / jnp.maximum(held - 1, 1)  # of a mean
+  known = jnp.all(number >= FEW)
+  clear = known & ((earns - earned) ** 2 > 4 * spread.sum())
   back = view.over & guard.learnt & worse
   age = jnp.where(guard.learnt, guard.age + 1, 0)
   learnt = (guard.learnt | (view.taken > 0)) & ~view.begins & ~view.over
-  leads = clear & worse  # `old` does
-  period = jnp.where(clear & ~worse, RARE, OFTEN)
-  other = (age // TURN) % period == period - 1
-  acts = learnt & jnp.where(other, ~leads, leads)
+  turns = age % TURN == 0  # a turn begins
+  lost = guard.learnt & turns & ~guard.acts & clear & worse
+  losses = jnp.where(lost, guard.losses + 1, jnp.where(clear & worse, guard.losses, 0))
+  waits = jnp.where(turns, jnp.where(guard.other, 0, guard.waits + guard.learnt), guard.waits)
+  rare = jnp.minimum(4 * 2 ** jnp.maximum(losses - 1, 0), 16)
+  period = jnp.where(clear, jnp.where(worse, rare, 16), jnp.where(known, 4, 2))
+  other = jnp.where(turns, waits >= period - 1, guard.other)
+  acts = jnp.where(turns, other ^ (clear & worse), guard.acts)
   old = choose(view.begins, new, guard.old)
   after = Guard(
     old,
     new,
     learnt,
     jnp.where(learnt, age, 0),
-    acts,
+    learnt & acts,
+    learnt & other,
+    jnp.where(learnt, waits, 0),
+    jnp.where(learnt, losses, 0),
     jnp.where(view.begins, jnp.nan, rewards),
     jnp.where(view.begins, 0, number),
   )
-  return Acts(choose(back | acts, old, new), after, back, earned, earns)
+  return Acts(choose(back | (acts & learnt), old, new), after, back, earned, earns)
 
 
 METHOD = Method(init, act, hides=hides, copies=2, weighs=True)
