@@ -14,13 +14,15 @@ from mjx_cl.adapt.trees import choose
 TURN, SKIP = 4, 1  # chunks of a turn, and of its first that do not count
 KEPT = 12, 6  # chunks that count, of the old weights, which stay, and of the new, which change
 FEW = 4  # chunks of each side from which on a difference may be clear
+GRACE = 48  # chunks from the first update on in which the new weights alone act
 
 
 class Guard(NamedTuple):
   """Two sets of weights that act by turns while an adaptation runs.
 
-  From the first update on, turns of TURN chunks. One side leads, and of every `period` turns one is
-  the other's. A side's worth is its mean reward over its last KEPT chunks, the first SKIP of each
+  GRACE chunks after the first update turns of TURN chunks begin: who learns gets worse before it
+  gets better, and learns from what it does itself. One side leads, and of every `period` turns one
+  is the other's. A side's worth is its mean reward over its last KEPT chunks, the first SKIP of each
   turn left out, since the robot comes to them from the other's hands. The learner's leads, unless
   the old clearly earn more: by two standard errors of the difference of the means (Welch's), of
   FEW chunks each at least.
@@ -93,13 +95,14 @@ def act(guard: Guard, view: View) -> Acts:
   age = jnp.where(guard.learnt, guard.age + 1, 0)
   learnt = (guard.learnt | (view.taken > 0)) & ~view.begins & ~view.over
   turns = age % TURN == 0  # a turn begins
-  lost = guard.learnt & turns & ~guard.acts & clear & worse
+  free = age < GRACE
+  lost = ~free & guard.learnt & turns & ~guard.acts & clear & worse
   losses = jnp.where(lost, guard.losses + 1, jnp.where(clear & worse, guard.losses, 0))
   waits = jnp.where(turns, jnp.where(guard.other, 0, guard.waits + guard.learnt), guard.waits)
   rare = jnp.minimum(4 * 2 ** jnp.maximum(losses - 1, 0), 16)
   period = jnp.where(clear, jnp.where(worse, rare, 16), jnp.where(known, 4, 2))
-  other = jnp.where(turns, waits >= period - 1, guard.other)
-  acts = jnp.where(turns, other ^ (clear & worse), guard.acts)
+  other = jnp.where(turns, ~free & (waits >= period - 1), guard.other)
+  acts = jnp.where(turns, ~free & (other ^ (clear & worse)), guard.acts)
   old = choose(view.begins, new, guard.old)
   after = Guard(
     old,
