@@ -14,6 +14,7 @@ from mjx_cl.adapt.trees import choose
 TURN, SKIP = 4, 1  # chunks of a turn, and of its first that do not count
 KEPT = 12, 6  # chunks that count, of the old weights, which stay, and of the new, which change
 FEW = 4  # chunks of each side from which on a difference may be clear
+NEVER = 2**30
 GRACE = 48  # chunks from the first update on in which the new weights alone act
 
 
@@ -28,9 +29,10 @@ class Guard(NamedTuple):
   FEW chunks each at least.
 
     period  =  2    while a side has fewer chunks
-               4    where nothing is clear
-               16   where the learner's clearly earn more
-               4, 8, then 16   where the old do, the longer the more often in a row they did
+               4    where the old earn more, but not clearly
+               4, 8, then 16   where they clearly do, the longer the more often in a row they did
+               16   where the learner's earn more, but not clearly
+               -    where they clearly do: the old, which stay as they are, act no more
 
   What acts is what predicts. When the adaptation ends, however it does, the side that earned more
   stays, the learner's where they are equal or nothing is known. The idea is that of high confidence
@@ -100,7 +102,8 @@ def act(guard: Guard, view: View) -> Acts:
   losses = jnp.where(lost, guard.losses + 1, jnp.where(clear & worse, guard.losses, 0))
   waits = jnp.where(turns, jnp.where(guard.other, 0, guard.waits + guard.learnt), guard.waits)
   rare = jnp.minimum(4 * 2 ** jnp.maximum(losses - 1, 0), 16)
-  period = jnp.where(clear, jnp.where(worse, rare, 16), jnp.where(known, 4, 2))
+  period = jnp.where(clear, jnp.where(worse, rare, NEVER), jnp.where(worse, 4, 16))
+  period = jnp.where(known, period, 2)
   other = jnp.where(turns, ~free & (waits >= period - 1), guard.other)
   acts = jnp.where(turns, ~free & (other ^ (clear & worse)), guard.acts)
   old = choose(view.begins, new, guard.old)
