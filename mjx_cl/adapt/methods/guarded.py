@@ -1,4 +1,4 @@
-"""Method of arm `guarded`: old and new weights act by turns, and the better ones stay."""
+"""Method of arm `guarded`: old and new weights act by turns, the new stay where they win."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ class Guard(NamedTuple):
                16   where the learner's earn more, but not clearly
                -    where they clearly do: the old, which stay as they are, act no more
 
-  What acts is what predicts. When the adaptation ends, however it does, the side that earned more
-  stays, the learner's where they are equal or nothing is known. The idea is that of high confidence
+  What acts is what predicts. When the adaptation ends, however it does, the learner's stay if they
+  clearly earn more, or the old have not acted long enough to tell, else the old. The idea is that of high confidence
   policy improvement (Thomas, Theocharous and Ghavamzadeh 2015,
   https://proceedings.mlr.press/v37/thomas15.html), here by turns and without its bounds.
 
@@ -93,7 +93,7 @@ def act(guard: Guard, view: View) -> Acts:
   spread = jnp.nanvar(rewards, 1) / jnp.maximum(held - 1, 1)  # of a mean
   known = jnp.all(number >= FEW)
   clear = known & ((earns - earned) ** 2 > 4 * spread.sum())
-  back = view.over & guard.learnt & worse
+  back = view.over & guard.learnt & known & ~(clear & ~worse)
   age = jnp.where(guard.learnt, guard.age + 1, 0)
   learnt = (guard.learnt | (view.taken > 0)) & ~view.begins & ~view.over
   turns = age % TURN == 0  # a turn begins
