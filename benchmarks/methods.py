@@ -25,6 +25,11 @@ def quiet() -> Arm:
   return Arm("method `quiet`, told the onset", ONSET, RULE, method="quiet")
 
 
+def still() -> Arm:
+  """Acts without exploring from the onset on, and learns nothing."""
+  return Arm("method `still`, told the onset", ONSET, RULE, method="still")
+
+
 def swift_guarded() -> Arm:
   """As swift, old and new weights by turns."""
   return Arm("method `swift-guarded`, told the onset", ONSET, RULE, method="swift-guarded")
