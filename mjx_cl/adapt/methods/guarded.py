@@ -21,12 +21,12 @@ GRACE = 48  # chunks from the first update on in which the new weights alone act
 class Guard(NamedTuple):
   """Two sets of weights that act by turns while an adaptation runs.
 
-  GRACE chunks after the first update turns of TURN chunks begin: who learns gets worse before it
-  gets better, and learns from what it does itself. One side leads, and of every `period` turns one
-  is the other's. A side's worth is its mean reward over its last KEPT chunks, the first SKIP of each
-  turn left out, since the robot comes to them from the other's hands. The learner's leads, unless
-  the old clearly earn more: by two standard errors of the difference of the means (Welch's), of
-  FEW chunks each at least.
+  The learner's act alone for GRACE chunks after the first update: who learns gets worse before it
+  gets better, and learns from what it does itself. Then come turns of TURN chunks. One side leads,
+  and of every `period` turns one is the other's. A side's worth is its mean reward over its last
+  KEPT chunks, the first SKIP of each turn left out, since the robot comes to them from the other's
+  hands. The learner's leads, unless the old clearly earn more: by two standard errors of the
+  difference of the means (Welch's), of FEW chunks each at least.
 
     period  =  2    while a side has fewer chunks
                4    where the old earn more, but not clearly
@@ -35,8 +35,8 @@ class Guard(NamedTuple):
                -    where they clearly do: the old, which stay as they are, act no more
 
   What acts is what predicts. When the adaptation ends, however it does, the learner's stay if they
-  clearly earn more, or the old have not acted long enough to tell, else the old. The idea is that of high confidence
-  policy improvement (Thomas, Theocharous and Ghavamzadeh 2015,
+  clearly earn more, or if the old have not acted long enough to tell, else the old. The idea is
+  that of high confidence policy improvement (Thomas, Theocharous and Ghavamzadeh 2015,
   https://proceedings.mlr.press/v37/thomas15.html), here by turns and without its bounds.
 
   Attributes:
