@@ -2,7 +2,7 @@
 `methods_lives.parquet` of `mjx-cl leaderboard --methods --out FOLDER`.
 
 For each setting and method the reward a step over the last 2,000 steps, and its difference from arm
-`none`, paired by agent and seed: mean, 95 % bootstrap of pairs (10,000 draws), chance by sign flips
+`none`, paired by agent and seed: mean, 95 % bootstrap of pairs, chance by sign flips
 (`mjx_cl.scoring.adaptation.sign_flips`), and whether it is below after Holm's correction over all.
 """
 
@@ -14,9 +14,8 @@ import sys
 import numpy as np
 
 from mjx_cl.io import tables
+from mjx_cl.scoring import intervals
 from mjx_cl.scoring.adaptation import NOTHING, holm, sign_flips
-
-DRAWS = 10_000
 
 
 def pairs(lives: list[dict]) -> dict[tuple[str, str], np.ndarray]:
@@ -38,14 +37,12 @@ def main(folder: pathlib.Path) -> None:
   chances = [sign_flips(x[:, 0] - x[:, 1]) for x in found.values()]
   for (key, x), p, told in zip(found.items(), chances, holm(chances)):
     apart = x[:, 0] - x[:, 1]
-    rng = np.random.default_rng(0)
-    draws = apart[rng.integers(0, len(x), (DRAWS, len(x)))].mean(1)
-    low, high = np.percentile(draws, [2.5, 97.5])
+    low, high = intervals.interval(apart, np.mean) or (np.nan, np.nan)
     end, none = x.mean(0)
-    below = "below" if told and apart.mean() < 0 else "above" if told else "not told apart"
+    place = "below" if told and apart.mean() < 0 else "above" if told else "not told apart"
     print(
       f"{key[0]}, {key[1]}: {end:.2f}, none {none:.2f}, difference {apart.mean():.3f} "
-      f"[{low:.3f}, {high:.3f}], {len(x)} pairs, p {p:.3f}; after Holm: {below}"
+      f"[{low:.3f}, {high:.3f}], {len(x)} pairs, p {p:.3f}; after Holm: {place}"
     )
 
 

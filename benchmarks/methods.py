@@ -30,11 +30,6 @@ def still() -> Arm:
   return Arm("method `still`, told the onset", ONSET, RULE, method="still")
 
 
-def swift_guarded() -> Arm:
-  """As swift, old and new weights by turns."""
-  return Arm("method `swift-guarded`, told the onset", ONSET, RULE, method="swift-guarded")
-
-
 def swift() -> Arm:
   """As quiet, but learns from the first records on, follows sooner and ends later."""
   return Arm("method `swift`, told the onset", ONSET, RULE, method="swift")

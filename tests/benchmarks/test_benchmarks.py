@@ -608,3 +608,22 @@ def test_won_back_is_a_mean_of_agents_and_refuses_what_lost_nothing(tmp_path, ca
     won_back.main(str(tmp_path))
   with pytest.raises(SystemExit, match="holds no parts"):
     won_back.main(str(tmp_path / "a"))
+
+
+def test_ends_are_paired_by_hand(tmp_path, capsys):
+  """One method ends 0.1 to 0.2 below `none` in eight pairs, another level with it, in one setting."""
+  life = {"robot": "walker", "setting": "dark", "agent": "walker"}
+  off = {"none": [0.0] * 8, "worse": [-0.1, -0.2] * 4, "level": [0.1, -0.1] * 4, "short": [0.0] * 3}
+  rows = [
+    life | {"method": method, "seed": seed, "reward_final": 0.5 + x + 0.01 * seed}
+    for method, own in off.items()
+    for seed, x in reversed(list(enumerate(own)))
+  ]
+  pq.write_table(pa.Table.from_pylist(rows), tmp_path / "methods_lives.parquet")
+  load("ends").main(tmp_path)
+  worse, level, short = capsys.readouterr().out.splitlines()
+  # by sign flips two of 2^8 are as far out: 0.008, below 0.05 / 3
+  assert worse.startswith("walker: dark, worse: 0.39, none 0.54, difference -0.150 [-0.1")
+  assert worse.endswith("8 pairs, p 0.008; after Holm: below")
+  assert "difference -0.000" in level.replace(" 0.000", " -0.000")
+  assert level.endswith("after Holm: not told apart") and "3 pairs" in short

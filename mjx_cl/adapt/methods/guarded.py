@@ -14,7 +14,7 @@ from mjx_cl.adapt.trees import choose
 TURN, SKIP = 4, 1  # chunks of a turn, and of its first that do not count
 KEPT = 12, 6  # chunks that count, of the old weights, which stay, and of the new, which change
 FEW = 4  # chunks of each side from which on a difference may be clear
-NEVER = 2**30
+NEVER = 2**30  # turns
 GRACE = 48  # chunks from the first update on in which the new weights alone act
 
 
@@ -101,7 +101,7 @@ def act(guard: Guard, view: View) -> Acts:
   lost = ~free & guard.learnt & turns & ~guard.acts & clear & worse
   losses = jnp.where(lost, guard.losses + 1, jnp.where(clear & worse, guard.losses, 0))
   waits = jnp.where(turns, jnp.where(guard.other, 0, guard.waits + guard.learnt), guard.waits)
-  rare = jnp.minimum(4 * 2 ** jnp.maximum(losses - 1, 0), 16)
+  rare = 4 * 2 ** jnp.clip(losses - 1, 0, 2)
   period = jnp.where(clear, jnp.where(worse, rare, NEVER), jnp.where(worse, 4, 16))
   period = jnp.where(known, period, 2)
   other = jnp.where(turns, ~free & (waits >= period - 1), guard.other)
