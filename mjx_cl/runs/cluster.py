@@ -30,6 +30,7 @@ from mjx_cl.runs import merge, workers
 AGAIN = 3  # times that a part whose process was lost begins anew
 ANSWER_S = 10.0  # that a cluster may take to answer
 SAVE_S = 120.0  # that parts may take to save, where others were interrupted or have failed
+ASK_S = 2.0  # after which a part asks again whether it is to end
 HERE = ".ray"  # file in OUT by which a machine knows that it sees the driver's
 
 
@@ -121,8 +122,23 @@ def folder_of(given: Given) -> tuple[pathlib.Path, bool]:
   return pathlib.Path(tempfile.gettempdir(), f"mjx_cl_ray_{user}", name), False
 
 
-def run_part(name: str, given: Given, tell: Callable[[str], Any]) -> Told:
-  """Runs a part on this machine."""
+def run_part(
+  name: str,
+  given: Given,
+  tell: Callable[[str], Any],
+  stopped: Callable[[], bool] = lambda: False,
+) -> Told:
+  """Runs a part on this machine.
+
+  Args:
+    name: of the part.
+    given: what the task is given.
+    tell: called with each line that the part says.
+    stopped: whether it is to save and end, asked every ASK_S.
+
+  Raises:
+    KeyboardInterrupt: once it is; what was lived is saved.
+  """
   found = versions()
   wrong = [
     f"{k} {found.get(k)} in place of {v}" for k, v in given.versions.items() if found.get(k) != v
@@ -134,7 +150,7 @@ def run_part(name: str, given: Given, tell: Callable[[str], Any]) -> Told:
     folders.make(out)
     folders.atomic(out / "suite.json", lambda file: file.write(given.suite.encode()))
   with own_core() as cores:
-    told = _process(name, given, out, cores, tell)
+    told = _process(name, given, out, cores, tell, stopped)
   if told.code or shared:
     return told
   folder = out / name
@@ -143,14 +159,24 @@ def run_part(name: str, given: Given, tell: Callable[[str], Any]) -> Told:
 
 
 def _process(
-  name: str, given: Given, out: pathlib.Path, cores: list[int], tell: Callable[[str], Any]
+  name: str,
+  given: Given,
+  out: pathlib.Path,
+  cores: list[int],
+  tell: Callable[[str], Any],
+  stopped: Callable[[], bool],
 ) -> Told:
   worker = _worker(given, out, cores)
   worker.tell = tell
+  asked = time.monotonic()
   try:
     worker.give(name)
     while not worker.check():
       time.sleep(0.1)
+      if time.monotonic() - asked >= ASK_S:
+        asked = time.monotonic()
+        if stopped():
+          raise KeyboardInterrupt
     return Told(0)
   except UserError as e:
     release()
@@ -168,9 +194,12 @@ _HELD: list[tuple[tuple, workers.Worker]] = []
 def release() -> None:
   """Has the process that is kept for the next part save and end."""
   while _HELD:
-    _, worker = _HELD.pop()
+    worker = _HELD[-1][1]
     worker.close()
-    worker.process.wait()
+    while worker.process.poll() is None:
+      with contextlib.suppress(KeyboardInterrupt):  # told once more: it is saving
+        worker.process.wait()
+    _HELD.pop()
 
 
 def _worker(given: Given, out: pathlib.Path, cores: list[int]) -> workers.Worker:
@@ -194,6 +223,15 @@ class Board:
 
   def __init__(self) -> None:
     self.lines: dict[str, str] = {}
+    self.over = False
+
+  def stop(self) -> None:
+    """The parts are to save and end."""
+    self.over = True
+
+  def stopped(self) -> bool:
+    """Whether they are."""
+    return self.over
 
   def put(self, name: str, line: str) -> None:
     """Takes a line of a part."""
@@ -312,7 +350,8 @@ def _drive(
   board = ray.remote(Board).options(num_cpus=0, scheduling_strategy=here).remote()
 
   def task(name: str, given: Given) -> Told:
-    return run_part(name, given, lambda line: board.put.remote(name, line))
+    stopped = lambda: ray.get(board.stopped.remote())
+    return run_part(name, given, lambda line: board.put.remote(name, line), stopped)
 
   def submit(name: str) -> Any:
     how = {"num_cpus": 1, "num_gpus": int(given.gpu), "memory": needs[name], "max_retries": -1}
@@ -341,7 +380,10 @@ def _drive(
         stop.check()
   finally:
     # a KeyboardInterrupt to each task, which closes its process's standard input and waits until
-    # that has saved; what Ray ends by force takes its processes along
+    # that has saved; where C code drops it the task hears of it from the board. What Ray ends by
+    # force takes its processes along
+    if running:
+      board.stop.remote()
     for reference in running:
       ray.cancel(reference)
     if running:

@@ -103,6 +103,17 @@ def test_what_a_part_says_last_is_why_it_failed(plan):
   assert type(wrong) is UserError and "part healthy: no agent" in str(wrong)
 
 
+def test_a_part_that_is_to_end_saves(plan, monkeypatch):
+  """Without an exception from Ray, which C code may drop."""
+  monkeypatch.setattr(cluster, "ASK_S", 0.0)
+  out, said = plan("out", steps=3200), []
+  (out / cluster.HERE).write_text("7")
+  own = given(out, token="7")
+  with pytest.raises(KeyboardInterrupt):
+    cluster.run_part(PARTS[0], own, said.append, lambda: any("step " in line for line in said))
+  assert not processes(out) and list(out.rglob("checkpoints/*"))
+
+
 STUB = """import json, os, pathlib, sys, zlib
 out = pathlib.Path(sys.argv[1])
 size = json.loads((out / "suite.json").read_text())["size"]
@@ -272,15 +283,19 @@ def test_what_is_lost_begins_again(plan, whole, machines, lost):
 
 
 def test_an_interrupt_leaves_nothing_running_and_the_same_command_goes_on(plan, whole, machines):
-  two = plan("two", steps=3200)
-
   def tell(text):
     if "step " in text:
       os.kill(os.getpid(), signal.SIGINT)
 
-  with pytest.raises(KeyboardInterrupt):
-    together(machines, two, tell)
-  assert not processes(two) and list(two.rglob("checkpoints/*"))
+  for name in ("two", "three", "four"):  # where it is heard late both parts may be at their end
+    two = plan(name, steps=3200)
+    with pytest.raises(KeyboardInterrupt):
+      together(machines, two, tell)
+    assert not processes(two)
+    if list(two.rglob("checkpoints/*")):
+      break
+  else:
+    pytest.fail("no part was saved in three tries")
   assert sorted(together(machines, two)) == PARTS and same(whole, two)
 
 
