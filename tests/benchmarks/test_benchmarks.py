@@ -627,3 +627,28 @@ def test_ends_are_paired_by_hand(tmp_path, capsys):
   assert worse.endswith("8 pairs, p 0.008; after Holm: below")
   assert "difference -0.000" in level.replace(" 0.000", " -0.000")
   assert level.endswith("after Holm: not told apart") and "3 pairs" in short
+
+
+def test_two_methods_are_set_apart_by_hand(tmp_path, capsys):
+  """Two agents, each alone one end of the interval: 10 of 100 more lost and 0.1 lower at the end of
+  0.4 that the fault takes, and nothing; a life that the fault costs nothing does not count.
+  """
+  rows = [
+    {"agent": agent, "method": method, "seed": seed, "affected": seed > 0 if none else None}
+    | {"return_lost": 100.0 if none else 20.0 + (10 if worse and seed else 0), "reward_pre": 0.9}
+    | {"reward_final": 0.5 if none else 0.8 - (0.1 if worse and seed else 0)}
+    for agent in ("a", "b")
+    for method in ("one", "two", "none")
+    for seed in range(3)
+    for none, worse in [(method == "none", (agent, method) == ("a", "one"))]
+  ]
+  pq.write_table(pa.Table.from_pylist(rows), tmp_path / "methods_lives.parquet")
+  apart = load("apart")
+  apart.main(str(tmp_path), "one", "two")
+  assert capsys.readouterr().out.splitlines() == [
+    "return lost, share: 0.050 [0.000, 0.100], 4 lives",
+    "reward at the end: -0.050 [-0.100, 0.000], 4 lives",
+    "share of the loss at the end: -0.125 [-0.250, 0.000], 4 lives",
+  ]
+  with pytest.raises(SystemExit, match="no lives of one and three"):
+    apart.main(str(tmp_path), "one", "three")
