@@ -33,8 +33,3 @@ def still() -> Arm:
 def swift() -> Arm:
   """As quiet, but learns from the first records on, follows sooner and ends later."""
   return Arm("method `swift`, told the onset", ONSET, RULE, method="swift")
-
-
-def swift_guarded() -> Arm:
-  """As swift, and old and new weights by turns."""
-  return Arm("method `swift-guarded`, told the onset", ONSET, RULE, method="swift-guarded")
