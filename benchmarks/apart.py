@@ -16,9 +16,9 @@ import sys
 import numpy as np
 
 from mjx_cl.io import tables
+from mjx_cl.scoring import intervals
 from mjx_cl.scoring.adaptation import NOTHING
 
-DRAWS = 10_000
 WHAT = ("return lost, share", "reward at the end", "share of the loss at the end")
 
 
@@ -52,11 +52,7 @@ def main(folder: str, method: str, other: str) -> None:
   """Prints a row for each of WHAT."""
   rows = tables.read_rows(pathlib.Path(folder) / "methods_lives.parquet")
   agents = lives(rows, [method, other])
-  rng, drawn = np.random.default_rng(0), np.zeros((DRAWS, len(WHAT)))
-  for k in range(DRAWS):
-    some = [agents[i] for i in rng.integers(len(agents), size=len(agents))]
-    drawn[k] = statistics([x[rng.integers(len(x), size=len(x))] for x in some])
-  ends = np.percentile(drawn, [2.5, 97.5], axis=0).T
+  ends = np.percentile(intervals.nested(agents, statistics), [2.5, 97.5], axis=0).T
   for what, value, (low, high) in zip(WHAT, statistics(agents), ends):
     print(f"{what}: {value:.3f} [{low:.3f}, {high:.3f}], {sum(map(len, agents))} lives")
 

@@ -15,9 +15,7 @@ import sys
 import numpy as np
 import pyarrow.parquet as parquet
 
-from mjx_cl.scoring import normalised_recovery
-
-DRAWS = 10_000
+from mjx_cl.scoring import intervals, normalised_recovery
 
 
 def shares(folder: pathlib.Path) -> dict[str, list[np.ndarray]]:
@@ -35,13 +33,14 @@ def shares(folder: pathlib.Path) -> dict[str, list[np.ndarray]]:
   return out
 
 
-def interval(parts: list[np.ndarray], seed: int = 0) -> list[float]:
-  """Of the mean over parts of the mean over their streams."""
-  rng, means = np.random.default_rng(seed), np.zeros(DRAWS)
-  for k in range(DRAWS):
-    drawn = [parts[i] for i in rng.integers(len(parts), size=len(parts))]
-    means[k] = np.mean([x[rng.integers(len(x), size=len(x))].mean() for x in drawn])
-  return np.percentile(means, [2.5, 97.5]).tolist()
+def mean(parts: list[np.ndarray]) -> float:
+  """Over parts of the mean over their streams."""
+  return float(np.mean([x.mean() for x in parts]))
+
+
+def interval(parts: list[np.ndarray]) -> list[float]:
+  """Of `mean`."""
+  return np.percentile(intervals.nested(parts, mean), [2.5, 97.5]).tolist()
 
 
 def main(folder: str) -> None:
@@ -57,9 +56,9 @@ def main(folder: str) -> None:
           "arm": arm,
           "agents": len(parts),
           "streams": sum(map(len, parts)),
-          "won_back": float(np.mean([x.mean() for x in parts])),
+          "won_back": mean(parts),
           "won_back_ci": interval(parts),
-          "more": float(np.mean([x.mean() for x in apart])),
+          "more": mean(apart),
           "more_ci": interval(apart),
         }
       )

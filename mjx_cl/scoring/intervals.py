@@ -69,6 +69,29 @@ def weights(n: int, reps: int, seed: int = 0) -> np.ndarray:
   return counts
 
 
+def nested(
+  groups: list[np.ndarray],
+  statistic: Callable[[list[np.ndarray]], ArrayLike],
+  reps: int = 10_000,
+  seed: int = 0,
+) -> np.ndarray:
+  """`statistic` of groups drawn with replacement, and of each its runs drawn likewise: a bootstrap
+  of agents and then of their seeds; float (reps, k).
+
+  Args:
+    groups: of each its runs, (n, ...).
+    statistic: groups -> (k,) or ().
+    reps: draws.
+    seed: of the draws.
+  """
+  random, out = np.random.default_rng(seed), []
+  for _ in range(reps):
+    drawn = [groups[k] for k in random.integers(len(groups), size=len(groups))]
+    runs = [x[random.integers(len(x), size=len(x))] for x in drawn]
+    out.append(np.atleast_1d(np.asarray(statistic(runs), float)))
+  return np.array(out)
+
+
 def ends(statistics: np.ndarray, level: float = 0.95) -> list[list[float | None] | None]:
   """Percentile intervals of several bootstrapped statistics at once.
 

@@ -611,7 +611,7 @@ def test_won_back_is_a_mean_of_agents_and_refuses_what_lost_nothing(tmp_path, ca
 
 
 def test_ends_are_paired_by_hand(tmp_path, capsys):
-  """One method ends 0.1 to 0.2 below `none` in eight pairs, another level with it, in one setting."""
+  """One method ends 0.1 to 0.2 below `none` in eight pairs, another level with it."""
   life = {"robot": "walker", "setting": "dark", "agent": "walker"}
   off = {"none": [0.0] * 8, "worse": [-0.1, -0.2] * 4, "level": [0.1, -0.1] * 4, "short": [0.0] * 3}
   rows = [
