@@ -8,7 +8,11 @@ import json
 import pathlib
 from typing import Any
 
+import jax
+import numpy as np
+
 from mjx_cl import detectors, envs
+from mjx_cl.adapt import methods
 from mjx_cl.adapt.arms import ARMS
 from mjx_cl.config import AdaptConfig, RunConfig
 from mjx_cl.errors import FileError, UserError, require
@@ -47,6 +51,23 @@ def arm_agents(config: RunConfig, env: Any) -> dict[str, agents.Trained]:
     )
     out[arm] = other
   return out
+
+
+def check_learners(config: RunConfig, trained: agents.Trained) -> None:
+  """An arm that learns needs a critic to begin from.
+
+  Raises:
+    UserError: such an arm, and an agent that was cut down to what acts.
+  """
+  if any(np.any(leaf) for leaf in jax.tree.leaves(trained.train.params["val"])):
+    return
+  learns = lambda arm: arm.learns and not arm.fresh and methods.of(arm).learns
+  names = [name for name in config.arms if learns(ARMS[name])]
+  require(
+    not names,
+    f"agent {agents.called(trained)!r} holds what acts alone, its critic is zero: nothing can "
+    f"learn from it; leave out arm {', '.join(names)}, or give the agent as it was trained",
+  )
 
 
 def known_as(env: Any) -> str:

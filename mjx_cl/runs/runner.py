@@ -30,7 +30,7 @@ from mjx_cl.runs import packing, room
 from mjx_cl.runs.clock import clock_of, counted, sorted_out
 from mjx_cl.runs.groups import Settled
 from mjx_cl.runs.healthy import Healthy, fork, key_of, last, take
-from mjx_cl.runs.identity import arm_agents, identity
+from mjx_cl.runs.identity import arm_agents, check_learners, identity
 from mjx_cl.runs.lives import Lives
 from mjx_cl.runs.loops import make_loop
 from mjx_cl.runs.outlook import Standing
@@ -101,6 +101,7 @@ class Runner:
     adapt = ("lr", "policy_lr", "anchor", "last_starts", "batch")
     departures = {name: getattr(config.adapt, name) for name in adapt}
     self.trained = agents.of(self.env, config.agent, **departures)
+    check_learners(config, self.trained)
     self.repeat = self.trained.repeat
     self.others = arm_agents(config, self.env)
     self.changes = changes(config)

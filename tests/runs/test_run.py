@@ -30,7 +30,7 @@ from mjx_cl.envs.walker import Walker
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.io import tables
 from mjx_cl.render import figures
-from mjx_cl.runs import run, runner, workers
+from mjx_cl.runs import identity, run, runner, workers
 from mjx_cl.runs.run import ledger_of
 from mjx_cl.runs.runner import KINDS
 from mjx_cl.scoring import events, intervals
@@ -945,6 +945,21 @@ def test_load_refuses_what_does_not_fit(saved, tmp_path):
     agents.load(str(saved), "walker", 25, 6)
   with pytest.raises(UserError, match=f"shipped: {', '.join(agents.shipped())};"):
     agents.load(str(tmp_path / "none"), "walker", 24, 6)
+
+
+def test_what_is_cut_down_to_its_acting_cannot_learn(saved, tmp_path):
+  """Arms that take no update may use it; scratch, which draws all anew, too."""
+  trained = agents.load(str(saved), "walker", 24, 6)
+  params = trained.train.params | {"val": jax.tree.map(np.zeros_like, trained.train.params["val"])}
+  agents.save(tmp_path / "cut", trained.train._replace(params=params), trained.card)
+  config = RunConfig(
+    "walker", agent=str(tmp_path / "cut"), arms=("still", "scratch", "none", "quiet")
+  )
+  cut = agents.load(config.agent, "walker", 24, 6)
+  identity.check_learners(dataclasses.replace(config, arms=config.arms[:-1]), cut)
+  identity.check_learners(config, trained)
+  with pytest.raises(UserError, match="critic is zero.* leave out arm quiet, or give the agent"):
+    runner.Runner(config, tmp_path / "out")
 
 
 # ---- eval ----------------------------------------------------------------------------------------
