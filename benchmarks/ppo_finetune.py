@@ -168,6 +168,8 @@ def measure(args) -> dict:
     RunConfig(
       args.env,
       fault=args.fault,
+      target=args.target,
+      severity=args.severity,
       onset=args.onset,
       steps=args.steps,
       seeds=args.seeds,
@@ -260,6 +262,8 @@ def measure(args) -> dict:
   return {
     "env": args.env,
     "fault": args.fault,
+    "target": args.target,
+    "severity": args.severity,
     "onset": args.onset,
     "steps": args.steps,
     "seeds": seeds,
@@ -385,6 +389,8 @@ def parser() -> argparse.ArgumentParser:
     ),
   )
   out.add_argument("--fault", default="walker/gear-half", help="fault or preset")
+  out.add_argument("--target", help="joint or part; left out: drawn from the seed")
+  out.add_argument("--severity", type=float, help="left out: 0.5, or the preset's own")
   out.add_argument("--onset", type=int, default=5000)
   out.add_argument("--steps", type=int, default=25_000)
   out.add_argument("--seeds", type=int, default=10)

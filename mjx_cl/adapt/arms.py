@@ -167,7 +167,7 @@ _SHIPPED: dict[str, Arm] = {
   ),
   "guarded": Arm(
     "as detector, but the weights of before the finetuning and the new ones act by turns, more "
-    "often those that earn more; the new ones stay if they clearly do",
+    "often those that earn more; the new ones stay if they do",
     ALARM,
     RULE,
     method="guarded",

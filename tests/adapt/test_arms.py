@@ -659,16 +659,24 @@ def test_old_and_new_weights_act_by_turns(same):
   memory = tuple(jax.vmap(functools.partial(methods.remember, m))(weights(7.0)) for m in own)
   acting, told = weights(1.0), []
   heard = {1: [[] for _ in range(groups)], 0: [[] for _ in range(groups)]}
-  periods = [set() for _ in range(3)]
+  periods: list[set] = [set() for _ in range(3)]
+  begun: dict[int, int] = {}  # chunks from the first update to the first turn
   other, waits, losses = np.zeros(3, bool), np.zeros(3, int), np.zeros(3, int)
-  turn, guard_acts = np.zeros(groups, int), np.zeros(groups, bool)  # chunks since the first update
+  age, guard_acts = np.zeros(groups, int), np.zeros(groups, bool)  # age: see Guard
+  leads = np.zeros(groups, bool)  # the old do
 
   def weighed(g):
-    sides = [np.array(heard[side][g][-kept:]) for side, kept in ((0, 12), (1, 6))]
+    kept = 6 if leads[g] or age[g] < 48 else 16
+    sides = [np.array(heard[side][g][-n:]) for side, n in ((0, 16), (1, kept))]
     few = min(len(heard[side][g]) for side in (0, 1)) < 4
-    gap = 0 if few else sides[1].mean() - sides[0].mean()
-    error = np.inf if few else np.sqrt(sum(np.var(x, ddof=1) / len(x) for x in sides))
-    return sides, few, gap, int(gap > 2 * error) - int(gap < -2 * error)  # 1: the new are ahead
+    gap, error, free = np.nan, np.inf, sum(map(len, sides)) - 2
+    if min(map(len, sides)):
+      gap = sides[1].mean() - sides[0].mean()
+      squares = sum(((x - x.mean()) ** 2).sum() for x in sides)
+      error = np.sqrt(squares / free * sum(1 / len(x) for x in sides)) if free else np.inf
+    ahead = 0 if few else int(gap > 2 * error) - int(gap < -2 * error)  # 1: the new are ahead
+    fails = len(heard[1][g]) >= 6 and gap < -3 * error
+    return sides, few, gap, ahead, fails
 
   for c in range(last + 1):
     old_acts = np.asarray(acting["w"][:, 0]) == 1.0
@@ -691,33 +699,39 @@ def test_old_and_new_weights_act_by_turns(same):
     )
     acting, _, memory, (back, earned, earns) = loop_lib._act(own, which, memory, view)
     for g in range(groups):
-      if c and (not learnt or turn[g] % guarded.TURN >= guarded.SKIP):
+      if c and (not learnt or age[g] % guarded.TURN >= guarded.SKIP):
         heard[int(learnt and not bool(guard_acts[g]))][g].append(reward[g])
     guard_acts = np.asarray(memory[1].acts) & (np.asarray(which) == 1)
-    turn = turn + learnt
+    was = [weighed(g) for g in range(groups)]
+    age = age + learnt
+    age = np.where([w[-1] for w in was], np.maximum(age, 48), age)
     told.append(np.asarray(acting["w"][:, 0]) == 1.0)
     for g in range(3) if first <= c < last else ():
-      sides, few, gap, ahead = weighed(g)
+      sides, few, gap, ahead, _ = was[g]
       mean = [x.mean() if len(x) else np.nan for x in sides]
       np.testing.assert_allclose([earned[g], earns[g]], mean, rtol=1e-5)
-      if turn[g] % 4:
+      if age[g] % 4:
         assert told[-1][g] == told[-2][g]  # whole turns
         continue
-      grace = turn[g] < 48
-      lives = turn[g] > 0 and not told[-2][g]  # the new have just had a turn
+      grace = age[g] < 48
+      lives = age[g] > 0 and not told[-2][g]  # the new have just had a turn
       losses[g] = losses[g] + (lives and not grace) if ahead < 0 else 0
       losing = [4, 4, 8, 16][min(losses[g], 3)]
       period = 2 if few else {1: np.inf, 0: 4 if gap < 0 else 16, -1: losing}[ahead]
-      waits[g] = 0 if other[g] else waits[g] + (turn[g] > 0)
+      waits[g] = 0 if other[g] else waits[g] + (age[g] > 0)
       other[g] = waits[g] >= period - 1 and not grace
       assert told[-1][g] == (not grace and (ahead < 0) != other[g]), (c, g)
+      leads[g] = told[-1][g] != other[g]
       if not grace:
         periods[g].add((period, ahead))
+        begun.setdefault(g, c - first)
   assert periods[:2] == [{(2, 0), (4, -1), (8, -1), (16, -1)}, {(2, 0), (np.inf, 1)}], periods
   assert {(2, 0), (4, 0), (16, 0)} <= periods[2], periods  # what is equal is clear now and then
+  assert 8 <= begun[0] < 16 and begun[1] == 48  # who fails has no grace
   share = np.array(told)[first + 48 : last].mean(0)  # of the chunks that the old weights live
   assert share[0] > 0.8 and share[1] < 0.02 and 0.05 < share[2] < 0.4 and share[3] == 0
-  stays = [True, False, weighed(2)[-1] <= 0, False]  # the old, unless the new are clearly ahead
+  sides, _, gap, ahead, _ = was[2]
+  stays = [True, False, gap < 0.05 * sides[0].mean() and ahead <= 0, False]
   assert back.tolist() == stays and (np.asarray(acting["w"][:, 0]) == 1.0).tolist() == stays
   assert not memory[1].learnt.any() and not memory[1].acts.any()
 
