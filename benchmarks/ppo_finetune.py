@@ -350,6 +350,11 @@ def score(
     ):
       out[key], out[key + "_ci"] = mean(of, name)
     arms[arm] = out
+  lost = [np.array([r["return_lost"] for r in rows if r["arm"] == a]) for a in ("ppo", "ppo-none")]
+  share = lambda own, none: 100 * (1 - own.mean(-1) / none.mean(-1))
+  drawn = intervals.draws(len(lost[0]), 10_000)
+  arms["ppo"]["score"] = float(share(*lost))  # as on the leaderboard of methods
+  arms["ppo"]["score_ci"] = intervals.ends(share(*(x[drawn] for x in lost))[None])[0]
   return {"arms": arms, "rows": rows, "control_s": control_s}
 
 

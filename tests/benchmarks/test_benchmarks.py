@@ -180,6 +180,10 @@ def test_ppo_finetunes_from_the_onset_on_and_the_other_arm_not(ppo, policy, tmp_
   assert value["arms"]["ppo"]["updates"] == 2 * 2 * 2 and value["arms"]["ppo-none"]["updates"] == 0
   rows = {(r["arm"], r["seed"]): r for r in value["rows"]}
   assert rows["ppo", 0]["reward_pre"] == pytest.approx(of("ppo-none", 0)[1000:1088].mean())
+  lost = [rows["ppo", s]["return_lost"] / rows["ppo-none", s]["return_lost"] for s in (0, 1)]
+  weight = [rows["ppo-none", s]["return_lost"] for s in (0, 1)]
+  share = 100 * (1 - np.average(lost, weights=weight))
+  assert value["arms"]["ppo"]["score"] == pytest.approx(share)
   assert json.loads(json.dumps(value))["policy"]["step" + "s"] == 0
 
 
