@@ -63,10 +63,9 @@ def settings(own: Sequence[methods.Method], config: AdaptConfig) -> dict[str, ja
   """
   values = {}
   for name in (f.name for f in fields(methods.Settings)):
-    wanted = [getattr(method.settings, name) for method in own]
-    run = getattr(config, name)
-    if run == getattr(AdaptConfig, name) and any(x is not None for x in wanted):
-      values[name] = jnp.asarray([run if x is None else x for x in wanted], jnp.float32)
+    each = [method.settings.of(name, config) for method in own]
+    if any(x != getattr(config, name) for x in each):
+      values[name] = jnp.asarray(each, jnp.float32)
   return values
 
 

@@ -33,7 +33,7 @@ class Clock:
     config: of the run.
     labels: (arm, seed) of each stream.
     together: herds of its lives, see work.herds.
-    own: how streams learn.
+    learners: how each stream learns.
     core: what a core is expected to take.
     cores: that share the work.
     repeat: control steps of a decision.
@@ -50,13 +50,13 @@ class Clock:
     config: RunConfig,
     labels: Sequence[tuple[str, int]],
     together: list[list[list[int]]],
-    own: Learner,
+    learners: Sequence[Learner],
     core: Speed,
     cores: int,
     repeat: int = 1,
     stops: dict[int, int] | None = None,
   ) -> None:
-    self.config, self.labels, self.together, self.own = config, labels, together, own
+    self.config, self.labels, self.together, self.learners = config, labels, together, learners
     self.core, self.cores, self.chunk, self.stops = core, cores, CHUNK * repeat, stops or {}
     self.measured, self.modelled = np.zeros(4), np.zeros(4)  # core seconds by kind
     self.lived, self.foretold = 0.0, 0.0  # seconds of wall time
@@ -85,7 +85,7 @@ class Clock:
     ]
     at = np.arange(now, c.steps, self.chunk)
     begun = [self.joined or own.since >= 0 for own in stands]
-    return work.load(spells, begun, self.together, self.own, at, self.chunk)
+    return work.load(spells, begun, self.together, self.learners, at, self.chunk)
 
   def left(self, now: int, stands: Sequence[Standing], compiled: float = 0.0) -> float | None:
     """Seconds from control step `now` to the end; None: nothing is known yet.
@@ -128,7 +128,7 @@ def clock_of(
   robots = filter(None, (config.env, becomes(config)))
   physics = max(work.PHYSICS_S.get(robot, 0.1e-3) for robot in robots)
   core = work.speed(config.adapt, trained, size, physics, repeat)
-  own = work.learner(config.adapt, trained, repeat)
+  own = [work.learner(ARMS[arm], config.adapt, trained, repeat) for arm, _ in labels]
   return Clock(config, labels, work.herds(lives), own, core, len(runtime.cores()), repeat, stops)
 
 

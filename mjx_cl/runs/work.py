@@ -16,6 +16,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from mjx_cl.adapt import methods
+from mjx_cl.adapt.arms import Arm
 from mjx_cl.config import CHUNK, AdaptConfig
 from mjx_cl.runs.groups import BAND, HERD
 
@@ -93,10 +95,11 @@ class Load(NamedTuple):
     return np.stack([self.herds, self.bands, self.watched, self.updates], 1)
 
 
-def learner(adapt: AdaptConfig, trained: Any, repeat: int = 1) -> Learner:
-  """How streams learn by AdaptConfig and the agent's DreamerConfig."""
+def learner(arm: Arm, adapt: AdaptConfig, trained: Any, repeat: int = 1) -> Learner:
+  """How a stream of this arm learns by AdaptConfig and the agent's DreamerConfig."""
   replayed = (adapt.batch or trained.batch) * trained.length
-  return Learner((adapt.start_windows + trained.length) * repeat, adapt.ratio / replayed / repeat)
+  windows = methods.of(arm).settings.of("start_windows", adapt)
+  return Learner((windows + trained.length) * repeat, adapt.ratio / replayed / repeat)
 
 
 def speed(adapt: AdaptConfig, trained: Any, size: float, physics: float, repeat: int = 1) -> Speed:
@@ -138,7 +141,7 @@ def load(
   spells: Sequence[Sequence[Spell]],
   begun: Sequence[bool],
   together: list[list[list[int]]],
-  own: Learner,
+  learners: Sequence[Learner],
   at: np.ndarray,
   chunk: int,
 ) -> Load:
@@ -148,12 +151,12 @@ def load(
     spells: of each stream, none within another.
     begun: whether it is a learner already.
     together: see `herds`.
-    own: how streams learn.
+    learners: how each stream learns.
     at: int (chunks,).
     chunk: its control steps.
   """
   learns, updates = np.zeros((len(spells), len(at))), np.zeros((len(spells), len(at)))
-  for g, stream in enumerate(spells):
+  for g, (stream, own) in enumerate(zip(spells, learners)):
     frozen = np.full(len(at), 0.0 if begun[g] else 1.0)
     for start, steps, chance in stream:
       frozen *= 1.0 - chance * (at >= start)

@@ -48,7 +48,8 @@ def clock_of(config, cores=2):
     for seed in range(config.first_seed, config.first_seed + config.seeds)
   ]
   lives = [(ARMS[arm].agent, (ARMS[arm].breaks, seed)) for arm, seed in labels]
-  own = work.learner(config.adapt, DreamerConfig(batch=8, length=64))
+  trained = DreamerConfig(batch=8, length=64)
+  own = [work.learner(ARMS[arm], config.adapt, trained) for arm, _ in labels]
   stops = stop_rule.told(config)
   return Clock(config, labels, work.herds(lives), own, CORE, cores, stops=stops)
 
@@ -81,7 +82,8 @@ def lived(clock, spans):
         out.append(Standing(decide.ADAPTING if start + steps > now else phase.get(end, 0), start))
     return out
 
-  return at, work.load(own, [False] * len(own), clock.together, clock.own, at, clock.chunk), stands
+  load = work.load(own, [False] * len(own), clock.together, clock.learners, at, clock.chunk)
+  return at, load, stands
 
 
 def told_after_a_tenth(config, spans, core, cores=2):
@@ -224,7 +226,7 @@ def test_seconds_of_chunks_by_hand():
   lives = [("", k) for k in range(9)] * 2
   together = work.herds(lives)
   assert [len(herd) for herd in together] == [8, 1] and together[1] == [[8, 17]]
-  own = work.Learner(fill=100, rate=4 / 64)
+  own = [work.Learner(fill=100, rate=4 / 64)] * 18
   spells = [[Spell(64, 200)]] + [[]] * 17
   done = work.load(spells, [False] * 18, together, own, np.arange(0, 320, 64), 64)
   assert done.herds.tolist() == [2] * 5 and done.bands.tolist() == [0, 1, 1, 1, 1]
@@ -243,6 +245,17 @@ def test_seconds_of_chunks_by_hand():
   # a life that all its streams have left is lived no more
   gone = work.load([[]] * 18, [k in (8, 17) for k in range(18)], together, own, np.arange(1), 64)
   assert (gone.herds[0], gone.watched[0], gone.bands[0]) == (1, 10, 1)
+
+
+def test_each_stream_learns_from_when_its_method_does():
+  """`swift` wants 64 windows of 64 records, a run 1,024, unless it is given another number."""
+  fills = lambda **adapt: [
+    own.fill
+    for own in clock_of(
+      RunConfig("walker", seeds=1, arms=("detector", "swift", "none"), adapt=AdaptConfig(**adapt))
+    ).learners
+  ]
+  assert fills() == [1088, 128, 1088] and fills(start_windows=512) == [576] * 3
 
 
 def test_memory_is_flat_in_the_steps_but_for_replays_and_trace():

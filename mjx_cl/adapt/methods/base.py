@@ -102,6 +102,11 @@ class Settings:
   def __post_init__(self) -> None:
     AdaptConfig(**{k: v for k, v in vars(self).items() if v is not None})  # its ranges
 
+  def of(self, name: str, config: AdaptConfig) -> Any:
+    """The value that a run of `config` takes."""
+    run, wanted = getattr(config, name), getattr(self, name)
+    return run if wanted is None or run != getattr(AdaptConfig, name) else wanted
+
 
 @dataclass(frozen=True)
 class Method:
