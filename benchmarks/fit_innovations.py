@@ -21,6 +21,7 @@ import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 
+sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1]))  # for its neighbours
 from benchmarks import fit_learnt  # noqa: E402
 from benchmarks.fit_learnt import (  # noqa: E402
   ARL0,

@@ -23,12 +23,13 @@ import sys
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks import fit_innovations, fit_learnt
-from mjx_cl.detectors import innovations, learnt
-from mjx_cl.io import folders, runtime
-from mjx_cl.leaderboard import oracle
-from mjx_cl.leaderboard.streams import Streams, StreamSet
-from mjx_cl.scoring import autoregression
+sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1]))  # for its neighbours
+from benchmarks import fit_innovations, fit_learnt  # noqa: E402
+from mjx_cl.detectors import innovations, learnt  # noqa: E402
+from mjx_cl.io import folders, runtime  # noqa: E402
+from mjx_cl.leaderboard import oracle  # noqa: E402
+from mjx_cl.leaderboard.streams import Streams, StreamSet  # noqa: E402
+from mjx_cl.scoring import autoregression  # noqa: E402
 
 ORACLES = ("two_channels", "all_channels", "innovations_weighed", "every_variable")
 FROM = 2_000  # control steps at the start of a stream in which nothing counts
@@ -120,7 +121,7 @@ def main() -> None:
     x = oracle.channels(nominal.residual)
     each = len(nominal.seed) // len(set(nominal.seed.tolist()))
     normal = autoregression.Healthy(x[FROM:, ::each], autoregression.ORDER)
-    shipped = learnt.fits()[robot]
+    shipped = learnt.fits()[ships.agent(robot)]
     level = fit_learnt.level(
       fit_learnt.scores(fit_learnt.averages(nominal, shipped), shipped).max(0), fit_learnt.ARL0
     )

@@ -5,7 +5,9 @@ the right way.
 import dataclasses
 import importlib.util
 import json
+import os
 import pathlib
+import re
 import subprocess
 import sys
 import types
@@ -397,6 +399,18 @@ def test_compile_time_names_its_programs(given):
     done.returncode == 1
     and done.stderr == "usage: python benchmarks/compile_time.py update|watch|learn\n"
   )
+
+
+ALIKE = [p.name for p in FOLDER.glob("*.py") if re.search(r"^from benchmarks", p.read_text(), re.M)]
+
+
+@pytest.mark.parametrize("name", ALIKE)
+def test_a_script_finds_its_neighbours_from_anywhere(name, tmp_path):
+  """As its row has it, `python benchmarks/NAME`: the folder is no part of the package."""
+  environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
+  told = [sys.executable, FOLDER / name, "--help"]
+  got = subprocess.run(told, cwd=tmp_path, env=environment, capture_output=True, text=True)
+  assert got.returncode == 0 and got.stdout.startswith("usage: "), got.stderr
 
 
 def test_the_thresholds_that_ship_are_those_of_the_board(tmp_path):
