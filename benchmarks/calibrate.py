@@ -2,7 +2,7 @@
 logarithm for ARL0 = 100,000 control steps.
 
   python benchmarks/calibrate.py --out results/arl0.json
-  python benchmarks/calibrate.py --robot quadruped --out results/arl0_quadruped.json
+  python benchmarks/calibrate.py --robot quadruped --out results/arl0_quadruped-trot-2.json
   python benchmarks/calibrate.py --robot car --settled runs/car_tune --out results/arl0_car.json
 
 Nominal streams of seeds 100 to 109 give ARL0 = nominal steps / alarms, with restarts (every alarm

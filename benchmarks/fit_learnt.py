@@ -1,7 +1,7 @@
 """Fits detector `learnt` on recorded streams: `python benchmarks/fit_learnt.py`.
 
-Healthy streams and tuning faults of the seeds that tune, of each robot; writes
-mjx_cl/detectors/learnt.json. `--left-out` prints instead, for each tuning fault, the score of a fit
+Healthy streams and tuning faults of the seeds that tune, of each robot; writes the fits of the
+agents that acted into mjx_cl/detectors/learnt.json, beside those of others. `--left-out` prints instead, for each tuning fault, the score of a fit
 that has not seen it, and of one that has seen it on other seeds: mean over its streams of
 100 2^(-latency / 5 s), 0 where it is missed, at one alarm in 10,000 healthy control steps.
 """
@@ -9,7 +9,6 @@ that has not seen it, and of one that has seen it on other seeds: mean over its 
 import argparse
 import json
 import pathlib
-import sys
 from typing import Any, NamedTuple
 
 import jax
@@ -196,7 +195,7 @@ def main() -> None:
   runtime.setup()
   streams = StreamSet(given.streams)
   target = pathlib.Path(learnt.__file__).with_suffix(".json")
-  robots = {}
+  held = json.loads(target.read_text())
   for robot in streams.robots:
     told = {name.split(":")[0] for name in streams.suite.robots[robot].get("tune", {})}
     fit, healthy = reference(streams.get(robot, streams.find(robot, "nominal", "tune")))
@@ -211,10 +210,10 @@ def main() -> None:
       continue
     fit = weighed(fit, healthy, faulty, np.ones(len(numbers), bool))
     short = lambda x: np.vectorize(lambda v: float(f"{v:.6g}"))(np.asarray(x, float)).tolist()
-    robots[robot] = {k: short(v) for k, v in fit._asdict().items()}
+    held["agents"][streams.agent(robot)] = {k: short(v) for k, v in fit._asdict().items()}
   if not given.left_out:
-    value = {"command": " ".join(["python", *sys.argv]), "version": __version__, "robots": robots}
-    folders.atomic(target, lambda file: file.write((json.dumps(value) + "\n").encode()))
+    held |= {"version": __version__}
+    folders.atomic(target, lambda file: file.write((json.dumps(held) + "\n").encode()))
 
 
 if __name__ == "__main__":

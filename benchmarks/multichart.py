@@ -99,7 +99,7 @@ def main(args: argparse.Namespace) -> None:
     )
 
   def score(name, settings):
-    entry = entries_of.entry(name, settings)
+    (entry,), _ = entries_of.able([entries_of.entry(name, settings)], held, robots)
     tables[name] = {robot: standing(entry, *data[robot]) for robot in robots}
     print(
       f"{name:60s}"

@@ -17,20 +17,27 @@ import sys
 
 import pyarrow.parquet as parquet
 
-from benchmarks.report.report import load
-from mjx_cl import detectors
-from mjx_cl.cli import app
-from mjx_cl.detectors import baselines
-from mjx_cl.errors import FileError
-from mjx_cl.io import tables
-from mjx_cl.leaderboard import score
+sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1]))  # for its neighbours
+from benchmarks.report.report import load  # noqa: E402
+from mjx_cl import detectors  # noqa: E402
+from mjx_cl.cli import app  # noqa: E402
+from mjx_cl.config import own_agent  # noqa: E402
+from mjx_cl.detectors import baselines  # noqa: E402
+from mjx_cl.errors import FileError  # noqa: E402
+from mjx_cl.io import tables  # noqa: E402
+from mjx_cl.leaderboard import score  # noqa: E402
 
 FILE = pathlib.Path(detectors.__file__).parent / "thresholds.json"
 LEAST = 10  # alarms
 LATER = [
-  *(f"results/learnt/{robot}" for robot in ("car", "quadruped", "walker")),
+  *(f"results/learnt/{robot}" for robot in ("car", "walker")),
   *(f"results/innovations/{agent}" for agent in ("car", "quadruped", "quadruped-trot-2")),
   *(f"results/innovations/{agent}" for agent in ("walker", "walker-2", "walker-3")),
+  # `multichart` apart, whose units are the thresholds of its charts
+  *(
+    f"results/leaderboard_100k/{name}"
+    for name in ("quadruped-trot-2-multichart", "quadruped-trot-2")
+  ),
 ]
 BOARDS = ["results/leaderboard_100k", *LATER]
 
@@ -80,7 +87,8 @@ def collect(folder: pathlib.Path) -> dict:
   out: dict[str, dict] = {"robots": {}, "agents": {}}
   for robot, own in sorted(robots.items()):
     agent = agents.get(robot, robot)
-    out["robots" if agent == robot else "agents"][agent] = dict(sorted(own.items()))
+    shared = agent == own_agent(robot)
+    out["robots" if shared else "agents"][robot if shared else agent] = dict(sorted(own.items()))
   return head | out
 
 

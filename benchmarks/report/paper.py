@@ -80,7 +80,7 @@ EXPERIMENTS: dict[str, Experiment] = {
     9000,
     "right hind leg's velocity limits to a third",
     "9 runs and a failed one",
-    "MuJoCo in place of Isaac Lab",
+    "MuJoCo in place of Isaac Lab; agent first cloned from a driver that knows the robot's state",
     (
       Statement("alarm after onset", '"quickly"', "IV-B", "latency"),
       Statement(
@@ -329,7 +329,7 @@ def setup(experiment: Experiment, config: dict) -> list[str]:
     (card["dreamer"]["size"], author.size, "{} in place of {}"),
     (own("batch"), author.batch, "{} sequences an update in place of {}"),
     (own("lr"), author.lr, "learning rate {:g} in place of {:g}"),
-    (own("policy_lr"), author.policy_lr, "the policy's own steps {:g} times as long"),
+    (adapt.get("policy_lr") or 1.0, author.policy_lr, "the policy's own steps {:g} times as long"),
     (own("anchor"), author.anchor, "policy held to the actions taken with a weight of {:g}"),
     (
       dreamer["min_std"],

@@ -7,7 +7,7 @@ from mjx_cl import envs
 from mjx_cl.cli.agents import MOST_EPISODES
 from mjx_cl.cli.flags import Certify, Render
 from mjx_cl.cli.output import emit, say
-from mjx_cl.config import FaultConfig
+from mjx_cl.config import FaultConfig, own_agent
 from mjx_cl.envs import adapters
 from mjx_cl.errors import UserError, require
 from mjx_cl.faults import presets
@@ -72,7 +72,9 @@ def do_render(args: Render) -> None:
       **acting,
     )
   if args.json:
-    emit({"env": args.env, "agent": args.agent or args.env, "fault": args.fault, **result})
+    emit(
+      {"env": args.env, "agent": args.agent or own_agent(args.env), "fault": args.fault, **result}
+    )
   else:
     print(
       f"{result['file']}: {result['frames']} pictures, {result['fps']:g} a second, drawn by "

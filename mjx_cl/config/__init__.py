@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from typing import Annotated
 
@@ -39,6 +40,7 @@ from mjx_cl.errors import require
 # often
 CHUNK = 64
 FINETUNING_LR = 1e-4  # of agents whose card names none
+OWN_AGENT = {"quadruped": "quadruped-trot-2"}  # where it is not the one of the robot's name
 # settings by name; on the command line --set name=value ...
 Settings = Annotated[
   dict,
@@ -58,6 +60,19 @@ def named(fault: str) -> bool:
   path/to/file.py:name.
   """
   return "/" in fault and ":" not in fault
+
+
+def own_agent(robot: str) -> str:
+  """Name of the agent that a robot has where none is given."""
+  return OWN_AGENT.get(robot, robot)
+
+
+def whose(known: Collection[str], robot: str | None, agent: str | None = None) -> str:
+  """Of the agents that something is known of the one whose figures are taken: this one, or the
+  robot's own, or the walker's.
+  """
+  names = agent or "", own_agent(robot or "walker"), "walker"
+  return next(name for name in names if name in known)
 
 
 def finetuning_lr(lr: float | None, card: dict) -> float | None:

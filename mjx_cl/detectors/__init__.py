@@ -9,6 +9,7 @@ from mjx_cl.detectors.paper_rule import (
   CALIBRATED,
   PAPER,
   calibrated_rule,
+  figures,
   one_threshold,
   paper_rule,
 )

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from mjx_cl.config import own_agent
 from mjx_cl.detectors.base import (
   Alarm,
   Detector,
@@ -238,7 +239,7 @@ def innovations(
     threshold=(threshold, above(threshold, 0), "above 0"),
     warmup=(warmup, warmup == 0 or warmup >= 2, "0, or at least 2"),
   )
-  fit = fit_of(agent or robot or "walker")
+  fit = fit_of(agent or own_agent(robot or "walker"))
   own, size, count = warmup or OWN, len(fit.mean), len(fit.grain)
   none = lambda: jnp.zeros((len(RATES), N + 2 * count))
   told = lambda: Warm(jnp.int32(own), jnp.asarray(fit.mean), jnp.square(fit.std) * own)

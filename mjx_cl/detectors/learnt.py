@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from mjx_cl.config import whose
 from mjx_cl.detectors.base import (
   Alarm,
   Detector,
@@ -39,7 +40,7 @@ Averages = Float[Array, "rates channels"]
 
 
 class Fit(NamedTuple):
-  """What was fitted on one robot; p channels, r rates.
+  """What was fitted on one agent's robots; p channels, r rates.
 
   Attributes:
     mean: float32 (p,), of the channels, healthy.
@@ -64,11 +65,11 @@ class Fit(NamedTuple):
 
 @functools.cache
 def fits() -> dict[str, Fit]:
-  """Fit of each robot; written by benchmarks/fit_learnt.py."""
-  robots = json.loads(pathlib.Path(__file__).with_suffix(".json").read_text())["robots"]
+  """Fit of each agent that has one; written by benchmarks/fit_learnt.py."""
+  agents = json.loads(pathlib.Path(__file__).with_suffix(".json").read_text())["agents"]
   return {
-    robot: Fit(**{k: np.asarray(v, np.float32) for k, v in own.items()})
-    for robot, own in robots.items()
+    agent: Fit(**{k: np.asarray(v, np.float32) for k, v in own.items()})
+    for agent, own in agents.items()
   }
 
 
@@ -109,7 +110,11 @@ def ratio(averages: Averages, fit: Fit) -> Number:
 
 @whole
 def learnt(
-  threshold: Setting = 1.0, looks: str = "both", warmup: int = 0, robot: str | None = None
+  threshold: Setting = 1.0,
+  looks: str = "both",
+  warmup: int = 0,
+  agent: str | None = None,
+  robot: str | None = None,
 ) -> Detector:
   """Exponentially weighted averages of all channels at three rates: how far they are from a healthy
   robot's, and how much they look like faults that were seen before.
@@ -133,7 +138,8 @@ def learnt(
     threshold: decision level [units].
     looks: `distance`, `ratio` or `both`.
     warmup: samples that fit mean and std from the start [control steps]; 0: the fit's.
-    robot: whose fit is taken; default, and for a robot without any: the walker's.
+    agent: whose fit is taken, a shipped name; default, and for one without any: the robot's own.
+    robot: default, and for a robot without any: the walker.
 
   Returns:
     Detector over monitor.Residual.
@@ -150,7 +156,7 @@ def learnt(
   )
   if looks not in ("both", *LOOKS):
     raise UserError(f"detector 'learnt': looks is both, {' or '.join(LOOKS)}; got {looks!r}")
-  fit = fits().get(robot or "walker") or fits()["walker"]
+  fit = fits()[whose(fits(), robot, agent)]
   use, own = np.array([looks in ("both", name) for name in LOOKS]), warmup or OWN
   none = lambda: jnp.zeros((len(RATES), len(CHANNELS)))
   told = lambda: Warm(jnp.int32(own), jnp.asarray(fit.mean), jnp.square(fit.std) * own)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from mjx_cl.detectors.base import Alarm, Detector, Real, Setting, above, demand, whole
 from mjx_cl.detectors.combine import any_of
-from mjx_cl.detectors.thresholds import board
+from mjx_cl.detectors.thresholds import board, of_agents
 from mjx_cl.errors import UserError
 
 CHARTS = "cusum@surprise,ewma,e_detector"
@@ -35,6 +35,7 @@ def multichart(
   threshold: Setting = 1.0,
   charts: Any = CHARTS,
   robot: str | None = None,
+  agent: str | None = None,
 ) -> Detector:
   """Charts that look at different things, side by side; the alarm of any counts.
 
@@ -54,6 +55,7 @@ def multichart(
     threshold: decision level [thresholds h_i].
     charts: names on the leaderboard, joined by commas; those whose h_i is known.
     robot: whose h_i are taken; default, and for a robot without any: the walker's.
+    agent: whose h_i stand above the robot's, where it has its own.
 
   Returns:
     Detector over monitor.Residual.
@@ -65,6 +67,7 @@ def multichart(
   if not isinstance(charts, str):
     raise UserError(f"detector 'multichart': charts are names, joined by commas; got {charts!r}")
   rows = board().get(robot or "walker") or board()["walker"]
+  rows = rows | of_agents().get(agent or "", {})
   known = {name: row for name, row in rows.items() if row["settings"]["use"] != "multichart"}
   names = [name.strip() for name in charts.split(",")]
   for name in names:
@@ -76,7 +79,7 @@ def multichart(
   def chart(name: str) -> Detector:
     settings, unit = dict(known[name]["settings"]), known[name]["threshold"]
     use = settings.pop("use")
-    built = make(use, threshold=threshold * unit, robot=robot, **settings)
+    built = make(use, threshold=threshold * unit, robot=robot, agent=agent, **settings)
     return in_units(built, unit, threshold)
 
   return any_of(*map(chart, names))

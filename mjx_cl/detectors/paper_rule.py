@@ -2,20 +2,31 @@
 
 from typing import Any
 
+from mjx_cl.config import whose
 from mjx_cl.detectors.base import Detector, Real, Setting, whole
 from mjx_cl.detectors.combine import any_of, on
 from mjx_cl.detectors.rolling_sigma import rolling_sigma
 
 # names of the rule in the table; it has figures of its own: CALIBRATED, three deviations
 PAPER = "rolling_sigma", "rolling_sigma_plain"
-# by robot, chosen by benchmarks/calibrate.py on tuning seeds, see results/arl0.json,
-# arl0_quadruped.json, arl0_car.json
+# by agent, chosen by benchmarks/calibrate.py on tuning seeds, see results/arl0.json and
+# arl0_AGENT.json
 CALIBRATED: dict[str, dict[str, Any]] = {
   "walker": {
     "window": 4000,
     "smooth": 400,
     "lag": 500,
     "threshold": 6.5,
+    "patience": 1,
+    "two_sided": False,
+    "log": True,
+  },
+  "quadruped-trot-2": {
+    "window": 4000,
+    "smooth": 200,
+    "lag": 500,
+    "threshold": 6.0,
+    "threshold_rpr": 4.0,
     "patience": 1,
     "two_sided": False,
     "log": True,
@@ -75,7 +86,7 @@ def paper_rule(
 def calibrated_rule(**settings: Any) -> Detector:
   """The paper's rule calibrated to ARL0 = 100,000 steps on nominal robots, seeds 100 to 109:
   trailing mean of the logarithms, a lagged reference, one side, a threshold for each residual.
-  Figures of the walker; `make` takes those of the robot where it is told which.
+  Figures of the walker; `make` takes those of the agent where it is told which.
 
   How the figures were found: benchmarks/calibrate.py; its table: results/arl0.json. Runs of single
   samples in a row do for the car, not for what walks: a gait makes residuals swing, and at this
@@ -90,11 +101,16 @@ def calibrated_rule(**settings: Any) -> Detector:
   return paper_rule(**(CALIBRATED["walker"] | settings))
 
 
-def one_threshold(robot: str | None) -> dict:
-  """Settings of `rolling_sigma` on a robot, without a threshold: both residuals share one, RPR's
-  deviations counted in the proportion of its calibrated threshold to that of OPR. A single
-  threshold can then be calibrated, as the leaderboard does.
+def figures(robot: str | None, agent: str | None = None) -> dict:
+  """Settings of `rolling_sigma` with this agent."""
+  return CALIBRATED[whose(CALIBRATED, robot, agent)]
+
+
+def one_threshold(robot: str | None, agent: str | None = None) -> dict:
+  """`figures` without a threshold: both residuals share one, RPR's deviations counted in the
+  proportion of its calibrated threshold to that of OPR. A single threshold can then be calibrated,
+  as the leaderboard does.
   """
-  own = dict(CALIBRATED.get(robot or "walker", CALIBRATED["walker"]))
+  own = dict(figures(robot, agent))
   threshold = own.pop("threshold")
   return own | {"threshold_rpr": None, "unit_rpr": own.get("threshold_rpr", threshold) / threshold}

@@ -2,7 +2,7 @@
 
 import inspect
 from collections.abc import Callable, Collection
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import jax
 
@@ -24,8 +24,8 @@ class Entry(NamedTuple):
     build: threshold -> Detector.
     calibrated: has a threshold.
     reference: looks at nothing.
-    own: robot -> build where the settings are a robot's own, which is compiled for each robot;
-      None: `build` serves all.
+    own: (robot, agent) -> build where the settings are an agent's own, which is compiled for each
+      robot, agent None: the robot's own; None: `build` serves all.
     signed: takes innovations.
   """
 
@@ -33,7 +33,7 @@ class Entry(NamedTuple):
   build: Build
   calibrated: bool
   reference: bool
-  own: Callable[[str], Build] | None = None
+  own: Callable[..., Build] | None = None
   signed: bool = False
 
 
@@ -68,7 +68,9 @@ def entry(name: str, settings: dict) -> Entry:
   reference, signed = (bool(getattr(factory, k, False)) for k in ("reference", "signed"))
   if use == "rolling_sigma" or signed or {"robot", "agent"} & set(parameters):
     more = {"shared": True} if use == "rolling_sigma" else {}
-    own = lambda robot: lambda threshold: build(threshold, robot=robot, **more)
+    own = lambda robot, agent=None: (
+      lambda threshold: build(threshold, robot=robot, agent=agent, **more)
+    )
   return Entry(name, build, calibrated, reference, own, signed)
 
 
@@ -118,9 +120,7 @@ def able(
   kept, left = [], []
   for one in entries:
     try:
-      if one.signed:
-        one = _signed(one, streams, robots)
-      kept.append(one)
+      kept.append(_of_agents(one, streams, robots))
     except UserError as e:
       if one.name in named:
         raise
@@ -128,18 +128,15 @@ def able(
   return kept, left
 
 
-def _signed(one: Entry, streams: StreamSet, robots: Collection[str]) -> Entry:
-  """A detector that takes innovations, of each robot's agent."""
-
-  def own(robot: str) -> Build:
-    agent, build = streams.agent(robot), cast(Any, one.build)
-    return lambda threshold: build(threshold, robot=robot, agent=agent)
-
-  for robot in robots:
+def _of_agents(one: Entry, streams: StreamSet, robots: Collection[str]) -> Entry:
+  """A detector with settings of each agent that acted in the set."""
+  of = one.own
+  own = of and (lambda robot: of(robot, streams.agent(robot)))
+  for robot in robots if one.signed else ():
     streams.need_innovations(robot)
-    if one.own:
+    if own:
       own(robot)(1.0)
-  return one._replace(own=own) if one.own else one
+  return one._replace(own=own)
 
 
 def one_line(name: str, run: Callable[[], Any]) -> Any:

@@ -7,7 +7,7 @@ import json
 import pathlib
 from typing import Any
 
-from mjx_cl.config import AdaptConfig, RunConfig
+from mjx_cl.config import AdaptConfig, RunConfig, own_agent
 from mjx_cl.errors import FileError, UserError, choose, require
 from mjx_cl.io import folders, tables
 from mjx_cl.leaderboard import methods_page
@@ -110,7 +110,7 @@ def _part(setting: str, config: dict, rows: list[dict]) -> list[dict]:
   whole = {
     "robot": config["env"],
     "setting": setting,
-    "agent": config["agent"] or config["env"],
+    "agent": config["agent"] or own_agent(config["env"]),
     "control_s": config["control_s"],
     **{k: config[k] for k in ("fault", "severity", "target")},
     "settings": settings(config),

@@ -5,7 +5,7 @@ import inspect
 
 from mjx_cl import detectors, envs
 from mjx_cl.adapt.arms import ARMS
-from mjx_cl.config import CHUNK, RunConfig
+from mjx_cl.config import CHUNK, RunConfig, own_agent
 from mjx_cl.faults.presets import becomes, changes
 from mjx_cl.runs.identity import known_as
 from mjx_cl.runs.records import acts
@@ -41,10 +41,10 @@ def watching(config: RunConfig) -> str | None:
   steps = found.arl0 * found.alarms
   low, high = (steps / n for n in reversed(intervals.poisson(found.alarms)))
   shared = found == detectors.calibrated(config.detector, robot, config.settings)
-  agent = robot if shared else config.agent
+  agent = own_agent(robot) if shared else config.agent
   plain = {f.name: (f.default,) for f in dataclasses.fields(RunConfig)} | {
     "env": (robot,),
-    "agent": (None, robot) if shared else (config.agent,),
+    "agent": (None, agent) if shared else (config.agent,),
   }
   other = [
     k

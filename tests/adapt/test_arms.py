@@ -1049,7 +1049,7 @@ def test_an_arm_with_an_agent_of_its_own(lived):
 def test_an_arm_without_its_agent_is_refused(tiny, tmp_path):
   config = RunConfig("walker", fault="gear", steps=300, onset=200, seeds=1, arms=("randomised",))
   with pytest.raises(
-    UserError, match="arm 'randomised': no agent 'quadruped-randomised'; shipped: .*walker"
+    UserError, match="arm 'randomised': no agent 'quadruped-trot-2-randomised'; shipped: .*walker"
   ):
     run.Runner(dataclasses.replace(config, env="quadruped"), tmp_path)
   agents.save(

@@ -1066,15 +1066,16 @@ def test_what_differs_from_the_papers_setup():
   same = json.loads(json.dumps(CONFIG)) | {"detector": "rolling_sigma_plain", "onset": 9000}
   same["adapt"] |= {"batch": None, "lr": None, "average": 1.0, "least": 1}
   same["agent_card"] = {"dreamer": {"size": "size12m", "batch": 16, "lr": 4e-5}}
-  assert paper.setup(dog, same) == ["MuJoCo in place of Isaac Lab"]
+  assert paper.setup(dog, same) == [dog.robot]
   assert paper.setup(walker, same) == ["onset 9,000 in place of 5,000"]
   slower = CONFIG | {"agent_card": CONFIG["agent_card"] | {"finetuning_lr": 3e-5}}
   assert paper.setup(walker, slower)[2] == "learning rate 3e-05 in place of 4e-05"
-  same["agent_card"]["dreamer"] |= {"horizon": 33, "policy_lr": 0.5}
+  same["agent_card"]["dreamer"] |= {"horizon": 33, "policy_lr": 1e-6}  # of its last stage alone
+  same["adapt"] |= {"policy_lr": 0.5}
   assert paper.setup(dog, same) == [
     "the policy's own steps 0.5 times as long",
     "discount horizon 33 in place of 333",
-    "MuJoCo in place of Isaac Lab",
+    dog.robot,
   ]
   same["agent_card"]["dreamer"] = {
     "size": "size12m",
@@ -1083,7 +1084,7 @@ def test_what_differs_from_the_papers_setup():
     "max_std": 0.5,
     "entropy": 0.0,
   }
-  same["adapt"] |= {"anchor": 0.05}
+  same["adapt"] |= {"anchor": 0.05, "policy_lr": None}
   assert paper.setup(dog, same)[:4] == [
     "policy held to the actions taken with a weight of 0.05",
     "standard deviation of the actions at least 0.03 in place of 0.1",
@@ -1100,8 +1101,6 @@ def test_the_papers_block_names_every_experiment(results):
     len(e.statements) for e in paper.EXPERIMENTS.values()
   )
   assert text.count("size1m") == 1  # what all share is said once
-  assert (
-    cells(text, "`paper/quadruped`")[-1]
-    == "onset 5,000 in place of 9,000; MuJoCo in place of Isaac Lab"
-  )
+  own = f"onset 5,000 in place of 9,000; {paper.EXPERIMENTS['paper/quadruped'].robot}"
+  assert cells(text, "`paper/quadruped`")[-1] == own
   assert len({line.count("|") for line in text.split("\n") if line.startswith("|")}) == 1

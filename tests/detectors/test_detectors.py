@@ -412,50 +412,56 @@ def test_calibrated_settings_can_be_overridden():
   )
 
 
-@pytest.mark.parametrize("robot", detectors.CALIBRATED)
-def test_each_robot_has_its_own_figures(robot):
+CALIBRATED = [
+  ("quadruped" if "quadruped" in agent else agent, agent) for agent in detectors.CALIBRATED
+]
+
+
+@pytest.mark.parametrize("robot, agent", CALIBRATED)
+def test_each_agent_has_its_own_figures(robot, agent):
   """The settings are those that benchmarks/calibrate.py chose and results/ holds; a setting that is
   given wins.
   """
-  own = detectors.CALIBRATED[robot]
+  own = detectors.CALIBRATED[agent]
   chosen = json.loads(
     (
       pathlib.Path(__file__).parents[2]
-      / f"results/arl0{'' if robot == 'walker' else '_' + robot}.json"
+      / f"results/arl0{'' if agent == 'walker' else '_' + agent}.json"
     ).read_text()
   )["chosen"]
   assert {k: chosen[k] for k in own} == own and chosen["arl0"] >= 100_000
   assert chosen["threshold_rpr"] == own.get("threshold_rpr", own["threshold"])
-  state = detectors.make("rolling_sigma", robot=robot).init()
+  state = detectors.make("rolling_sigma", robot=robot, agent=agent).init()
   assert state[0].buffer.shape == (own["window"] + own["lag"],) and state[0].recent.shape == (
     own["smooth"],
   )
+  assert detectors.figures("quadruped") == detectors.CALIBRATED["quadruped-trot-2"]
+  assert detectors.figures("walker", "walker-2") == detectors.CALIBRATED["walker"]
   assert detectors.make("rolling_sigma", robot=robot, smooth=7).init()[0].recent.shape == (7,)
   assert detectors.make("rolling_sigma", window=300, lag=20).init()[0].buffer.shape == (320,)
   assert detectors.make("rolling_sigma_plain").init()[0].buffer.shape == (1000,)
 
 
-@pytest.mark.parametrize("robot", detectors.CALIBRATED)
-def test_one_threshold_for_both_residuals_is_both_thresholds_in_proportion(robot):
+@pytest.mark.parametrize("robot, agent", CALIBRATED)
+def test_one_threshold_for_both_residuals_is_both_thresholds_in_proportion(robot, agent):
   """What the leaderboard calibrates: at the calibrated threshold it is the detector of `mjx-cl
   run`, and its score tells when it fires.
   """
-  own = detectors.CALIBRATED[robot]
+  own = detectors.CALIBRATED[agent]
   ratio = own.get("threshold_rpr", own["threshold"]) / own["threshold"]
   small = dict(
     window=100, warmup=20, smooth=40, lag=2
   )  # long excursions: the car wants 20 samples in a row
   xs = residuals(jax.random.key(6), 400, invalid=0.0)
   run = lambda det: jax.lax.scan(det.update, det.init(), xs)[1]
-  assert detectors.one_threshold(robot) | {
+  assert detectors.one_threshold(robot, agent) | {
     "threshold_rpr": 0,
     "unit_rpr": 0,
     "threshold": 0,
   } == own | {"threshold_rpr": 0, "unit_rpr": 0, "threshold": 0}
-  one = run(detectors.make("rolling_sigma", robot=robot, shared=True, **small, threshold=0.8))
-  two = run(
-    detectors.make("rolling_sigma", robot=robot, **small, threshold=0.8, threshold_rpr=0.8 * ratio)
-  )
+  whose = dict(robot=robot, agent=agent, **small, threshold=0.8)
+  one = run(detectors.make("rolling_sigma", shared=True, **whose))
+  two = run(detectors.make("rolling_sigma", threshold_rpr=0.8 * ratio, **whose))
   np.testing.assert_array_equal(one.fired, two.fired)
   assert (
     one.fired.any()

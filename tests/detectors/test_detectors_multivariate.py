@@ -792,6 +792,12 @@ def test_the_units_of_multichart_are_the_robots():
     detectors.make("multichart", robot=robot, charts="cusum@surprise"), xs
   ).score[-1]
   known = detectors.board()
+  crouches = {"robot": "quadruped", "agent": "quadruped"}  # has thresholds of its own
+  per = lambda own: detectors.calibrated("cusum@surprise", settings={}, **own).value
+  of = lambda own: scan(detectors.make("multichart", charts="cusum@surprise", **own), xs).score[-1]
+  trots = crouches | {"agent": "quadruped-trot-2"}
+  np.testing.assert_allclose(of(crouches) / of(trots), per(trots) / per(crouches), rtol=1e-5)
+  assert per(trots) == detectors.board()["quadruped"]["cusum@surprise"]["threshold"]
   np.testing.assert_allclose(
     score("walker") / score("car"),
     known["car"]["cusum@surprise"]["threshold"] / known["walker"]["cusum@surprise"]["threshold"],

@@ -7,8 +7,9 @@ import pytest
 from test_detectors_multivariate import gaussian
 
 from benchmarks import fit_learnt
-from mjx_cl import detectors, envs
+from mjx_cl import detectors
 from mjx_cl.adapt import watch
+from mjx_cl.config import own_agent
 from mjx_cl.detectors import base, learnt
 from mjx_cl.detectors.multivariate import pick
 from mjx_cl.errors import UserError
@@ -66,12 +67,15 @@ def by_hand(rows, fit, threshold, looks):
 
 
 @pytest.mark.parametrize("looks", ["both", *learnt.LOOKS])
-@pytest.mark.parametrize("robot", ["walker", "quadruped"])
-def test_it_is_its_equation(robot, looks):
-  fit = learnt.fits()[robot]
+@pytest.mark.parametrize(
+  "robot, agent, fit",
+  [("walker", None, "walker"), ("quadruped", None, "quadruped-trot-2"), ("quadruped",) * 3],
+)
+def test_it_is_its_equation(robot, agent, fit, looks):
+  fit = learnt.fits()[fit]
   rows = residuals(1200, fit, lift=3.0)
   rows = rows._replace(valid=np.arange(1200) % 7 != 3)
-  det = detectors.make("learnt", threshold=1.5, looks=looks, robot=robot)
+  det = detectors.make("learnt", threshold=1.5, looks=looks, robot=robot, agent=agent)
   _, out = jax.jit(lambda xs: jax.lax.scan(det.update, det.init(), xs))(rows)
   score, fired = by_hand(rows, fit, 1.5, looks)
   assert fired.any() and np.array_equal(np.isnan(score), np.isnan(out.score))
@@ -136,7 +140,8 @@ def is_warm(x):
 
 
 def test_every_robot_that_ships_with_an_agent_has_a_fit():
-  assert set(StreamSet().robots) == set(learnt.fits()) <= set(envs.ENVS)
+  known, held = set(learnt.fits()), StreamSet()
+  assert known == {held.agent(r) for r in held.robots} | {own_agent(r) for r in held.robots}
   walker, other = (detectors.make("learnt", robot=name) for name in ("walker", "spot"))
   rows = residuals(300, learnt.fits()["walker"])
   same = [jax.lax.scan(det.update, det.init(), rows)[1].score for det in (walker, other)]

@@ -21,7 +21,7 @@ def shipped():
 
 def test_the_agents_that_ship_are_those_that_acted(shipped):
   for robot in shipped.robots:
-    trained = agents.of(envs.make(robot))
+    trained = agents.of(envs.make(robot), shipped.agent(robot))
     assert shipped.config["agents"][robot]["crc32"] == parts.digest(trained.train.params), robot
 
 

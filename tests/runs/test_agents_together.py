@@ -11,6 +11,7 @@ from test_cli import content, mjx, refused  # noqa: F401  fixtures
 from test_records import row
 from test_transfer import agent, saved  # noqa: F401  fixtures: a tiny agent of the car
 
+from mjx_cl import config, envs
 from mjx_cl.cli import runs
 from mjx_cl.config import RunConfig
 from mjx_cl.errors import UserError
@@ -107,6 +108,10 @@ def test_the_bootstrap_is_that_of_agents_and_then_of_their_rows():
 def test_the_shipped_agents_numbered():
   assert agents.numbered("car") == agents.numbered("car_real") == ["car", "car-2", "car-3"]
   assert "walker-plain" not in agents.numbered("walker")
+  trots = [f"quadruped-trot{end}" for end in ("", "-2", "-3")]
+  assert agents.numbered("quadruped") == trots
+  own = agents.of(envs.make("quadruped"))  # not the one of the robot's name, which crouches
+  assert agents.called(own) == config.own_agent("quadruped") == "quadruped-trot-2"
   with pytest.raises(UserError, match="no agent of 'halfcheetah' ships; shipped: car,"):
     agents.numbered("halfcheetah")
 

@@ -23,6 +23,7 @@ from mjx_cl.config import (
   field_kinds,
   finetuning_lr,
   kinds,
+  own_agent,
   recorded,
 )
 from mjx_cl.dreamer.agent import Agent, TrainState
@@ -106,13 +107,14 @@ def of(env: Any, path: str | None = None, **departures: Any) -> Trained:
 
 
 def numbered(env_name: str) -> list[str]:
-  """Shipped agents of a robot, each of a training seed of its own: NAME, NAME-2, ..., where NAME is
-  the robot or the one whose agents it takes.
+  """Shipped agents of a robot, each of a training seed of its own, by the recipe of the one that it
+  has without a path: NAME, NAME-2, ...
 
   Raises:
     UserError: where none ships.
   """
   name = _own_name(env_name, getattr(envs.ENVS.data.get(env_name), "agents_of", None))
+  name = re.sub(r"-\d+$", "", name)
   found = [agent for agent in shipped() if re.fullmatch(rf"{re.escape(name)}(-\d+)?", agent)]
   require(found, f"no agent of {env_name!r} ships; shipped: {', '.join(shipped()) or 'none'}")
   return found
@@ -120,12 +122,13 @@ def numbered(env_name: str) -> list[str]:
 
 def _own_name(env_name: str, related: str | None) -> str:
   """The shipped agent that a robot has without a path."""
-  return related if related and env_name not in shipped() else env_name
+  name = own_agent(env_name)
+  return own_agent(related) if related and name not in shipped() else name
 
 
 def is_shipped(env: Any) -> bool:
   """Whether there is an agent for this robot without a path."""
-  return not {env.spec.name, getattr(env, "agents_of", None)}.isdisjoint(shipped())
+  return _own_name(env.spec.name, getattr(env, "agents_of", None)) in shipped()
 
 
 def read_card(folder: pathlib.Path) -> tuple[dict, DreamerConfig]:
@@ -162,7 +165,7 @@ def load(
   """Loads an agent by shipped name or folder.
 
   Args:
-    path: folder or shipped name; None: the shipped agent named as the environment, or as the one
+    path: folder or shipped name; None: the robot's own (config.own_agent), or that of the robot
       whose agents it takes.
     env_name: robot that it must fit.
     obs_size: variables of its observation.
