@@ -31,7 +31,7 @@ import numpy as np  # noqa: E402
 from mjx_cl import envs, faults  # noqa: E402
 from mjx_cl.cli import app  # noqa: E402
 from mjx_cl.io import tables  # noqa: E402
-from mjx_cl.leaderboard import lives, parts, suite  # noqa: E402
+from mjx_cl.leaderboard import lives, parts, streams, suite  # noqa: E402
 from mjx_cl.logs import charts, verdict  # noqa: E402
 from mjx_cl.rollout.monitor import Monitor  # noqa: E402
 from mjx_cl.rollout.scan import Rollout, nest, start  # noqa: E402
@@ -90,7 +90,7 @@ def gapped(x: np.ndarray, fresh: np.ndarray, rows: int) -> np.ndarray:
 def robot(name: str, ahead: bool) -> dict:
   """Shares found of a robot's faults, the charts' and the board's; `ahead`: in innovations."""
   env, board = envs.make(name), suite.suite("leaderboard")
-  trained = agents.of(env, None)
+  trained = agents.of(env, streams.StreamSet().agent(name))  # as in the set it stands beside
   who, keys, onsets, steps, _ = parts.who_lives(board, name, "tune", "fault", env.spec.control_s)
   scored = {(f.partition(":")[0], s) for f, own in board.robots[name]["score"].items() for s in own}
   keep = np.array(
