@@ -24,9 +24,9 @@ class Run(RunConfig):
   Example: mjx-cl run walker --fault gear --severity 0.5 --seeds 2 --out runs/gear
 
   Attributes:
-    agent: Trained agents: shipped names or folders; `all`: the robot, ROBOT-2, ... of other
-      training seeds; default: the robot's own. Of several each lives a run of its own in
-      OUT/agent=NAME, and OUT/bench.json says what they say together.
+    agent: Trained agents: shipped names or folders; default: the robot's own (walker, car,
+      quadruped-trot-2); `all`: it and its like of other training seeds. Of several each lives a
+      run of its own in OUT/agent=NAME, and OUT/bench.json says what they say together.
     out: Result folder.
     quick: A whole loop in about two minutes, for a first look: other defaults of fault, seeds,
       onset, steps and stop rule, for walker, quadruped and car.
