@@ -88,7 +88,7 @@ def pair(still: Still) -> tuple[np.ndarray, np.ndarray]:
   broken = envs.make(still.becomes) if still.becomes else env
   both = []
   for robot, fault, weak in ((env, {}, None), (broken, still.fault, still.weak)):
-    trained = agents.of(robot, None)
+    trained = agents.of(robot, "quadruped" if still.robot == "quadruped" else None)
     acting = {"agent": trained.agent, "params": trained.train.params, "repeat": trained.repeat}
     both.append(drawn(robot, acting | fault, still.step, still.seed, weak))
   return both[0], both[1]

@@ -4,9 +4,8 @@ benchmarks/thresholds.py [--board FOLDER ...] [--out FILE]
 Writes mjx_cl/detectors/thresholds.json from leaderboards' own files, of which the first that has a
 robot's detector counts: robot -> name on the board -> settings, threshold, ARL0 and the alarms that
 it was counted from; of boards of another agent than the robot's own the same by agent. Left out are references, which look at nothing, the paper's rule, which has
-figures of its own (`detectors.PAPER`), and what the board counted fewer than ten alarms of: a
-detector that no threshold brings to that rate stays silent, and one with too few rows has not been
-measured.
+figures of its own (`detectors.PAPER`), and what no threshold brings to that rate or the board
+counted fewer than ten alarms of: the former stays silent, the latter has not been measured.
 """
 
 from __future__ import annotations
@@ -29,15 +28,14 @@ from mjx_cl.leaderboard import score  # noqa: E402
 
 FILE = pathlib.Path(detectors.__file__).parent / "thresholds.json"
 LEAST = 10  # alarms
+TROTS = "quadruped-trot", "quadruped-trot-2"
+FITTED = "car", "quadruped", *TROTS, "walker", "walker-2", "walker-3"
 LATER = [
-  *(f"results/learnt/{robot}" for robot in ("car", "walker")),
-  *(f"results/innovations/{agent}" for agent in ("car", "quadruped", "quadruped-trot-2")),
-  *(f"results/innovations/{agent}" for agent in ("walker", "walker-2", "walker-3")),
+  *(f"results/learnt/{robot}" for robot in ("car", "quadruped", "walker")),
+  *(f"results/innovations/{agent}" for agent in FITTED),
   # `multichart` apart, whose units are the thresholds of its charts
-  *(
-    f"results/leaderboard_100k/{name}"
-    for name in ("quadruped-trot-2-multichart", "quadruped-trot-2")
-  ),
+  "results/leaderboard_100k/quadruped-trot-2-multichart",
+  "results/leaderboard_100k/quadruped-trot-2",
 ]
 BOARDS = ["results/leaderboard_100k", *LATER]
 
@@ -48,7 +46,7 @@ def collect(folder: pathlib.Path) -> dict:
   try:
     rows = parquet.read_table(
       folder / "leaderboard.parquet",
-      columns=["detector", "robot", "threshold", "arl0", "arl0_alarms"],
+      columns=["detector", "robot", "threshold", "arl0", "arl0_alarms", "note"],
     ).to_pylist()
   except Exception as e:  # pyarrow raises of its own
     raise FileError(
@@ -64,6 +62,7 @@ def collect(folder: pathlib.Path) -> dict:
       or name in baselines.REFERENCES
       or row["threshold"] is None
       or row["arl0_alarms"] < LEAST
+      or "asked" in (row["note"] or "")  # no threshold gives the asked rate
     ):
       continue
     settings = dict(known[name])

@@ -14,7 +14,7 @@ from mjx_cl.detectors.base import Alarm, Detector, Real, Setting
 from mjx_cl.detectors.paper_rule import calibrated_rule, figures, one_threshold, paper_rule
 from mjx_cl.detectors.rolling_sigma import rolling_sigma
 from mjx_cl.detectors.table import factory, split
-from mjx_cl.detectors.thresholds import Threshold, board, of_agents
+from mjx_cl.detectors.thresholds import Threshold, known_of
 from mjx_cl.errors import PluginError, UserError
 from mjx_cl.io.plugins import line
 
@@ -28,7 +28,7 @@ def calibrated(name: str, robot: str, settings: dict, agent: str | None = None) 
   """
   use, channel = split(name)
   _check_channels(name, channel, settings.get("channel"))
-  known = board().get(robot, {}) | of_agents().get(agent or "", {})
+  known = known_of(robot, agent)
   rows = [row for row in known.values() if row["settings"]["use"] == use]
   own = settings | ({"channel": channel} if channel else {})
   for row in rows:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from mjx_cl.detectors.base import Alarm, Detector, Real, Setting, above, demand, whole
 from mjx_cl.detectors.combine import any_of
-from mjx_cl.detectors.thresholds import board, of_agents
+from mjx_cl.detectors.thresholds import board, known_of
 from mjx_cl.errors import UserError
 
 CHARTS = "cusum@surprise,ewma,e_detector"
@@ -66,8 +66,8 @@ def multichart(
   demand("multichart", threshold=(threshold, above(threshold, 0), "above 0"))
   if not isinstance(charts, str):
     raise UserError(f"detector 'multichart': charts are names, joined by commas; got {charts!r}")
-  rows = board().get(robot or "walker") or board()["walker"]
-  rows = rows | of_agents().get(agent or "", {})
+  rows = known_of(robot, agent)
+  rows = rows if len(rows) > 1 else board()["walker"]
   known = {name: row for name, row in rows.items() if row["settings"]["use"] != "multichart"}
   names = [name.strip() for name in charts.split(",")]
   for name in names:

@@ -28,10 +28,18 @@ def _held() -> dict:
 def board() -> dict:
   """What the leaderboard at ARL0 = 100,000 control steps found: robot -> name on the board ->
   {settings, threshold, arl0, alarms}; written by benchmarks/thresholds.py from
-  results/leaderboard_100k and, of `learnt` and `innovations`, the folders of that name. The agent
-  that ships under the robot's name, seeds 100 to 109; detectors that can be had at that rate alone.
+  the folders that it names. The robot's own agent (config.own_agent), seeds 100 to 109; detectors
+  that can be had at that rate alone.
   """
   return _held()["robots"]
+
+
+def known_of(robot: str | None, agent: str | None = None) -> dict:
+  """Rows of `board` that hold with this agent: its own, and, where it has no board of its own but
+  single rows, the others of the robot's.
+  """
+  own = of_agents().get(agent or "", {})
+  return own if len(own) > 1 else board().get(robot or "", {}) | own
 
 
 def of_agents() -> dict:

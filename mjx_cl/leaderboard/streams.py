@@ -206,8 +206,8 @@ class StreamSet:
     return names
 
   def agent(self, robot: str) -> str:
-    """Shipped name or folder of the agent that was recorded, the robot's own where the set does not
-    tell.
+    """Shipped name or folder of the agent that was recorded, that of the robot's name where the
+    set does not tell.
     """
     told = self.config.get("agents", {}).get(robot, {})
     return told.get("agent") or told.get("name", robot)
