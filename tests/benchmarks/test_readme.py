@@ -117,8 +117,8 @@ def test_the_table_is_that_of_results():
   assert socks == [noticed, 10, latency, back, n]
   n, noticed, _, back, without = counts("paper/quadruped")
   assert quadruped == [noticed, 10, back, n, without, n]
-  arms = json.loads((ROOT / "results/steady_detector/summary.json").read_text())["arms"]
-  own, none = arms["detector"], arms["none"]
+  arms = json.loads((ROOT / "results/steady_loop/summary.json").read_text())["arms"]
+  own, none = arms["swift"], arms["none"]
   assert own["false_alarm_streams"] == 0 and own["affected"] == own["seeds"]
   back, without = own["recovered_within_10000"], none["recovered_within_10000"]
   assert trot == [own["alarms"], 10, own["latency_median_steps"], back, 10, without, 10]
