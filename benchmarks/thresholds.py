@@ -28,7 +28,7 @@ from mjx_cl.leaderboard import score  # noqa: E402
 
 FILE = pathlib.Path(detectors.__file__).parent / "thresholds.json"
 LEAST = 10  # alarms
-TROTS = "quadruped-trot", "quadruped-trot-2"
+TROTS = "quadruped-trot", "quadruped-trot-2", "quadruped-trot-3"
 FITTED = "car", "quadruped", *TROTS, "walker", "walker-2", "walker-3"
 LATER = [
   *(f"results/learnt/{robot}" for robot in ("car", "quadruped", "walker")),
