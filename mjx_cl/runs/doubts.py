@@ -7,7 +7,7 @@ from mjx_cl import detectors, envs
 from mjx_cl.adapt.arms import ARMS
 from mjx_cl.config import CHUNK, RunConfig, own_agent
 from mjx_cl.faults.presets import becomes, changes
-from mjx_cl.runs.identity import known_as
+from mjx_cl.runs.identity import agent_of, known_as
 from mjx_cl.runs.records import acts
 from mjx_cl.scoring import intervals
 
@@ -27,7 +27,7 @@ def watching(config: RunConfig) -> str | None:
   ):
     return None
   robot = known_as(envs.make(config.env, config.physics))
-  found = detectors.calibrated(config.detector, robot, config.settings, config.agent)
+  found = detectors.calibrated(config.detector, robot, config.settings, agent_of(config))
   if found is None:
     default = inspect.signature(build).parameters.get("threshold")
     own = "its own default threshold" + (
@@ -41,7 +41,7 @@ def watching(config: RunConfig) -> str | None:
   steps = found.arl0 * found.alarms
   low, high = (steps / n for n in reversed(intervals.poisson(found.alarms)))
   shared = found == detectors.calibrated(config.detector, robot, config.settings)
-  agent = own_agent(robot) if shared else config.agent
+  agent = own_agent(robot) if shared else agent_of(config)
   plain = {f.name: (f.default,) for f in dataclasses.fields(RunConfig)} | {
     "env": (robot,),
     "agent": (None, agent) if shared else (config.agent,),

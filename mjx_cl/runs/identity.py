@@ -77,6 +77,11 @@ def known_as(env: Any) -> str:
   return getattr(env, "agents_of", None) or env.spec.name
 
 
+def agent_of(config: RunConfig) -> str | None:
+  """The run's `agent`, one that ships by its name, however it was given."""
+  return config.agent and (agents.named(config.agent) or config.agent)
+
+
 def threshold_of(config: RunConfig) -> detectors.Threshold | None:
   """The board's threshold that this run's detector has without having been given one; None where it
   has another.
@@ -84,7 +89,7 @@ def threshold_of(config: RunConfig) -> detectors.Threshold | None:
   if "threshold" in config.settings or detectors.split(config.detector)[0] in detectors.PAPER:
     return None
   robot = known_as(envs.make(config.env, config.physics))
-  return detectors.calibrated(config.detector, robot, config.settings, config.agent)
+  return detectors.calibrated(config.detector, robot, config.settings, agent_of(config))
 
 
 def identity(config: RunConfig) -> dict:

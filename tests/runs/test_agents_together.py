@@ -15,7 +15,7 @@ from mjx_cl import config, envs
 from mjx_cl.cli import runs
 from mjx_cl.config import RunConfig
 from mjx_cl.errors import UserError
-from mjx_cl.runs import suite, summary
+from mjx_cl.runs import identity, suite, summary
 from mjx_cl.training import agents
 
 WALKER = RunConfig("walker", arms=("detector",))
@@ -112,6 +112,13 @@ def test_the_shipped_agents_numbered():
   assert agents.numbered("quadruped") == trots
   own = agents.of(envs.make("quadruped"))  # not the one of the robot's name, which crouches
   assert agents.called(own) == config.own_agent("quadruped") == "quadruped-trot-2"
+
+
+def test_a_shipped_agent_has_its_threshold_however_it_is_named():
+  of = lambda agent: identity.threshold_of(
+    RunConfig("walker", detector="innovations", agent=agent, arms=("none",))
+  )
+  assert of(str(agents.HERE / "walker-2")) == of("walker-2") != of("walker") == of(None)
   with pytest.raises(UserError, match="no agent of 'halfcheetah' ships; shipped: car,"):
     agents.numbered("halfcheetah")
 

@@ -88,8 +88,13 @@ def save(folder: os.PathLike | str, train: TrainState, card: dict) -> None:
 
 def called(trained: Trained) -> str:
   """The name of an agent that ships, the whole path of another's folder."""
-  path = pathlib.Path(trained.path)
-  return path.name if path.parent == HERE else str(path.absolute())
+  return named(trained.path) or str(pathlib.Path(trained.path).absolute())
+
+
+def named(path: str) -> str | None:
+  """The name of the agent that ships in this folder; None: another's."""
+  folder = pathlib.Path(path).resolve()
+  return folder.name if folder.parent == HERE.resolve() else None
 
 
 def of(env: Any, path: str | None = None, **departures: Any) -> Trained:
