@@ -1,9 +1,10 @@
 """Fits detector `learnt` on recorded streams: `python benchmarks/fit_learnt.py`.
 
 Healthy streams and tuning faults of the seeds that tune, of each robot; writes the fits of the
-agents that acted into mjx_cl/detectors/learnt.json, beside those of others. `--left-out` prints instead, for each tuning fault, the score of a fit
-that has not seen it, and of one that has seen it on other seeds: mean over its streams of
-100 2^(-latency / 5 s), 0 where it is missed, at one alarm in 10,000 healthy control steps.
+agents that acted into mjx_cl/detectors/learnt.json, beside those of others. `--left-out` prints
+instead, for each tuning fault, the score of a fit that has not seen it, and of one that has seen it
+on other seeds: mean over its streams of 100 2^(-latency / 5 s), 0 where it is missed, at one alarm
+in 10,000 healthy control steps.
 """
 
 import argparse

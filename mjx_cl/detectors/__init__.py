@@ -9,7 +9,7 @@ from mjx_cl.detectors.paper_rule import (
   CALIBRATED,
   PAPER,
   calibrated_rule,
-  figures,
+  calibrated_settings,
   one_threshold,
   paper_rule,
 )

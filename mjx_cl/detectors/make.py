@@ -11,7 +11,12 @@ import numpy as np
 from mjx_cl.config import kinds
 from mjx_cl.detectors import combine
 from mjx_cl.detectors.base import Alarm, Detector, Real, Setting
-from mjx_cl.detectors.paper_rule import calibrated_rule, figures, one_threshold, paper_rule
+from mjx_cl.detectors.paper_rule import (
+  calibrated_rule,
+  calibrated_settings,
+  one_threshold,
+  paper_rule,
+)
 from mjx_cl.detectors.rolling_sigma import rolling_sigma
 from mjx_cl.detectors.table import factory, split
 from mjx_cl.detectors.thresholds import Threshold, known_of
@@ -148,7 +153,7 @@ def _figures(
 ) -> dict:
   """What `make` hands on to a factory of its own accord."""
   if name == "rolling_sigma":
-    return (one_threshold if shared else figures)(robot, agent)
+    return (one_threshold if shared else calibrated_settings)(robot, agent)
   handed = {"robot": robot, "agent": agent, "make": make}
   taken = inspect.signature(build).parameters
   return {k: v for k, v in handed.items() if v is not None and k in taken}
@@ -207,7 +212,7 @@ def make(
       combine.patience; others have their own setting of this name, or none.
     cool_down: samples after an alarm in which no other counts, of the channels together, see
       combine.cool_down.
-    robot: of whose agent `rolling_sigma` has the figures, where CALIBRATED has them, default the
+    robot: whose agent's figures `rolling_sigma` starts from, where CALIBRATED has them, default the
       walker's; handed on to a factory that takes it. Others: see `calibrated`.
     agent: that acts, a shipped name or a folder, likewise; default: the robot's own.
     shared: `rolling_sigma` has one threshold for both residuals, see `one_threshold`.

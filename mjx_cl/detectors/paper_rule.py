@@ -101,16 +101,16 @@ def calibrated_rule(**settings: Any) -> Detector:
   return paper_rule(**(CALIBRATED["walker"] | settings))
 
 
-def figures(robot: str | None, agent: str | None = None) -> dict:
+def calibrated_settings(robot: str | None, agent: str | None = None) -> dict:
   """Settings of `rolling_sigma` with this agent."""
   return CALIBRATED[whose(CALIBRATED, robot, agent)]
 
 
 def one_threshold(robot: str | None, agent: str | None = None) -> dict:
-  """`figures` without a threshold: both residuals share one, RPR's deviations counted in the
-  proportion of its calibrated threshold to that of OPR. A single threshold can then be calibrated,
-  as the leaderboard does.
+  """`calibrated_settings` without a threshold: both residuals share one, RPR's deviations counted
+  in the proportion of its calibrated threshold to that of OPR. A single threshold can then be
+  calibrated, as the leaderboard does.
   """
-  own = dict(figures(robot, agent))
+  own = dict(calibrated_settings(robot, agent))
   threshold = own.pop("threshold")
   return own | {"threshold_rpr": None, "unit_rpr": own.get("threshold_rpr", threshold) / threshold}

@@ -435,8 +435,8 @@ def test_each_agent_has_its_own_figures(robot, agent):
   assert state[0].buffer.shape == (own["window"] + own["lag"],) and state[0].recent.shape == (
     own["smooth"],
   )
-  assert detectors.figures("quadruped") == detectors.CALIBRATED["quadruped-trot-2"]
-  assert detectors.figures("walker", "walker-2") == detectors.CALIBRATED["walker"]
+  assert detectors.calibrated_settings("quadruped") == detectors.CALIBRATED["quadruped-trot-2"]
+  assert detectors.calibrated_settings("walker", "walker-2") == detectors.CALIBRATED["walker"]
   assert detectors.make("rolling_sigma", robot=robot, smooth=7).init()[0].recent.shape == (7,)
   assert detectors.make("rolling_sigma", window=300, lag=20).init()[0].buffer.shape == (320,)
   assert detectors.make("rolling_sigma_plain").init()[0].buffer.shape == (1000,)

@@ -112,6 +112,8 @@ def test_the_shipped_agents_numbered():
   assert agents.numbered("quadruped") == trots
   own = agents.of(envs.make("quadruped"))  # not the one of the robot's name, which crouches
   assert agents.called(own) == config.own_agent("quadruped") == "quadruped-trot-2"
+  with pytest.raises(UserError, match="no agent of 'halfcheetah' ships; shipped: car,"):
+    agents.numbered("halfcheetah")
 
 
 def test_a_shipped_agent_has_its_threshold_however_it_is_named():
@@ -119,8 +121,6 @@ def test_a_shipped_agent_has_its_threshold_however_it_is_named():
     RunConfig("walker", detector="innovations", agent=agent, arms=("none",))
   )
   assert of(str(agents.HERE / "walker-2")) == of("walker-2") != of("walker") == of(None)
-  with pytest.raises(UserError, match="no agent of 'halfcheetah' ships; shipped: car,"):
-    agents.numbered("halfcheetah")
 
 
 @pytest.fixture
