@@ -134,7 +134,8 @@ def joined(published: list[dict], own: list[dict], name: str | None = None) -> l
 
   A method that is a file's function goes by the function's name, unless the board has one of that
   name; `name` is that of the only method of one's own. A life that is published already, by method,
-  setting, agent and seed, stays as published.
+  setting, agent and seed, stays as published. Of an agent that no published life of the setting has
+  the severity may be another: what costs one agent half may cost another nothing.
 
   Raises:
     UserError: a setting of the same name differs; `name` where there are more methods, or it is
@@ -152,19 +153,24 @@ def joined(published: list[dict], own: list[dict], name: str | None = None) -> l
   for method in new:
     short = name or method.rsplit(":", 1)[-1]
     called[method] = method if short in known or short in called.values() else short
-  there = {(life["robot"], life["setting"]): life for life in published}
+  setting = lambda life: (life["robot"], life["setting"])
+  there = {setting(life): life for life in published}
+  alike = {(*setting(life), life["agent"]): life for life in published}
   for life in own:
-    other = there.get((life["robot"], life["setting"]))
+    of = (*setting(life), life["agent"])
+    other = alike.get(of, there.get(setting(life)))
     if other is None:
       continue
     two = [json.loads(settings(json.loads(x["settings"]))) for x in (life, other)]
+    if of not in alike:
+      two[0]["severity"] = two[1]["severity"]
     if two[0] != two[1]:
       raise UserError(
         f"setting {life['setting']} was run with another {', '.join(folders.differing(*two))} than "
         f"the published one: it takes suite {SUITE!r} as it ships"
       )
   mine = [life | {"method": called.get(life["method"], life["method"])} for life in own]
-  if mine and there and not there.keys() & {(life["robot"], life["setting"]) for life in mine}:
+  if mine and there and not there.keys() & {setting(life) for life in mine}:
     return mine  # another suite: it stands by itself
   unit = lambda life: tuple(life[k] for k in adaptation.KEYS)
   held = {unit(life) for life in published}

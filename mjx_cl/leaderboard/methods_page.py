@@ -176,7 +176,9 @@ def section(
   own = [x for x in lives if (x["robot"], x["setting"]) == of]
   rows = {r["method"]: r for r in board.rows if (r["robot"], r["setting"]) == of}
   one = own[0]
-  what = one["fault"] + ("" if one["severity"] is None else f", severity {one['severity']:g}")
+  severities = dict.fromkeys(x["severity"] for x in own if x["severity"] is not None)
+  what = one["fault"] + (", severity " if severities else "")
+  what += " or ".join(f"{s:g}" for s in severities)
   what += f", target {one['target']}" if one.get("target") else ""
   what += f"; from step {one['onset']:,} on, {one['steps']:,} steps"
   return (

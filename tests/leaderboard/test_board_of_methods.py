@@ -143,6 +143,24 @@ def test_another_suite_stands_by_itself_and_other_settings_are_refused():
     methods.joined(lives, [x | {"settings": json.dumps(config)} for x in lives])
 
 
+def test_another_agent_may_have_another_severity_and_nothing_else():
+  lives = methods.of_folder(STEADY)
+  lives = [x for x in lives if x["setting"] == lives[0]["setting"]]
+  config = json.loads(lives[0]["settings"]) | {"severity": 0.9}
+  other = {"agent": "walker-9", "severity": 0.9}
+  own = [x | other | {"settings": json.dumps(config)} for x in lives]
+  both = methods.joined(lives, own)
+  assert len(both) == 2 * len(lives)
+  board = adaptation.board(both)
+  assert {r["agents"] for r in board.rows} == {2}
+  config["adapt"]["ratio"] = 64.0
+  with pytest.raises(UserError, match="run with another adapt than the published one"):
+    methods.joined(lives, [x | {"settings": json.dumps(config)} for x in own])
+  more = [x | {"seed": 900} for x in own]
+  with pytest.raises(UserError, match="run with another severity than"):  # of its own lives
+    methods.joined(both, [x | {"settings": lives[0]["settings"]} for x in more])
+
+
 @pytest.mark.parametrize(
   "argv, said",
   (
