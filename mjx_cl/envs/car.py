@@ -212,8 +212,8 @@ def advance(model: Model, motion: Motion, angle: jax.Array, speed: jax.Array) ->
 
 
 class Car(Racer):
-  """The simulated car on tracks of its own. Touching a wall terminates, 1,200 control steps of 0.05
-  s truncate.
+  """The simulated car on tracks of its own. Touching a wall, or facing back along the track,
+  terminates; 1,200 control steps of 0.05 s truncate.
 
   Reset: a random track and place on it, at most 0.3 m and 0.2 rad off the centre line, at rest with
   straight wheels.
@@ -253,7 +253,7 @@ class Car(Racer):
     key_noise, key = jax.random.split(state.physics.key)
     motion = advance(model, state.physics.motion, *command(action))
     along = self.along(track, motion)
-    crashed = self.course.collides(track, motion.x, motion.y, motion.yaw)
+    crashed = self.crashed(track, motion)
     obs, step = self._observe(model, motion, track, key_noise), state.step + 1
     earned = reward(along, crashed, model.task["reward_weights"])
     truncated = ~crashed & (step >= self.spec.episode_steps)

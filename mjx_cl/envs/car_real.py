@@ -256,9 +256,9 @@ def read_motion(qpos: jax.Array, qvel: jax.Array) -> tuple[Motion, jax.Array]:
 class CarReal(racing.Racer):
   """The four-wheel car on the tracks of `car`, with the reality gap switched on by name.
 
-  Touching a wall, or tipping over by 60 degrees, terminates; 1,200 control steps of 0.05 s
-  truncate. Reset as in `car`, on settled springs. `Model.task` as in `car` where the name is the
-  same; besides
+  Touching a wall, facing back along the track, or tipping over by 60 degrees, terminates; 1,200
+  control steps of 0.05 s truncate. Reset as in `car`, on settled springs. `Model.task` as in `car`
+  where the name is the same; besides
 
     accel_max: () [m/s2].
     speed_lag_s: () [s].
@@ -368,7 +368,7 @@ class CarReal(racing.Racer):
     along = racing.progress(
       self.course, last.track, motion.x, motion.y, out["qvel"][0], out["qvel"][1]
     )
-    crashed = self.course.collides(last.track, motion.x, motion.y, motion.yaw) | ~(upright > 0.5)
+    crashed = self.crashed(last.track, motion) | ~(upright > 0.5)
     obs, step = self._observe(model, motion, last.track, key_noise), state.step + 1
     earned = racing.reward(along, crashed, model.task["reward_weights"])
     truncated = ~crashed & (step >= self.spec.episode_steps)

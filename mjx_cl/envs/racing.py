@@ -150,11 +150,25 @@ def progress(
   return velocity_x * jnp.cos(heading) + velocity_y * jnp.sin(heading)
 
 
+def astray(
+  course: Course, track: jax.Array, x: jax.Array, y: jax.Array, yaw: jax.Array
+) -> jax.Array:
+  """Whether the car faces back along the track, bool (): cos(yaw - heading at its nearest point) <
+  0.
+
+  The observation does not tell the two ways round apart, so that a car that has spun would drive on
+  as well as ever and learn that driving well does not pay. The reference driver is at most 20
+  degrees off the heading, in `car_real`, where it crashes, 45. To end an episode there is the usage
+  of TORCS (Loiacono, Cardamone and Lanzi 2013, https://arxiv.org/abs/1304.1672, by gym_torcs).
+  """
+  return jnp.cos(yaw - course.locate(track, x, y).heading) < 0
+
+
 def reward(
   along: jax.Array, crashed: jax.Array, weights: jax.Array | tuple[float, ...] = WEIGHTS
 ) -> jax.Array:
   """Reward, float32 (): 0.2 along - 5 [crashed], for the speed along the track [m/s]; 1 at the
-  highest speed, negative the wrong way round.
+  highest speed. Crashed: has touched a wall, or is `astray`.
 
   5 is what a new start costs, 10 control steps from standstill at half of the full reward: even a
   policy that is blind to what follows an end gains nothing by crashing.
@@ -207,6 +221,11 @@ class Racer:
     """Privileged: track, x, y [m], yaw [rad] and speed ahead [m/s]."""
     m = state.physics.motion
     return state.physics.track, m.x, m.y, m.yaw, m.vx
+
+  def crashed(self, track: jax.Array, motion: Motion) -> jax.Array:
+    """Whether the car touches a wall or is `astray`, bool ()."""
+    at = track, motion.x, motion.y, motion.yaw
+    return self.course.collides(*at) | astray(self.course, *at)
 
   def measure(self, state: EnvState) -> dict[str, jax.Array]:
     """mean_speed_m_s: speed along the track, float32 ()."""

@@ -515,6 +515,20 @@ def test_contact_terminates_and_time_truncates(env, init, step):
   )
 
 
+def test_a_car_that_faces_back_along_the_track_has_crashed(env, init, step):
+  state, _ = init(3)
+  t, degrees = env.course.tracks[1], np.array([0, 85, -85, 95, -95, 180])
+  turn = np.resize(np.radians(degrees), CARS)
+  motion = motions(CARS, x=t.centre[9][0], y=t.centre[9][1], yaw=t.heading[9] + turn)
+  physics = state.physics._replace(motion=motion, track=jnp.ones(CARS, jnp.int32))
+  _, out = step(
+    env.model, state._replace(physics=physics), jnp.tile(jnp.asarray([0.0, -1]), (CARS, 1))
+  )
+  assert out.terminated[:6].tolist() == [False, False, False, True, True, True]
+  assert not out.truncated.any()
+  np.testing.assert_allclose(out.reward[:6], [0, 0, 0, -5, -5, -5], atol=0.1)  # from rest
+
+
 def test_same_key_gives_equal_bits_and_a_loop_the_same_numbers(env, init, step, same):
   action = jnp.tile(jnp.asarray([[0.3, 1.0], [-0.2, 0.5], [0.1, -1.0]]), (CARS // 3, 1))
 

@@ -488,13 +488,13 @@ def test_observation_reward_and_end_follow_the_course(env, drive):
       mujoco.mju_quat2Mat(matrix[i], q[i, 3:7])
     yaw = np.arctan2(matrix[:, 3], matrix[:, 0])
     track, place = state.physics.track, [np.float32(x) for x in (q[:, 0], q[:, 1], yaw)]
-    near = np.asarray(collides(track, *place))
+    heading = np.asarray(locate(track, *place[:2]).heading)
+    near = np.asarray(collides(track, *place)) | (np.cos(yaw - heading) < 0)
     np.testing.assert_allclose(out.obs[:, :64], np.clip(scan(track, *place), 0, 10) / 10, atol=1e-4)
     own = np.stack(
       [v[:, 0] * np.cos(yaw) + v[:, 1] * np.sin(yaw), v[:, 5], (q[:, 8] + q[:, 11]) / 2], -1
     )
     np.testing.assert_allclose(out.obs[:, 64:], own, atol=1e-4)
-    heading = np.asarray(locate(track, *place[:2]).heading)
     np.testing.assert_allclose(
       out.reward, (v[:, 0] * np.cos(heading) + v[:, 1] * np.sin(heading)) / 5 - 5 * near, atol=1e-4
     )
@@ -503,6 +503,23 @@ def test_observation_reward_and_end_follow_the_course(env, drive):
     assert not out.truncated.any()
     ended |= near
   assert ended.all()  # a constant command meets a wall
+
+
+def test_facing_back_along_the_track_terminates(env, drive):
+  def change(state):
+    backend = state.physics.backend
+    for i, turn in enumerate((0.0, np.pi, 1.7)):
+      m = state.physics.motion
+      yaw = m.yaw[i] + turn
+      qpos = np.array(env._rest)
+      qpos[:2], qpos[3:7] = (m.x[i], m.y[i]), (np.cos(yaw / 2), 0, 0, np.sin(yaw / 2))
+      backend = backend.at[i].set(env.physics.init(jnp.asarray(qpos, jnp.float32), jnp.zeros(16)))
+    return state._replace(physics=state.physics._replace(backend=backend))
+
+  keys = jax.random.split(jax.random.key(6), 3)
+  _, _, (out,) = drive([env.model] * 3, keys, [[0.0, -1.0]], change)
+  np.testing.assert_array_equal(out.terminated, [False, True, True])
+  np.testing.assert_allclose(out.reward, [0, -5, -5], atol=0.2)  # from rest
 
 
 def test_tipping_over_terminates_and_the_time_limit_truncates(env, drive):
