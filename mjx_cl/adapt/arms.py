@@ -199,6 +199,13 @@ _SHIPPED: dict[str, Arm] = {
   ),
   "quiet-guarded": Arm("as guarded, and as quiet", ALARM, RULE, method="quiet-guarded"),
   "swift-guarded": Arm("as guarded, and as swift", ALARM, RULE, method="swift-guarded"),
+  "ratchet": Arm(
+    "as detector, but the learner goes back to its best weights so far where it falls behind them",
+    ALARM,
+    RULE,
+    method="ratchet",
+  ),
+  "swift-ratchet": Arm("as ratchet, and as swift", ALARM, RULE, method="swift-ratchet"),
   "still": Arm(
     "from the alarm on the robot does not explore, and learns nothing: quiet without learning",
     ALARM,

@@ -885,6 +885,44 @@ def test_agents_round_trip(tiny, tmp_path, same):
   )  # and loses nothing twice
 
 
+def test_a_small_agent_differs_by_its_rounding_alone(tiny, tmp_path, same):
+  """Weights to 11 bits, squares to a third of an octave, momentum from 0, all else in full."""
+  state = used(tiny)
+  square = jax.tree.map(np.abs, state.opt[1].nu)
+  zeros = lambda x: np.where(np.arange(x.size).reshape(x.shape) == 0, 0, x).astype(np.float32)
+  state = state._replace(
+    opt=(state.opt[0], state.opt[1]._replace(nu=jax.tree.map(zeros, square)), *state.opt[2:]),
+    params=jax.tree.map(lambda x: x / (1 + np.abs(x)), state.params),
+    slow=jax.tree.map(lambda x: x / (1 + np.abs(x)), state.slow),
+  )
+  card = {"env": "walker", "dreamer": dataclasses.asdict(tiny.config)}
+  agents.save(tmp_path, state, card, small=True)
+  back = agents.load(str(tmp_path), "walker", 24, 6).train
+  for name in ("params", "slow"):
+    for a, b in zip(*(jax.tree.leaves(getattr(x, name)) for x in (back, state)), strict=True):
+      assert a.dtype == b.dtype == np.float32
+      # a float16 keeps 11 bits, below 2^-14 steps of 2^-24
+      np.testing.assert_allclose(a, b, rtol=2.0**-11, atol=2.0**-25)
+  held, kept = (jax.tree.leaves(x.opt[1].nu) for x in (back, state))
+  for a, b in zip(held, kept, strict=True):
+    np.testing.assert_array_equal(a == 0, b == 0)
+    there = (b > 2.0**-80) & (b < 2.0**5)
+    octaves = np.log2(np.asarray(a)[there]) - np.log2(np.asarray(b)[there])
+    assert np.all(np.abs(octaves) <= 1 / 6 + 1e-5)
+  assert sum(np.sum(x > 0) for x in held) > 1000
+  assert not any(np.any(x) for x in jax.tree.leaves(back.opt[2].ema))
+  assert (back.opt[1].count, back.opt[2].count) == (state.opt[1].count, state.opt[2].count)
+  rest = {"params": (), "slow": (), "opt": ()}
+  assert same(back._replace(**rest), state._replace(**rest))
+  agents.save(tmp_path, back, card, small=True)
+  assert same(agents.load(str(tmp_path), "walker", 24, 6).train, back)  # nothing is lost twice
+
+
+def test_shipped_agents_are_small():
+  size = sum(f.stat().st_size for f in agents.HERE.rglob("*") if f.is_file() and f.suffix != ".py")
+  assert len(agents.shipped()) >= 9 and size <= 30e6
+
+
 def test_load_overrides_how_it_goes_on(saved):
   config = agents.load(str(saved), "walker", 24, 6, lr=1e-5, last_starts=4).agent.config
   assert (config.lr, config.last_starts, config.warmup) == (1e-5, 4, 0)

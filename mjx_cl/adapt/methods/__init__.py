@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from mjx_cl.adapt.arms import ARMS, Arm
-from mjx_cl.adapt.methods import calm, guarded, quiet, rollback, staged, world_model
+from mjx_cl.adapt.methods import calm, guarded, quiet, ratchet, rollback, staged, world_model
 from mjx_cl.adapt.methods.base import (
   PAPER,
   Acts,
@@ -54,6 +54,8 @@ METHODS: dict[str, Method] = {
   "swift": quiet.SWIFT,
   "quiet-guarded": quiet.GUARDED,
   "swift-guarded": quiet.SWIFT_GUARDED,
+  "ratchet": ratchet.METHOD,
+  "swift-ratchet": quiet.SWIFT_RATCHET,
   "still": quiet.STILL,
 }
 

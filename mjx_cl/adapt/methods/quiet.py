@@ -1,5 +1,5 @@
-"""Methods of the arms `quiet`, `swift`, `quiet-guarded`, `swift-guarded` and `still`: the robot
-does not explore from the alarm on.
+"""Methods of the arms `quiet`, `swift`, `still` and those that join them with another, like
+`swift-guarded`: the robot does not explore from the alarm on.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from mjx_cl.adapt.methods import guarded
+from mjx_cl.adapt.methods import guarded, ratchet
 from mjx_cl.adapt.methods.base import PAPER, Acts, Method, Settings, View
 from mjx_cl.adapt.trees import choose
 
@@ -78,4 +78,5 @@ GUARDED = quiet(guarded.METHOD)
 SOON = Settings(start_windows=64, average=0.2, regain=0.9)
 SWIFT = dataclasses.replace(quiet(PAPER), settings=SOON)
 SWIFT_GUARDED = dataclasses.replace(quiet(guarded.METHOD), settings=SOON)
+SWIFT_RATCHET = dataclasses.replace(quiet(ratchet.METHOD), settings=SOON)
 STILL = quiet(Method(learns=False))

@@ -32,6 +32,9 @@ from mjx_cl.io import arrays, folders, tables
 
 HERE = pathlib.Path(__file__).parent
 _HALF = "|bfloat16"  # suffix of a moment that is stored as the upper half of its float32
+_WEIGHT = "|float16"  # of weights in half precision
+_SQUARE = "|octaves"  # of mean squared gradients as uint8, see `_octaves`
+_FORGOTTEN = "|0"  # of momentum that is not stored, as bool
 # what a card must hold besides `dreamer`; where it has no `repeat` that is 1
 CARD = {
   "env": "str",
@@ -67,23 +70,62 @@ def shipped() -> list[str]:
   return sorted(p.parent.name for p in HERE.glob("*/card.json"))
 
 
-def save(folder: os.PathLike | str, train: TrainState, card: dict) -> None:
+def save(folder: os.PathLike | str, train: TrainState, card: dict, small: bool = False) -> None:
   """Writes an agent of one seed: parameters and counters in full, optimiser moments as bfloat16
   (they only steer step sizes).
+
+  Args:
+    folder: gets agent.npz and card.json.
+    train: of one seed.
+    card: see CARD.
+    small: two fifths of the size, as the shipped ones are: parameters as float16, mean squared
+      gradients to a third of an octave, momentum, which ten updates fill again, not at all. What it
+      costs: results/README.md, Half precision.
   """
   folder = pathlib.Path(folder)
   folder.mkdir(parents=True, exist_ok=True)
   stored = {}
   for name, leaf in arrays.named(train).items():
     value = np.asarray(leaf)
-    if name.startswith(".opt") and value.dtype == np.float32 and value.ndim:
-      stored[name + _HALF] = value.astype(ml_dtypes.bfloat16).view(np.uint16)
-    else:
+    moment = name.startswith(".opt") and value.dtype == np.float32 and value.ndim
+    if small and name.startswith((".params", ".slow")):
+      stored[name + _WEIGHT] = value.astype(np.float16)
+    elif not moment:
       stored[name] = value
+    elif not small:
+      stored[name + _HALF] = value.astype(ml_dtypes.bfloat16).view(np.uint16)
+    elif ".nu" in name:
+      stored[name + _SQUARE] = _octaves(value)
+    else:
+      stored[name + _FORGOTTEN] = np.zeros(value.shape, bool)
   text = json.dumps(card, indent=1) + "\n"
   with folders.together():
     arrays.write(folder / "agent.npz", stored, small=True)
     folders.atomic(folder / "card.json", lambda file: file.write(text.encode()))
+
+
+def _octaves(square: np.ndarray) -> np.ndarray:
+  """3 (log2 x + 80), rounded, from 1 to 255; 0 for 0. uint8."""
+  with np.errstate(divide="ignore"):
+    level = np.round(3 * (np.log2(square) + 80))
+  return np.where(square > 0, np.clip(level, 1, 255), 0).astype(np.uint8)
+
+
+def _stored(held: dict[str, np.ndarray], key: str) -> np.ndarray | None:
+  """A leaf of what `save` has written; None: it is not there, or of another type."""
+  if key in held:
+    return held[key]
+  forms = {
+    _HALF: (np.uint16, lambda x: x.view(ml_dtypes.bfloat16).astype(np.float32)),
+    _WEIGHT: (np.float16, lambda x: x.astype(np.float32)),
+    _SQUARE: (np.uint8, lambda x: np.where(x > 0, 2.0 ** (x / 3.0 - 80), 0).astype(np.float32)),
+    _FORGOTTEN: (np.bool_, lambda x: np.zeros(x.shape, np.float32)),
+  }
+  for suffix, (kind, read) in forms.items():
+    value = held.get(key + suffix)
+    if value is not None and value.dtype == kind:
+      return read(value)
+  return None
 
 
 def called(trained: Trained) -> str:
@@ -207,9 +249,7 @@ def load(
   like = jax.eval_shape(agent.init, jax.random.key(0))
   stored, leaves = arrays.read(folder / "agent.npz"), []
   for key, want in arrays.named(like).items():
-    value, half = stored.get(key), stored.get(key + _HALF)
-    if value is None and half is not None and half.dtype == np.uint16:
-      value = half.view(ml_dtypes.bfloat16).astype(np.float32)
+    value = _stored(stored, key)
     if value is None or value.shape != want.shape or value.dtype.kind not in "fiub":
       raise FileError(
         f"{folder / 'agent.npz'} does not fit size {config.size} with {obs_size} observations "
