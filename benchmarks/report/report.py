@@ -1606,6 +1606,7 @@ def methods_board(results: pathlib.Path) -> str:
   first = [
     (
       f"`{r['method']}`",
+      number(r["streams"]),
       shown(r, "score"),
       *(shown(r, f"score_{robot}") for robot in robots),
       "" if r["gain"] is None else shown(r, "gain"),
@@ -1627,14 +1628,15 @@ def methods_board(results: pathlib.Path) -> str:
       (setting, str(own["none"]["streams"]), lost, *(score(n) for n in names if n != "none"))
     )
   text = fill(f"""
-      {about["lives"]} lives. Score: 0 loses as much return as doing nothing, 100 loses none, below
+      {about["lives"]} lives, best gain first. Score: 0 loses as much return as doing nothing, 100 loses none, below
       0 is harm; mean over a robot's settings and over robots. Gain: score less that of the paper's
-      method (`detector`). Harm: settings in which more is lost than by doing nothing, by the paired
+      method (`detector`), on the lives of both. Harm: settings in which more is lost than by doing nothing, by the paired
       interval; worse: lives that lose a tenth of the reward more than doing nothing on the same
       seed. Recovered: of the lives that lose a tenth without adaptation. Falls beyond those of
       doing nothing, updates and seconds of a core are of a life. Brackets: 95 %, bootstrap over
-      seeds.""")
-  heads = ("method", "score", *robots, "gain", "harm", "worse", "recovered", "falls", "updates")
+      agents and their seeds.""")
+  heads = ("method", "lives", "score", *robots, "gain", "harm", "worse", "recovered")
+  heads = (*heads, "falls", "updates")
   tables = [
     grid((*heads, "time [s]"), first),
     grid(("setting", "lives", "lost, `none`", *(f"`{n}`" for n in names if n != "none")), second),

@@ -80,10 +80,22 @@ def show(board: adaptation.Board, lives: list[dict]) -> None:
   between = lambda ci: "" if ci is None else f" [{number(ci[0])}, {number(ci[1])}]"
   share = lambda x: "-" if x is None else f"{x:.0%}"
   robots = list(dict.fromkeys(life["robot"] for life in lives))
-  heads = ("method", "score", "gain", *robots, "harm", "worse", "recovered", "falls", "updates")
+  heads = (
+    "method",
+    "lives",
+    "score",
+    "gain",
+    *robots,
+    "harm",
+    "worse",
+    "recovered",
+    "falls",
+    "updates",
+  )
   cells = [
     (
       r["method"],
+      number(r["streams"]),
       number(r["score"]) + between(r["score_ci"]),
       number(r["gain"]) + between(r["gain_ci"]),
       *(number(r.get(f"score_{robot}")) for robot in robots),

@@ -27,6 +27,13 @@ MORE = (
 )
 # key, header, digits, whether in per cent, tooltip
 COLUMNS = (
+  (
+    "streams",
+    "Lives",
+    0,
+    False,
+    "Agents x settings x seeds; methods may have been lived by others",
+  ),
   ("score", "Score", 0, False, "0: does nothing; 100: nothing is lost"),
   (
     "gain",
@@ -151,7 +158,7 @@ def overall(board: adaptation.Board) -> str:
   """The table of methods."""
   robots = list(dict.fromkeys(r["robot"] for r in board.rows))
   columns = list(COLUMNS)
-  columns[1:1] = [
+  columns[2:2] = [
     (f"score_{robot}", robot, 0, False, f"Score on the settings of {robot}") for robot in robots
   ]
   head = "".join(f'<th title="{text(c[4])}">{text(c[1])}</th>' for c in columns)

@@ -25,7 +25,8 @@ class Board(NamedTuple):
 
   Attributes:
     rows: a dict for each method x setting, see `of_setting`.
-    overall: a dict for each method, best score first, see `board`.
+    overall: a dict for each method, see `board`, best gain first; best score first where the
+      paper's method is not there.
     critical_difference: mean ranks further apart differ at 5 % (Nemenyi); None for fewer than two
       methods or settings.
     friedman_p: chance of ranks this uneven if all methods were alike.
@@ -120,7 +121,10 @@ def board(lives: list[dict]) -> Board:
   place = dict(zip(rivals, ranks))
   for row in overall:
     row["mean_rank"] = intervals.finite(place.get(row["method"]))
-  overall.sort(key=lambda r: -np.inf if r["score"] is None else r["score"], reverse=True)
+  # gains are of the same lives, scores of all that a method has
+  by = "gain" if any(r["gain"] is not None for r in overall) else "score"
+  worth = lambda r: 0.0 if by == "gain" and r["method"] == PAPER else r[by]
+  overall.sort(key=lambda r: -np.inf if worth(r) is None else worth(r), reverse=True)
   return Board(rows, overall, critical, p)
 
 

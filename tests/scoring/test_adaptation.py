@@ -68,6 +68,23 @@ def test_scores_by_hand():
   assert board.critical_difference == pytest.approx(1.96 * (2 * 3 / 6 / 3) ** 0.5, rel=1e-3)
 
 
+def test_the_best_gain_comes_first_whatever_other_lives_a_method_has():
+  """`many` has lived a harder agent too, which lowers its score, not what it gains."""
+  easy = {
+    "none": NONE,
+    "detector": HALF,
+    "few": [x / 3 for x in NONE],
+    "many": [x / 4 for x in NONE],
+  }
+  hard = {"none": NONE, "detector": NONE, "many": [x / 2 for x in NONE]}
+  board = adaptation.board(lives(easy, agent="a") + lives(hard, agent="b"))
+  score = {r["method"]: r["score"] for r in board.overall}
+  assert score["few"] > score["many"] > score["detector"]
+  gain = {r["method"]: r["gain"] for r in board.overall}
+  assert gain["few"] == pytest.approx(50 / 3) and gain["many"] == pytest.approx(37.5)
+  assert [r["method"] for r in board.overall] == ["many", "few", "detector", "none"]
+
+
 def test_half_of_every_loss_has_no_interval_and_a_difference_is_paired():
   board = adaptation.board(lives({"none": NONE, "mine": HALF}))
   assert of(board, "mine")["score_ci"] == pytest.approx([50, 50])
