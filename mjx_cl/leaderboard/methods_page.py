@@ -32,7 +32,7 @@ COLUMNS = (
     "Lives",
     0,
     False,
-    "Agents x settings x seeds; methods may have been lived by others",
+    "Agents x settings x seeds; not every method was lived by all agents",
   ),
   ("score", "Score", 0, False, "0: does nothing; 100: nothing is lost"),
   (
@@ -40,7 +40,7 @@ COLUMNS = (
     "Gain over the paper's",
     0,
     False,
-    "Score less that of arm `detector`, on the same settings",
+    "Score less that of arm `detector`, on the lives of both",
   ),
   (
     "harm",

@@ -23,6 +23,8 @@ ARMS = {
   "swift": "#6b8e23",
   "quiet-guarded": "#8c1c5a",
   "swift-guarded": "#33470f",
+  "ratchet": "#2f4b7c",
+  "swift-ratchet": "#00b4a0",
   "still": "#c9a9bb",
   "always": ORANGE,
   "world-model": "#E69F00",

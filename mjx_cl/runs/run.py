@@ -263,10 +263,10 @@ def keep(runner: Runner) -> None:
   the end, and the moments and counters of its learner. In ARM whatever is no letter, digit, point,
   hyphen or underscore is an underscore.
 
-  Of a stream that went back (arms `rollback`, `guarded`) the weights are those of before, moments,
-  slow critic and counters those of the learner that was given up. The card is that of the agent it
-  began with but for what that scored, and `adapted`: robot and fault it has lived with, arm, seed,
-  control steps of the run, updates taken.
+  Of a stream that went back (arms `rollback`, `guarded`, `ratchet`) the weights are those of
+  before, moments, slow critic and counters those of the learner that was given up. The card is that
+  of the agent it began with but for what that scored, and `adapted`: robot and fault it has lived
+  with, arm, seed, control steps of the run, updates taken.
   """
   config, folder = runner.config, runner.out / "agents"
   for g, (arm, seed) in enumerate(runner.labels):

@@ -72,7 +72,10 @@ def by_hand(earns, end: int) -> tuple[list[float], list[bool], list[float]]:
         if len(heard) >= 6 and c == end and lack > 0.05 * abs(worth):
           new = best
         elif len(heard) >= 6 and c < end and lack > 0.1 * abs(worth) and far:
-          new, heard, pending = best, [], True
+          if any(back) and len(heard) == 6:  # the best earn less now
+            worth, number = mean, 6
+          else:
+            new, heard, pending = best, [], True
       if c == FIRST:
         worth, number, heard = mean, len(last), []
     acted = new
@@ -101,7 +104,9 @@ def test_it_goes_back_where_it_falls_behind_its_best(end):
   returns = [c for c in range(end + 1) if back[c]]
   assert returns and 60 < returns[0] < 70  # six to eight bad chunks tell
   assert FIRST < acting[returns[0]] < 60  # to what had earned 0.9
-  assert float(memory.best["w"]) == kept[-1] and float(memory.stride) == 0.5 ** len(returns)
+  assert float(memory.best["w"]) == kept[-1] and float(memory.stride) == max(
+    0.5 ** len(returns), ratchet.LEAST
+  )
 
 
 def test_what_only_does_harm_is_taken_back_to_the_old_weights():
@@ -109,6 +114,36 @@ def test_what_only_does_harm_is_taken_back_to_the_old_weights():
   acting, back, _ = told(earns, 60)
   assert (acting, back) == by_hand(earns, 60)[:2]
   assert sum(back) >= 2 and all(acting[c] == 0 for c in range(60) if back[c]) and acting[-1] == 0
+
+
+def test_a_robot_that_changes_again_is_not_held_to_what_was():
+  """What is learnt falls behind once; then the robot earns half whatever it does, and from chunk 90
+  on what is learnt earns more again.
+  """
+
+  def earns(weights, c):
+    base = 0.5 if weights < FIRST else 0.2 if 40 < weights < 50 else 0.9
+    base = base / 2 if c > 50 else base
+    return base + (0.2 if c > 90 and weights > 60 else 0) + NOISE[c] / 3
+
+  acting, back, memory = told(earns, 150)
+  assert (acting, back) == by_hand(earns, 150)[:2]
+  assert sum(back) == 1 and acting[-1] == 150  # it goes on learning, and keeps that
+  assert 0.4 < float(memory.worth) < 0.7
+
+
+def test_steps_have_a_least_share():
+  """Whatever it goes back to is good for ten chunks."""
+  last = [0.0, 0]
+
+  def earns(weights, c):
+    if weights < last[0]:
+      last[1] = c
+    last[0] = weights
+    return (0.9 if c - last[1] < 10 else 0.2) + NOISE[c]
+
+  _, back, memory = told(earns, 199)
+  assert sum(back) > 5 and float(memory.stride) == ratchet.LEAST
 
 
 def test_what_gets_better_or_stays_is_left_alone():

@@ -18,6 +18,7 @@ SPAN = 16  # chunks that are judged together: an episode of 1,000 steps, whose s
 FEW = 6  # chunks from which on a mean is compared
 BEHIND = 0.1  # of what the best earned, by which a mean must lie below it
 LESS = 0.05  # the same where the adaptation ends
+LEAST = 2.0**-4  # share of a step
 
 
 class Ratchet(NamedTuple):
@@ -88,7 +89,10 @@ def act(held: Ratchet, view: View) -> Acts:
   lack, scale = worth - mean, jnp.abs(worth)
   error = spread * (1 / known + 1 / number)
   enough = held.learnt & lived & (chunks >= FEW) & (number > 0)
-  back = enough & (lack > BEHIND * scale) & (lack**2 > 9 * error) & ~view.over
+  behind = enough & (lack > BEHIND * scale) & (lack**2 > 9 * error) & ~view.over
+  changed = behind & (held.stride < 1) & (chunks == FEW)  # the best themselves
+  worth, number = choose(changed, (mean, known), (worth, number))
+  back = behind & ~changed
   end = enough & (lack > LESS * scale) & view.over
   learnt = (held.learnt | (view.taken > 0)) & ~view.begins & ~view.over
   after = Ratchet(
@@ -100,7 +104,7 @@ def act(held: Ratchet, view: View) -> Acts:
     jnp.where(view.begins | starts | back, 0, chunks),
     learnt,
     back | (held.back & (view.taken == 0) & learnt),
-    jnp.where(view.begins, 1, held.stride * jnp.where(back, 0.5, 1)),
+    jnp.where(view.begins, 1, jnp.where(back, jnp.maximum(held.stride / 2, LEAST), held.stride)),
   )
   return Acts(choose(back | end, best, new), after)
 
