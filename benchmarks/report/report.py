@@ -1622,7 +1622,11 @@ def methods_board(results: pathlib.Path) -> str:
   second = []
   for robot, setting in dict.fromkeys((r["robot"], r["setting"]) for r in rows):
     own = {r["method"]: r for r in rows if (r["robot"], r["setting"]) == (robot, setting)}
-    score = lambda name, own=own: shown(own[name], "score") if name in own else "-"
+    few = lambda r, own=own: r["streams"] < own["none"]["streams"]
+    lives = lambda r, few=few: f" ({number(r['streams'])})" if few(r) else ""
+    score = lambda name, own=own, lives=lives: (
+      shown(own[name], "score") + lives(own[name]) if name in own else "-"
+    )
     lost = f"{number(100 * own['none']['lost'], 0)} %"
     second.append(
       (setting, str(own["none"]["streams"]), lost, *(score(n) for n in names if n != "none"))
@@ -1634,7 +1638,8 @@ def methods_board(results: pathlib.Path) -> str:
       interval; worse: lives that lose a tenth of the reward more than doing nothing on the same
       seed. Recovered: of the lives that lose a tenth without adaptation. Falls beyond those of
       doing nothing, updates and seconds of a core are of a life. Brackets: 95 %, bootstrap over
-      agents and their seeds.""")
+      agents and their seeds. Round brackets: lives, where a method has fewer of a setting. Scores
+      of other lives do not compare, gains do.""")
   heads = ("method", "lives", "score", *robots, "gain", "harm", "worse", "recovered")
   heads = (*heads, "falls", "updates")
   tables = [

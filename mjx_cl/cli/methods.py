@@ -117,10 +117,14 @@ def show(board: adaptation.Board, lives: list[dict]) -> None:
   cells = []
   for robot, setting in dict.fromkeys((r["robot"], r["setting"]) for r in board.rows):
     own = {r["method"]: r for r in board.rows if (r["robot"], r["setting"]) == (robot, setting)}
-    score = lambda name: number(own[name]["score"]) if name in own else "-"
+    few = lambda r: r["streams"] < own[adaptation.NOTHING]["streams"]
+    lives_of = lambda r: f" ({r['streams']})" if few(r) else ""
+    score = lambda name: number(own[name]["score"]) + lives_of(own[name]) if name in own else "-"
     lost = share(own[adaptation.NOTHING]["lost"])
     cells.append((robot, setting, lost, *(score(r["method"]) for r in board.overall)))
-  console().print(table(heads, cells, left=("robot", "setting"), title="score by setting"))
+  console().print(
+    table(heads, cells, left=("robot", "setting"), title="score by setting (lives, where fewer)")
+  )
   say(
     "gain: score less that of the paper's method (`detector`); harm: settings in which it loses "
     "more than doing nothing; worse: streams that do by a tenth; falls, updates: a stream, falls "
