@@ -54,7 +54,9 @@ def test_results_are_light():
 
 
 def counts(folder, change=0):
-  """Of the streams of a run: affected, noticed, median latency, back with adaptation, without."""
+  """Of the streams of a run: affected, noticed, median latency of those that were not learning, back
+  with adaptation, without.
+  """
   rows = [
     r
     for r in parquet.read_table(ROOT / "results" / folder / "runs.parquet").to_pylist()
@@ -66,7 +68,9 @@ def counts(folder, change=0):
     for arm in ("detector", "none")
   }
   latency = statistics.median_low(
-    np.inf if r["latency_steps"] is None else r["latency_steps"] for r in own
+    np.inf if r["latency_steps"] is None else r["latency_steps"]
+    for r in own
+    if not r["adapting_at_onset"]
   )
   return (
     sum(r["affected"] for r in own),
