@@ -25,8 +25,8 @@ class Board(NamedTuple):
 
   Attributes:
     rows: a dict for each method x setting, see `of_setting`.
-    overall: a dict for each method, see `board`, best gain first; best score first where the
-      paper's method is not there.
+    overall: a dict for each method, see `board`, best gain first, without one last; best
+      score first where the paper's method is not there.
     critical_difference: mean ranks further apart differ at 5 % (Nemenyi); None for fewer than two
       methods or settings.
     friedman_p: chance of ranks this uneven if all methods were alike.

@@ -916,6 +916,10 @@ def test_a_small_agent_differs_by_its_rounding_alone(tiny, tmp_path, same):
   assert same(back._replace(**rest), state._replace(**rest))
   agents.save(tmp_path, back, card, small=True)
   assert same(agents.load(str(tmp_path), "walker", 24, 6).train, back)  # nothing is lost twice
+  for bad in (1e6, np.nan):
+    wild = back._replace(params=jax.tree.map(lambda x, bad=bad: x * bad, back.params))
+    with pytest.raises(UserError, match="does not fit half precision; leave out small"):
+      agents.save(tmp_path, wild, card, small=True)
 
 
 def test_shipped_agents_are_small():

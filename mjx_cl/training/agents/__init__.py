@@ -79,8 +79,11 @@ def save(folder: os.PathLike | str, train: TrainState, card: dict, small: bool =
     train: of one seed.
     card: see CARD.
     small: two fifths of the size, as the shipped ones are: parameters as float16, mean squared
-      gradients to a third of an octave, momentum, which ten updates fill again, not at all. What it
-      costs: results/README.md, Half precision.
+      gradients to a third of an octave between 2^-80 and 32, momentum, which ten updates fill
+      again, not at all. What it costs: results/README.md, Half precision.
+
+  Raises:
+    UserError: `small`, and a weight is not finite or beyond 65,504.
   """
   folder = pathlib.Path(folder)
   folder.mkdir(parents=True, exist_ok=True)
@@ -89,6 +92,7 @@ def save(folder: os.PathLike | str, train: TrainState, card: dict, small: bool =
     value = np.asarray(leaf)
     moment = name.startswith(".opt") and value.dtype == np.float32 and value.ndim
     if small and name.startswith((".params", ".slow")):
+      require(np.abs(value).max() < 65_504, f"{name} does not fit half precision; leave out small")
       stored[name + _WEIGHT] = value.astype(np.float16)
     elif not moment:
       stored[name] = value
