@@ -1622,20 +1622,23 @@ def methods_board(results: pathlib.Path) -> str:
   second = []
   for robot, setting in dict.fromkeys((r["robot"], r["setting"]) for r in rows):
     own = {r["method"]: r for r in rows if (r["robot"], r["setting"]) == (robot, setting)}
-    few = lambda r, own=own: r["streams"] < own["none"]["streams"]
-    lives = lambda r, few=few: f" ({number(r['streams'])})" if few(r) else ""
-    score = lambda name, own=own, lives=lives: (
-      shown(own[name], "score") + lives(own[name]) if name in own else "-"
-    )
+
+    def score(name: str, own: dict = own) -> str:
+      row = own.get(name)
+      if row is None:
+        return "-"
+      fewer = row["streams"] < own["none"]["streams"]
+      return shown(row, "score") + (f" ({number(row['streams'])})" if fewer else "")
+
     lost = f"{number(100 * own['none']['lost'], 0)} %"
     second.append(
       (setting, str(own["none"]["streams"]), lost, *(score(n) for n in names if n != "none"))
     )
   text = fill(f"""
-      {about["lives"]} lives, best gain first. Score: 0 loses as much return as doing nothing, 100 loses none, below
-      0 is harm; mean over a robot's settings and over robots. Gain: score less that of the paper's
-      method (`detector`), on the lives of both. Harm: settings in which more is lost than by doing nothing, by the paired
-      interval; worse: lives that lose a tenth of the reward more than doing nothing on the same
+      {about["lives"]} lives, best gain first. Score: 0 loses as much return as doing nothing, 100
+      loses none, below 0 is harm; mean over a robot's settings and over robots. Gain: score less
+      that of the paper's method (`detector`), on the lives of both. Harm: settings in which more is
+      lost than by doing nothing, by the paired interval; worse: lives that lose a tenth of the reward more than doing nothing on the same
       seed. Recovered: of the lives that lose a tenth without adaptation. Falls beyond those of
       doing nothing, updates and seconds of a core are of a life. Brackets: 95 %, bootstrap over
       agents and their seeds. Round brackets: lives, where a method has fewer of a setting. Scores

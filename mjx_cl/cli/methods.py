@@ -117,9 +117,9 @@ def show(board: adaptation.Board, lives: list[dict]) -> None:
   cells = []
   for robot, setting in dict.fromkeys((r["robot"], r["setting"]) for r in board.rows):
     own = {r["method"]: r for r in board.rows if (r["robot"], r["setting"]) == (robot, setting)}
-    few = lambda r: r["streams"] < own[adaptation.NOTHING]["streams"]
-    lives_of = lambda r: f" ({r['streams']})" if few(r) else ""
-    score = lambda name: number(own[name]["score"]) + lives_of(own[name]) if name in own else "-"
+    most = own[adaptation.NOTHING]["streams"]
+    few = lambda r: f" ({r['streams']})" if r["streams"] < most else ""
+    score = lambda name: number(own[name]["score"]) + few(own[name]) if name in own else "-"
     lost = share(own[adaptation.NOTHING]["lost"])
     cells.append((robot, setting, lost, *(score(r["method"]) for r in board.overall)))
   console().print(

@@ -54,8 +54,8 @@ def test_results_are_light():
 
 
 def counts(folder, change=0):
-  """Of the streams of a run: affected, noticed, median latency of those that were not learning, back
-  with adaptation, without.
+  """Of the streams of a run: affected, noticed, median latency of those that were not learning,
+  back with adaptation, without.
   """
   rows = [
     r

@@ -26,12 +26,14 @@ class Ratchet(NamedTuple):
 
   The first are those that it began with, judged by the chunks between the alarm and the first
   update. The chunks from there on are cut into spans of SPAN; the weights of the middle of the span
-  that earned most are kept. Where the mean reward of the last SPAN chunks (of those since the last
-  return, FEW at least) lies below what the best earned by BEHIND and by three standard errors, the
-  variance that of the last chunks, the learner and what acts go back to the best, the slow critic
-  with them, and from then on every update moves the weights half as far; moments and replay stay.
-  When the adaptation ends, however it does, the best stay if
-  the last chunks earned less by LESS.
+  that earned most are kept. Where the mean reward of the last SPAN chunks (of those since the first
+  update or the last return, FEW at least) lies below what the best earned by BEHIND and by three
+  standard errors, the variance that of the last chunks, what acts goes back to the best at once,
+  the learner, with the slow critic, in place of its next chunk of updates; from then on updates
+  move the weights half as far, at the least LEAST of it. Moments and replay stay. Where the first
+  FEW chunks after a return lie as far behind, it is the robot that has changed: what they earn is
+  what the best are worth now. When the adaptation ends, however it does, the best act on if the
+  last chunks earned less by LESS.
 
   An actor that learns in dreams of a few thousand records can come to exploit what its world model
   has wrong, and unlearn what it could do; the records of that teach the model. It is early stopping
