@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mjx_cl.config import DreamerConfig, finetuning_lr
+from mjx_cl.config import DreamerConfig, finetuning_lr, finetuning_model_lr
 from mjx_cl.errors import FileError
 from mjx_cl.scoring import intervals
 
@@ -330,6 +330,11 @@ def setup(experiment: Experiment, config: dict) -> list[str]:
     (own("batch"), author.batch, "{} sequences an update in place of {}"),
     (own("lr"), author.lr, "learning rate {:g} in place of {:g}"),
     (adapt.get("policy_lr") or 1.0, author.policy_lr, "the policy's own steps {:g} times as long"),
+    (
+      finetuning_model_lr(adapt.get("model_lr"), card),
+      author.model_lr,
+      "the world model's own steps {:g} times as long",
+    ),
     (own("anchor"), author.anchor, "policy held to the actions taken with a weight of {:g}"),
     (
       dreamer["min_std"],

@@ -80,6 +80,12 @@ def finetuning_lr(lr: float | None, card: dict) -> float | None:
   return card.get("finetuning_lr") or lr if lr == FINETUNING_LR else lr
 
 
+def finetuning_model_lr(factor: float | None, card: dict) -> float:
+  """`factor`; None: `finetuning_model_lr` of an agent's card, or 1."""
+  factor = card.get("finetuning_model_lr") if factor is None else factor
+  return 1.0 if factor is None else factor
+
+
 @dataclass(frozen=True)
 class AdaptConfig:
   """When adaptation starts, how it runs and when it ends.
@@ -90,6 +96,9 @@ class AdaptConfig:
     lr: Learning rate while adapting; the default gives way to `finetuning_lr` of the agent's card,
       where it names one; None: that of the agent's training.
     policy_lr: Factor on the policy's steps while adapting; None: 1.
+    model_lr: Factor on the steps of encoder, dynamics and decoder while adapting, so that what
+      reads latents keeps up with them (two time-scales, https://arxiv.org/abs/1706.08500); None:
+      `finetuning_model_lr` of the agent's card, or 1.
     anchor: Weight while adapting of the actions that the robot itself took; None: the agent's own.
     batch: Sequences of one update while adapting; fewer mean more updates at the same ratio. None:
       the agent's own.
@@ -123,6 +132,7 @@ class AdaptConfig:
   start_windows: int = 1024
   lr: float | None = FINETUNING_LR
   policy_lr: float | None = None
+  model_lr: float | None = None
   anchor: float | None = None
   batch: int | None = 4
   last_starts: int | None = 0
@@ -191,7 +201,7 @@ class AdaptConfig:
       f"period_steps must be below period={self.period}; got {self.period_steps}",
     )
     positive(self, *given(self, "lr", "policy_lr", "batch"))
-    not_below_0(self, *given(self, "anchor"))
+    not_below_0(self, *given(self, "anchor", "model_lr"))
 
 
 @dataclass(frozen=True)

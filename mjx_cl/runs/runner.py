@@ -98,7 +98,7 @@ class Runner:
     into = becomes(config)
     self.other = None if into is None else self._robot(into)
     self.robots = [self.env] if self.other is None else [self.env, self.other]
-    adapt = ("lr", "policy_lr", "anchor", "last_starts", "batch")
+    adapt = ("lr", "policy_lr", "model_lr", "anchor", "last_starts", "batch")
     departures = {name: getattr(config.adapt, name) for name in adapt}
     self.trained = agents.of(self.env, config.agent, **departures)
     check_learners(config, self.trained)

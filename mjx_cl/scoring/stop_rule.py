@@ -274,6 +274,7 @@ LEARNS = (
   "start_windows",
   "lr",
   "policy_lr",
+  "model_lr",
   "last_starts",
   "batch",
   "fresh_moments",

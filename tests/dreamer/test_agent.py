@@ -592,6 +592,12 @@ def test_model_lr_of_zero_leaves_the_model_and_the_heads_learn(plain):
     assert (
       gap(heads.params[name], state.params[name]) == 0 < gap(full.params[name], state.params[name])
     )
+  tenth = Agent(replace(agent.config, model_lr=0.1), agent.obs_size, agent.act_size)
+  slow, _, _ = quick.jit(tenth.update)(
+    state, make_batch(1), KEY, jax.tree.map(jnp.float32, Weights())
+  )
+  wanted = jax.tree.map(lambda a, b: 0.9 * a + 0.1 * b, state.params["dyn"], full.params["dyn"])
+  assert gap(slow.params["dyn"], wanted) < 1e-6 < gap(slow.params["dyn"], full.params["dyn"])
   rest = lambda tree: {k: v for k, v in tree.items() if k not in ("enc", "dyn", "dec")}
   assert gap(rest(heads.params), rest(full.params)) < 1e-6  # float32 rounding of gains near 1
   assert gap(heads.params["rew"], state.params["rew"]) > 1e-6

@@ -951,6 +951,21 @@ def test_an_agent_is_finetuned_at_the_rate_of_its_card(saved, tmp_path):
       assert rates() == (own, own, said, 2e-5)
 
 
+def test_a_card_may_slow_the_world_model_while_it_is_finetuned_and_then_alone(saved, tmp_path):
+  shutil.copytree(saved, tmp_path / "agent")
+  load = lambda **given: agents.load(str(tmp_path / "agent"), "walker", 24, 6, **given)
+  factor = lambda **given: load(**given).agent.config.model_lr
+  card = json.loads((saved / "card.json").read_text())
+  assert (factor(), factor(model_lr=None), factor(model_lr=0.3)) == (1.0, 1.0, 0.3)
+  for said, wrong in ((0.1, False), (0.0, False), (-0.1, True), (1.5, True), ("slow", True)):
+    (tmp_path / "agent/card.json").write_text(json.dumps(card | {"finetuning_model_lr": said}))
+    if wrong:
+      with pytest.raises(FileError, match="is not an agent's card: .*finetuning_model_lr"):
+        load()
+    else:
+      assert (factor(), factor(model_lr=None), factor(model_lr=0.3)) == (1.0, said, 0.3)
+
+
 @pytest.mark.parametrize("name", agents.shipped())
 def test_every_shipped_agent_loads(name):
   robot = json.loads((agents.HERE / name / "card.json").read_text())["env"]
