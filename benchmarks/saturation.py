@@ -14,7 +14,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import sys
-from typing import Any, NamedTuple
+from typing import Any
 
 from mjx_cl.io import runtime
 
@@ -26,27 +26,18 @@ import numpy as np  # noqa: E402
 
 from mjx_cl import envs, faults  # noqa: E402
 from mjx_cl.adapt.arms import ALARM, RULE, Arm  # noqa: E402
-from mjx_cl.adapt.methods import PAPER, Acts, Method, View  # noqa: E402
+from mjx_cl.adapt.methods import Acts, Method, View, average  # noqa: E402
 from mjx_cl.adapt.methods.quiet import SWIFT, quiet  # noqa: E402
 from mjx_cl.cli import app  # noqa: E402
 from mjx_cl.dreamer.agent import Agent, TrainState  # noqa: E402
 from mjx_cl.dreamer.state import Record  # noqa: E402
+from mjx_cl.errors import choose  # noqa: E402
 from mjx_cl.rollout.scan import Rollout, nest, start  # noqa: E402
 from mjx_cl.training import agents  # noqa: E402
 
 FREE = 1.5  # |m| of a freed action in the median: tanh 0.905, slope 0.18
 SHARE = 0.05  # an action is stuck where all but this share of its m lie beyond FREE, on one side
 ROBOTS, STEPS = 8, 300
-
-
-class Memory(NamedTuple):
-  """Attributes:
-  own: memory of the method within.
-  taken: int32 (), updates of the adaptation so far.
-  """
-
-  own: Any
-  taken: jax.Array
 
 
 def least(raw: Any, np: Any) -> Any:
@@ -82,25 +73,23 @@ def free(agent: Agent, state: TrainState, batch: Record) -> TrainState:
   return state._replace(params=params, opt=opt)
 
 
-def freeing(method: Method) -> Method:
-  """`method`, whose adaptations begin by freeing what is stuck."""
+def update(agent: Agent, taken: jax.Array, state: TrainState, batch: Record, key: jax.Array):
+  """Agent.update, before the first of an adaptation `free`."""
+  begun = lambda s: free(agent, s, batch)
+  return agent.update(jax.lax.cond(taken == 0, begun, lambda s: s, state), batch, key)
 
-  def update(agent: Agent, memory: Memory, state: TrainState, batch: Record, key: jax.Array):
-    begun = lambda s: free(agent, s, batch)
-    return agent.update(jax.lax.cond(memory.taken == 0, begun, lambda s: s, state), batch, key)
 
-  def act(memory: Memory, view: View) -> Acts:
-    said = method.act(memory.own, view)
-    taken = jnp.where(view.begins, 0, memory.taken + view.taken)
-    return said._replace(memory=Memory(said.memory, taken))
+def act(taken: jax.Array, view: View) -> Acts:
+  """As the paper's; counts the updates of the adaptation, int32 ()."""
+  return average(jnp.where(view.begins, 0, taken + view.taken), view)
 
-  init = lambda params: Memory(method.init(params), jnp.int32(0))
-  return dataclasses.replace(method, init=init, act=act, update=update)
+
+FREEING = Method(lambda params: jnp.int32(0), act, update=update)
 
 
 def freed() -> Arm:
   """As swift, and stuck actions are freed."""
-  method = dataclasses.replace(quiet(freeing(PAPER)), settings=SWIFT.settings)
+  method = dataclasses.replace(quiet(FREEING), settings=SWIFT.settings)
   return Arm(
     "as swift, but actions that are stuck at their limit are freed", ALARM, RULE, method=method
   )
@@ -123,8 +112,11 @@ def stuck(name: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def main(args: argparse.Namespace) -> None:
+  known = dict.fromkeys(agents.shipped())
+  for name in args.agent:
+    choose("agent", name, known)
   print(f"{ROBOTS} healthy robots, {STEPS} decisions, by the policy's mean")
-  for name in args.agent or agents.shipped():
+  for name in args.agent or known:
     share, beyond = stuck(name)
     shown = ", ".join(f"{100 * s:.0f} %" for s in share)
     held = [str(i) for i, m in enumerate(beyond) if m > FREE]
