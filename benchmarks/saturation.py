@@ -22,7 +22,6 @@ runtime.setup()
 
 import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
-import numpy as np  # noqa: E402
 
 from mjx_cl import envs, faults  # noqa: E402
 from mjx_cl.adapt.arms import ALARM, RULE, Arm  # noqa: E402
@@ -40,13 +39,13 @@ SHARE = 0.05  # an action is stuck where all but this share of its m lie beyond 
 ROBOTS, STEPS = 8, 300
 
 
-def least(raw: Any, np: Any) -> Any:
-  """How far beyond 0 all but SHARE of the states (N, A) of an action lie, to one side, (A,)."""
-  return np.maximum(np.quantile(raw, SHARE, axis=0), -np.quantile(raw, 1 - SHARE, axis=0))
+def one_sided(raw: jax.Array) -> jax.Array:
+  """How far beyond 0 all but SHARE of an action's states lie, on one side: (N, A) -> (A,)."""
+  return jnp.maximum(jnp.quantile(raw, SHARE, axis=0), -jnp.quantile(raw, 1 - SHARE, axis=0))
 
 
 def free(agent: Agent, state: TrainState, batch: Record) -> TrainState:
-  """`state`, its stuck actions brought to |m| = FREE in the median over a batch's states (B, 1 + T).
+  """`state`, its stuck actions brought to |m| = FREE in the median of a batch's states (B, 1 + T).
 
   Mean squared gradients of such an action's last layer, tiny by then, become those of the layer's
   greatest action; its momentum is forgotten.
@@ -55,7 +54,7 @@ def free(agent: Agent, state: TrainState, batch: Record) -> TrainState:
     state.params, "pol", batch.deter.astype(jnp.float32), agent.hot(batch.stoch)
   )
   raw = raw.reshape(-1, raw.shape[-1])
-  stuck = least(raw, jnp) > FREE
+  stuck = one_sided(raw) > FREE
   scale = jnp.where(stuck, FREE / jnp.median(jnp.abs(raw), axis=0), 1.0)
   policy = state.params["pol"]
   params = {
@@ -95,9 +94,9 @@ def freed() -> Arm:
   )
 
 
-def stuck(name: str) -> tuple[np.ndarray, np.ndarray]:
+def saturation(name: str) -> tuple[jax.Array, jax.Array]:
   """Of each action of a shipped agent's healthy robots: share of states with |tanh(m)| > 0.99, and
-  `least`.
+  whether it is stuck.
   """
   env = envs.make(agents.read_card(agents.HERE / name)[0]["env"])
   trained = agents.of(env, name)
@@ -107,8 +106,8 @@ def stuck(name: str) -> tuple[np.ndarray, np.ndarray]:
   rollout = Rollout(env, agent, fault, trained.repeat, deterministic=True)
   _, rows = rollout.chunk(jax.tree.map(lambda x: x[None], params), streams, STEPS)
   raw, _ = agent._apply(params, "pol", rows.deter, agent.hot(rows.stoch))
-  raw = np.asarray(raw).reshape(-1, raw.shape[-1])
-  return np.mean(np.tanh(np.abs(raw)) > 0.99, 0), least(raw, np)
+  raw = raw.reshape(-1, raw.shape[-1])
+  return jnp.mean(jnp.tanh(jnp.abs(raw)) > 0.99, 0), one_sided(raw) > FREE
 
 
 def main(args: argparse.Namespace) -> None:
@@ -117,9 +116,9 @@ def main(args: argparse.Namespace) -> None:
     choose("agent", name, known)
   print(f"{ROBOTS} healthy robots, {STEPS} decisions, by the policy's mean")
   for name in args.agent or known:
-    share, beyond = stuck(name)
+    share, stuck = saturation(name)
     shown = ", ".join(f"{100 * s:.0f} %" for s in share)
-    held = [str(i) for i, m in enumerate(beyond) if m > FREE]
+    held = [str(i) for i, one in enumerate(stuck) if one]
     print(f"{name}: within 0.01 of the limit {shown}; stuck: {', '.join(held) or 'none'}")
 
 

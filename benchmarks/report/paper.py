@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mjx_cl.config import DreamerConfig, finetuning_lr, finetuning_model_lr
+from mjx_cl.config import DreamerConfig, finetuning_lr
 from mjx_cl.errors import FileError
 from mjx_cl.scoring import intervals
 
@@ -331,7 +331,7 @@ def setup(experiment: Experiment, config: dict) -> list[str]:
     (own("lr"), author.lr, "learning rate {:g} in place of {:g}"),
     (adapt.get("policy_lr") or 1.0, author.policy_lr, "the policy's own steps {:g} times as long"),
     (
-      finetuning_model_lr(adapt.get("model_lr"), card),
+      1.0 if adapt.get("model_lr") is None else adapt["model_lr"],
       author.model_lr,
       "the world model's own steps {:g} times as long",
     ),

@@ -1638,7 +1638,8 @@ def methods_board(results: pathlib.Path) -> str:
       {about["lives"]} lives, best gain first. Score: 0 loses as much return as doing nothing, 100
       loses none, below 0 is harm; mean over a robot's settings and over robots. Gain: score less
       that of the paper's method (`detector`), on the lives of both. Harm: settings in which more is
-      lost than by doing nothing, by the paired interval; worse: lives that lose a tenth of the reward more than doing nothing on the same
+      lost than by doing nothing, by the paired interval; worse: lives that lose a tenth of the
+      reward more than doing nothing on the same
       seed. Recovered: of the lives that lose a tenth without adaptation. Falls beyond those of
       doing nothing, updates and seconds of a core are of a life. Brackets: 95 %, bootstrap over
       agents and their seeds. Round brackets: lives, where a method has fewer of a setting. Scores

@@ -80,12 +80,6 @@ def finetuning_lr(lr: float | None, card: dict) -> float | None:
   return card.get("finetuning_lr") or lr if lr == FINETUNING_LR else lr
 
 
-def finetuning_model_lr(factor: float | None, card: dict) -> float:
-  """`factor`; None: `finetuning_model_lr` of an agent's card, or 1."""
-  factor = card.get("finetuning_model_lr") if factor is None else factor
-  return 1.0 if factor is None else factor
-
-
 @dataclass(frozen=True)
 class AdaptConfig:
   """When adaptation starts, how it runs and when it ends.
@@ -97,8 +91,7 @@ class AdaptConfig:
       where it names one; None: that of the agent's training.
     policy_lr: Factor on the policy's steps while adapting; None: 1.
     model_lr: Factor on the steps of encoder, dynamics and decoder while adapting, so that what
-      reads latents keeps up with them (two time-scales, https://arxiv.org/abs/1706.08500); None:
-      `finetuning_model_lr` of the agent's card, or 1.
+      reads latents keeps up with them (two time-scales, https://arxiv.org/abs/1706.08500); None: 1.
     anchor: Weight while adapting of the actions that the robot itself took; None: the agent's own.
     batch: Sequences of one update while adapting; fewer mean more updates at the same ratio. None:
       the agent's own.

@@ -928,8 +928,9 @@ def test_shipped_agents_are_small():
 
 
 def test_load_overrides_how_it_goes_on(saved):
-  config = agents.load(str(saved), "walker", 24, 6, lr=1e-5, last_starts=4).agent.config
-  assert (config.lr, config.last_starts, config.warmup) == (1e-5, 4, 0)
+  given = {"lr": 1e-5, "last_starts": 4, "model_lr": 0.1}
+  config = agents.load(str(saved), "walker", 24, 6, **given).agent.config
+  assert (config.lr, config.last_starts, config.model_lr, config.warmup) == (1e-5, 4, 0.1, 0)
 
 
 def test_an_agent_is_finetuned_at_the_rate_of_its_card(saved, tmp_path):
@@ -949,21 +950,6 @@ def test_an_agent_is_finetuned_at_the_rate_of_its_card(saved, tmp_path):
         load()
     else:
       assert rates() == (own, own, said, 2e-5)
-
-
-def test_a_card_may_slow_the_world_model_while_it_is_finetuned_and_then_alone(saved, tmp_path):
-  shutil.copytree(saved, tmp_path / "agent")
-  load = lambda **given: agents.load(str(tmp_path / "agent"), "walker", 24, 6, **given)
-  factor = lambda **given: load(**given).agent.config.model_lr
-  card = json.loads((saved / "card.json").read_text())
-  assert (factor(), factor(model_lr=None), factor(model_lr=0.3)) == (1.0, 1.0, 0.3)
-  for said, wrong in ((0.1, False), (0.0, False), (-0.1, True), (1.5, True), ("slow", True)):
-    (tmp_path / "agent/card.json").write_text(json.dumps(card | {"finetuning_model_lr": said}))
-    if wrong:
-      with pytest.raises(FileError, match="is not an agent's card: .*finetuning_model_lr"):
-        load()
-    else:
-      assert (factor(), factor(model_lr=None), factor(model_lr=0.3)) == (1.0, said, 0.3)
 
 
 @pytest.mark.parametrize("name", agents.shipped())

@@ -22,7 +22,6 @@ from mjx_cl.config import (
   DreamerConfig,
   field_kinds,
   finetuning_lr,
-  finetuning_model_lr,
   kinds,
   own_agent,
   recorded,
@@ -42,7 +41,6 @@ CARD = {
   "repeat": "int",
   "updates": "int | None",
   "finetuning_lr": "float | None",
-  "finetuning_model_lr": "float | None",
 }
 
 
@@ -199,9 +197,6 @@ def read_card(folder: pathlib.Path) -> tuple[dict, DreamerConfig]:
     require(fits, f"repeat must lie in 1..{MOST_REPEAT}; got {held['repeat']}")
     rate = held.get("finetuning_lr")
     require(rate is None or 0 < rate < 1, f"finetuning_lr must lie between 0 and 1; got {rate}")
-    factor = held.get("finetuning_model_lr")
-    fits = factor is None or 0 <= factor <= 1
-    require(fits, f"finetuning_model_lr must lie in [0, 1]; got {factor}")
     require(isinstance(held["dreamer"], dict), "dreamer must be a table of settings")
     dreamer = recorded(DreamerConfig, held["dreamer"])
     field_kinds(where, DreamerConfig, dreamer, "dreamer.")
@@ -229,8 +224,7 @@ def load(
     agents_of: robot with the same observation, action and reward, whose agents fit too; None: that
       of the class registered under this name.
     departures: fields of its DreamerConfig to go on with otherwise, e.g. lr, see
-      config.finetuning_lr; None: its own, of policy_lr 1, of model_lr the card's
-      `finetuning_model_lr`. Where model_lr is not among them it is 1.
+      config.finetuning_lr; None: its own, of policy_lr and model_lr 1.
 
   Raises:
     UserError: an agent of another robot or an unknown name.
@@ -251,8 +245,6 @@ def load(
     raise UserError(f"agent {name!r} was trained on {card['env']!r}, not on {env_name!r}")
   # whatever goes on from here does so at full learning rate, whatever its last stage held still
   departures |= {"lr": finetuning_lr(departures.get("lr"), card)}
-  if "model_lr" in departures:
-    departures["model_lr"] = finetuning_model_lr(departures["model_lr"], card)
   other = {"warmup": 0, "policy_lr": 1.0, "model_lr": 1.0} | {
     k: v for k, v in departures.items() if v is not None
   }
