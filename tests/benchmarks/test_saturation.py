@@ -22,7 +22,7 @@ def test_an_action_is_stuck_where_nearly_all_states_lie_to_one_side():
     [6.0 + 0 * n, -6.0 + 0 * n, np.where(n % 2, 6.0, -6.0), np.where(n < 4, 0, 6.0)], 1
   )
   np.testing.assert_allclose(saturation.one_sided(raw), [6, 6, -6, 6])
-  assert saturation.one_sided(np.where(n < 20, 0.0, 6.0)[:, None]) == [0]
+  np.testing.assert_array_equal(saturation.one_sided(np.where(n < 20, 0.0, 6.0)[:, None]), [0])
 
 
 @pytest.fixture(scope="module")
