@@ -5,7 +5,9 @@ search finds. Skipped where there is no Chromium.
 import functools
 import http.server
 import json
+import pathlib
 import queue
+import re
 import shutil
 import subprocess
 import threading
@@ -15,6 +17,13 @@ import pytest
 from tests.benchmarks.test_site import site  # noqa: F401
 
 PHONE = (390, 844)  # [CSS pixels]
+# Written at the head of each page by the server, so that it stands before any script of the page.
+HOOK = b"""<script>
+window.said = [];
+addEventListener("error", (e) => said.push(String(e.message || e.target.src)), true);
+addEventListener("unhandledrejection", (e) => said.push(String(e.reason)));
+console.error = (...x) => said.push(x.join(" "));
+</script>"""
 # Loads each page into a frame as wide as a phone and writes down what it says and how wide it is.
 PROBE = """<!doctype html><iframe id=frame style="width:%dpx;height:%dpx;border:0"></iframe>
 <script>
@@ -23,23 +32,10 @@ const wait = (ms) => new Promise((done) => setTimeout(done, ms));
 const load = (url) => new Promise((done) => { frame.onload = done; frame.src = url; });
 (async () => {
   for (const page of pages) {
-    const errors = [];
-    await load("about:blank");
-    const loaded = load(page);
-    const hook = () => {  // as soon as the page's own window is there
-      const w = frame.contentWindow;
-      if (w.location.href === "about:blank" || w.hooked) return;
-      w.hooked = true;
-      w.addEventListener("error", (e) => errors.push(String(e.message || e.target.src)), true);
-      w.addEventListener("unhandledrejection", (e) => errors.push(String(e.reason)));
-      w.console.error = (...x) => errors.push(x.join(" "));
-    };
-    const watch = setInterval(hook, 0);
-    await loaded;
-    hook();
+    await load(page);
     await wait(50);
-    clearInterval(watch);
-    out[page] = {errors, width: frame.contentDocument.documentElement.scrollWidth};
+    const errors = frame.contentWindow.said, root = frame.contentDocument.documentElement;
+    out[page] = {errors, width: root.scrollWidth};
   }
   const found = {};
   for (const word of %s) {
@@ -72,6 +68,20 @@ def seen(site, tmp_path_factory):
   said = queue.Queue()
 
   class Handler(http.server.SimpleHTTPRequestHandler):
+    def do_GET(self):
+      path = pathlib.Path(self.translate_path(self.path))
+      if path.suffix != ".html" or not path.is_file():
+        return super().do_GET()
+      page = path.read_bytes()
+      start = re.search(rb"<head[^>]*>", page)
+      at = start.end() if start else 0
+      page = page[:at] + HOOK + page[at:]
+      self.send_response(200)
+      self.send_header("Content-Type", "text/html; charset=utf-8")
+      self.send_header("Content-Length", str(len(page)))
+      self.end_headers()
+      self.wfile.write(page)
+
     def do_POST(self):
       said.put(json.loads(self.rfile.read(int(self.headers["Content-Length"]))))
       self.send_response(204)
