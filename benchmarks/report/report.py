@@ -627,7 +627,7 @@ def dreamer(results: pathlib.Path) -> str:
   )
 
 
-ENDS = ("", "-2", "-3")  # of the names of three agents of one recipe
+TROTS = ("", "-2", "-3")  # ends of the names of the quadrupeds that trot
 GOALS = {"velocity_error_m_s": 0.25, "fall_rate": 0.05}  # of the quadruped's agents
 
 
@@ -678,16 +678,7 @@ def agents(results: pathlib.Path) -> str:
     ("`car`", "car_agent/eval.json", trained("car_agent"), driving),
     ("`car-2`", "car_2_agent/eval.json", trained("car_2_agent"), driving),
     ("`car-3`", "car_3_agent/eval.json", trained("car_3_agent"), driving),
-    ("`car` in `car_real`, unchanged", "car_agent/eval_car_real.json", "", driving),
-    *(
-      (
-        f"`car-unsaturated{end}`, after `car{end}`",
-        f"car_unsaturated_agent/eval{end}.json",
-        trained("car_unsaturated_agent", f"curve{end}"),
-        driving,
-      )
-      for end in ENDS
-    ),
+    ("the same in `car_real`, unchanged", "car_agent/eval_car_real.json", "", driving),
     (
       "`quadruped`, without a demonstrator",
       "quadruped_agent/eval.json",
@@ -701,7 +692,7 @@ def agents(results: pathlib.Path) -> str:
         trained("quadruped_trot_agent", f"curve{end}"),
         trotting,
       )
-      for end in ENDS
+      for end in TROTS
     ),
     ("`quadruped-cloned`", "quadruped_cloned/eval.json", trained("quadruped_cloned"), walking),
   )
@@ -1773,7 +1764,7 @@ def gait(results: pathlib.Path) -> str:
   rows = []
   for file, name in (
     ("quadruped_agent/gait.json", "quadruped"),
-    *((f"quadruped_trot_agent/gait{end}.json", f"quadruped-trot{end}") for end in ENDS),
+    *((f"quadruped_trot_agent/gait{end}.json", f"quadruped-trot{end}") for end in TROTS),
   ):
     for own in load(results / file)["paces"]:
       rows.append(

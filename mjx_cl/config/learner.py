@@ -31,8 +31,6 @@ class DreamerConfig:
       learn another reward and nothing moves the latents that the policy reads.
     anchor: Weight of -log policy(a | s) for the actions that the robot itself took, in replayed
       states; holds the policy where learning moves the latents that it reads. 0: off.
-    pre_tanh: Weight of max(|m| - 2, 0)^2 in the policy's loss, m its mean before the tanh: keeps an
-      action that is best at its limit from sticking there, where its slope 1 - tanh(m)^2 is nil.
     min_std: Least deviation of the policy's actions.
     max_std: Greatest deviation of the policy's actions.
     warmup: Updates over which the learning rate rises linearly.
@@ -60,7 +58,6 @@ class DreamerConfig:
   policy_lr: float = 1.0
   model_lr: float = 1.0
   anchor: float = 0.0
-  pre_tanh: float = 0.0
   min_std: float = 0.1
   max_std: float = 1.0
   warmup: int = 1000
@@ -104,15 +101,7 @@ class DreamerConfig:
     )
     positive(self, "agc", "range_rate", "slow_rate")
     not_below_0(
-      self,
-      "anchor",
-      "pre_tanh",
-      "model_lr",
-      "warmup",
-      "entropy",
-      "free_nats",
-      "rep_scale",
-      "repval_scale",
+      self, "anchor", "model_lr", "warmup", "entropy", "free_nats", "rep_scale", "repval_scale"
     )
     fraction(self, "lam")
     require(self.bins % 2, f"bins must be odd; got {self.bins}")

@@ -4,8 +4,7 @@ sums.
 
 With imagined states s_0..s_H (no gradient), R the lambda-return, S the return scale and omega the
 product of continues:
-  policy = -mean omega_i [log pi(a_i | s_i) sg((R_i - v_i) / S) + eta H(pi(s_i))
-    - pre_tanh sum max(|m(s_i)| - FREE, 0)^2],   m the mean before its tanh
+  policy = -mean omega_i [log pi(a_i | s_i) sg((R_i - v_i) / S) + eta H(pi(s_i))]
   value  =  mean omega_i [CE(v(s_i), sg R_i) + CE(v(s_i), sg v_slow(s_i))],   i = 0..H-1, means over
     i and starts
 """
@@ -24,7 +23,6 @@ from mjx_cl.dreamer.losses import lambda_return, update_range
 from mjx_cl.dreamer.networks import Networks, sg
 from mjx_cl.types import Array
 
-FREE = 2.0  # |m| that costs nothing: tanh 0.964, slope 0.07
 Sums = tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]  # of policy, value, entropy
 
 
@@ -117,15 +115,11 @@ def sums(
   """Sums over states of the policy loss, the value loss and the entropy."""
   deter, stoch, first, action = states
   first = first or (None, None)
-  raw = heads.read(agent.pol, pol, deter, stoch, first[0])
-  mean, std = nets.normal(*raw, *agent.deviations)
+  mean, std = nets.normal(*heads.read(agent.pol, pol, deter, stoch, first[0]), *agent.deviations)
   entropy = nets.normal_entropy(std)
   policy = -omega * (
     nets.normal_logp(mean, std, action) * advantage + agent.config.entropy * entropy
   )
-  if agent.config.pre_tanh:
-    beyond = jnp.square(jax.nn.relu(jnp.abs(raw[0]) - FREE)).sum(-1)
-    policy = policy + agent.config.pre_tanh * omega * beyond
   logits = heads.read(agent.val, val, deter, stoch, first[1])
   value = omega * (
     nets.two_hot_loss(logits, ret, agent.bins) + nets.two_hot_loss(logits, slow, agent.bins)

@@ -52,8 +52,6 @@ SOURCES = {
       for file in ("eval.json", "curve.parquet")
     ),
     "quadruped_agent/eval.json",
-    *(f"car_unsaturated_agent/eval{end}.json" for end in ("", "-2", "-3")),
-    *(f"car_unsaturated_agent/curve{end}.parquet" for end in ("", "-2", "-3")),
     *(f"quadruped_trot_agent/eval{end}.json" for end in ("", "-2", "-3")),
     *(f"quadruped_trot_agent/curve{end}.parquet" for end in ("", "-2", "-3")),
     "quadruped_cloned/eval.json",
