@@ -37,7 +37,7 @@ from mjx_cl.training import agents  # noqa: E402
 
 CHUNK = 50
 PLANS = ((64, 5, 2, 0.3), (64, 10, 2, 0.3), (64, 10, 2, 0.1), (64, 15, 4, 0.15))  # N, H, M, sigma
-ELITE = 10  # of so many sequences one of the sequences
+ELITE = 10  # the best one in so many sequences
 
 
 class Planner:
