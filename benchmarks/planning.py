@@ -1,12 +1,12 @@
 """Does planning with the world model earn more than the policy? python benchmarks/planning.py
-car_real --agent car [--fault friction --target rear --severity 0.12] [--json]
+car_real --agent car [--json]
 
 At every step N sequences of H actions around the policy's mean are dreamt, each M times with the
 same draws of the prior for all of them; sequence 0 is the policy's own. A sequence is worth
   sum_k gamma^k r_k + gamma^H v,   gamma of the continue head, r and v of the agent's own heads,
 and the robot takes the mean of the first actions of the best tenth: one iteration of the planner of
-TD-MPC2 (Hansen et al. 2024, https://arxiv.org/abs/2310.16828), not weighted. Frozen robots, the same keys for
-all; differences are per control step, with 95 % bootstrap intervals over robots.
+TD-MPC2 (Hansen et al. 2024, https://arxiv.org/abs/2310.16828), not weighted. Frozen healthy robots,
+the same keys for all; differences are per control step, with 95 % bootstrap intervals over robots.
 """
 
 from __future__ import annotations
@@ -105,10 +105,8 @@ def drive(
   env: Any, agent: Any, params: Any, args: argparse.Namespace
 ) -> tuple[np.ndarray, np.ndarray]:
   """Reward a control step and ended episodes of each robot, acting by `agent`."""
-  fault = (faults.make(args.fault, env),)
-  target = jnp.asarray([fault[0].targets.index(args.target) if args.target else -1])
-  plan = faults.plan(jnp.asarray([args.severity]))
-  begin = lambda key: start(env, agent, fault, key, target=target, plan=plan)
+  fault = faults.none(env)
+  begin = lambda key: start(env, agent, fault, key)
   streams = nest(begin, 0, 0)(jax.random.split(jax.random.key(args.seed), args.robots)[None])
   rollout, own = Rollout(env, agent, fault, 1, True), jax.tree.map(lambda x: x[None], params)
   earned, ended = [], []
@@ -162,9 +160,6 @@ if __name__ == "__main__":
   parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
   parser.add_argument("env", choices=sorted(envs.ENVS))
   parser.add_argument("--agent", help="shipped name or folder")
-  parser.add_argument("--fault", default="none")
-  parser.add_argument("--target")
-  parser.add_argument("--severity", type=float, default=0.0)
   parser.add_argument("--robots", type=int, default=16)
   parser.add_argument("--steps", type=int, default=600)
   parser.add_argument("--seed", type=int, default=100)

@@ -81,7 +81,7 @@ def test_the_best_of_the_sequences_by_a_loop(whole):
 
 
 def test_too_little_is_refused():
-  args = dict(env="car_real", agent=None, fault="none", target=None, severity=0.0, seed=0)
+  args = dict(env="car_real", agent=None, seed=0)
   with pytest.raises(UserError, match="--steps must be at least 50; got 9"):
     planning.measure(argparse.Namespace(**args, steps=9, robots=2))
   with pytest.raises(UserError, match="--robots must be at least 2; got 1"):
