@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mjx_cl.config import DreamerConfig, finetuning_lr
+from mjx_cl.config import DreamerConfig, finetuning
 from mjx_cl.errors import FileError
 from mjx_cl.scoring import intervals
 
@@ -323,7 +323,7 @@ def setup(experiment: Experiment, config: dict) -> list[str]:
     **dataclasses.asdict(author),
     **card["dreamer"],
   }  # a card older than a setting has its default
-  adapt = adapt | {"lr": finetuning_lr(adapt.get("lr"), card)}
+  adapt = finetuning(adapt, card)
   own = lambda name: adapt[name] if adapt.get(name) is not None else dreamer[name]
   pairs = [
     (card["dreamer"]["size"], author.size, "{} in place of {}"),

@@ -75,9 +75,14 @@ def whose(known: Collection[str], robot: str | None, agent: str | None = None) -
   return next(name for name in names if name in known)
 
 
-def finetuning_lr(lr: float | None, card: dict) -> float | None:
-  """`lr`, of which the default gives way to `finetuning_lr` of an agent's card."""
-  return card.get("finetuning_lr") or lr if lr == FINETUNING_LR else lr
+def finetuning(given: dict, card: dict) -> dict:
+  """`given` settings of AdaptConfig, of which the defaults of `lr` and `anchor` give way to
+  `finetuning_lr` and `finetuning_anchor` of an agent's card.
+  """
+  defaults = {"lr": FINETUNING_LR, "anchor": None}
+  left = [name for name, value in defaults.items() if name in given and given[name] == value]
+  named = {name: card.get(f"finetuning_{name}") for name in left}
+  return given | {name: value for name, value in named.items() if value is not None}
 
 
 @dataclass(frozen=True)
@@ -92,7 +97,8 @@ class AdaptConfig:
     policy_lr: Factor on the policy's steps while adapting; None: 1.
     model_lr: Factor on the steps of encoder, dynamics and decoder while adapting, so that what
       reads latents keeps up with them (two time-scales, https://arxiv.org/abs/1706.08500); None: 1.
-    anchor: Weight while adapting of the actions that the robot itself took; None: the agent's own.
+    anchor: Weight while adapting of the actions that the robot itself took; None:
+      `finetuning_anchor` of the agent's card, where it names one, else that of its training.
     batch: Sequences of one update while adapting; fewer mean more updates at the same ratio. None:
       the agent's own.
     last_starts: Imagination starts are the last so many states of each sequence; 0: all, None: the

@@ -1070,6 +1070,9 @@ def test_what_differs_from_the_papers_setup():
   assert paper.setup(walker, same) == ["onset 9,000 in place of 5,000"]
   slower = CONFIG | {"agent_card": CONFIG["agent_card"] | {"finetuning_lr": 3e-5}}
   assert paper.setup(walker, slower)[2] == "learning rate 3e-05 in place of 4e-05"
+  held = CONFIG | {"agent_card": CONFIG["agent_card"] | {"finetuning_anchor": 0.1}}
+  line = "policy held to the actions taken with a weight of 0.1"
+  assert line in paper.setup(walker, held | {"adapt": CONFIG["adapt"] | {"anchor": None}})
   for factor in (0.1, 0.0):
     given = slower | {"adapt": CONFIG["adapt"] | {"model_lr": factor}}
     assert paper.setup(walker, given)[3] == f"the world model's own steps {factor:g} times as long"

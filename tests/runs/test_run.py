@@ -952,6 +952,23 @@ def test_an_agent_is_finetuned_at_the_rate_of_its_card(saved, tmp_path):
       assert rates() == (own, own, said, 2e-5)
 
 
+def test_an_agent_is_finetuned_with_the_anchor_of_its_card(saved, tmp_path):
+  """Where none is given; training on knows nothing of it."""
+  shutil.copytree(saved, tmp_path / "agent")
+  load = lambda **given: agents.load(str(tmp_path / "agent"), "walker", 24, 6, **given)
+  given = {}, {"anchor": None}, {"anchor": 0.0}, {"anchor": 0.2}
+  weights = lambda: [load(**some).agent.config.anchor for some in given]
+  card = json.loads((saved / "card.json").read_text())
+  assert weights() == [0.0, 0.0, 0.0, 0.2]
+  for said, known in ((0.1, [0.0, 0.1, 0.0, 0.2]), (0.0, [0.0, 0.0, 0.0, 0.2]), (-0.1, None)):
+    (tmp_path / "agent/card.json").write_text(json.dumps(card | {"finetuning_anchor": said}))
+    if known:
+      assert weights() == known
+    else:
+      with pytest.raises(FileError, match="finetuning_anchor must be 0 or above; got -0.1"):
+        load()
+
+
 @pytest.mark.parametrize("name", agents.shipped())
 def test_every_shipped_agent_loads(name):
   robot = json.loads((agents.HERE / name / "card.json").read_text())["env"]

@@ -21,7 +21,7 @@ from mjx_cl.config import (
   MOST_REPEAT,
   DreamerConfig,
   field_kinds,
-  finetuning_lr,
+  finetuning,
   kinds,
   own_agent,
   recorded,
@@ -41,6 +41,7 @@ CARD = {
   "repeat": "int",
   "updates": "int | None",
   "finetuning_lr": "float | None",
+  "finetuning_anchor": "float | None",
 }
 
 
@@ -195,8 +196,9 @@ def read_card(folder: pathlib.Path) -> tuple[dict, DreamerConfig]:
     kinds(where, CARD, held)
     fits = 1 <= held["repeat"] <= MOST_REPEAT
     require(fits, f"repeat must lie in 1..{MOST_REPEAT}; got {held['repeat']}")
-    rate = held.get("finetuning_lr")
+    rate, anchor = held.get("finetuning_lr"), held.get("finetuning_anchor")
     require(rate is None or 0 < rate < 1, f"finetuning_lr must lie between 0 and 1; got {rate}")
+    require(anchor is None or anchor >= 0, f"finetuning_anchor must be 0 or above; got {anchor}")
     require(isinstance(held["dreamer"], dict), "dreamer must be a table of settings")
     dreamer = recorded(DreamerConfig, held["dreamer"])
     field_kinds(where, DreamerConfig, dreamer, "dreamer.")
@@ -224,7 +226,7 @@ def load(
     agents_of: robot with the same observation, action and reward, whose agents fit too; None: that
       of the class registered under this name.
     departures: fields of its DreamerConfig to go on with otherwise, e.g. lr, see
-      config.finetuning_lr; None: its own, of policy_lr and model_lr 1.
+      config.finetuning; None: its own, of policy_lr and model_lr 1.
 
   Raises:
     UserError: an agent of another robot or an unknown name.
@@ -244,7 +246,7 @@ def load(
   if card["env"] not in (env_name, related):
     raise UserError(f"agent {name!r} was trained on {card['env']!r}, not on {env_name!r}")
   # whatever goes on from here does so at full learning rate, whatever its last stage held still
-  departures |= {"lr": finetuning_lr(departures.get("lr"), card)}
+  departures = finetuning(departures, card)
   other = {"warmup": 0, "policy_lr": 1.0, "model_lr": 1.0} | {
     k: v for k, v in departures.items() if v is not None
   }
