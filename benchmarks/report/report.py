@@ -1611,6 +1611,7 @@ def methods_board(results: pathlib.Path) -> str:
       *(shown(r, f"score_{robot}") for robot in robots),
       "" if r["gain"] is None else shown(r, "gain"),
       f"{r['harm']} of {r['settings']}",
+      f"{r['harm_agents']} of {r['pairs']}",
       f"{number(100 * r['harm_streams'], 0)} %",
       f"{r['recovered']} of {r['affected']}",
       number(r["falls"], 1),
@@ -1638,14 +1639,15 @@ def methods_board(results: pathlib.Path) -> str:
       {about["lives"]} lives, best gain first. Score: 0 loses as much return as doing nothing, 100
       loses none, below 0 is harm; mean over a robot's settings and over robots. Gain: score less
       that of the paper's method (`detector`), on the lives of both. Harm: settings in which more is
-      lost than by doing nothing, by the paired interval; worse: lives that lose a tenth of the
+      lost than by doing nothing, by the paired interval; by agent: pairs of a setting and an agent
+      in which that agent's seeds alone say so; worse: lives that lose a tenth of the
       reward more than doing nothing on the same
       seed. Recovered: of the lives that lose a tenth without adaptation. Falls beyond those of
       doing nothing, updates and seconds of a core are of a life. Brackets: 95 %, bootstrap over
       agents and their seeds. Round brackets: lives, where a method has fewer of a setting. Scores
       of other lives do not compare, gains do.""")
-  heads = ("method", "lives", "score", *robots, "gain", "harm", "worse", "recovered")
-  heads = (*heads, "falls", "updates")
+  heads = ("method", "lives", "score", *robots, "gain", "harm", "by agent", "worse")
+  heads = (*heads, "recovered", "falls", "updates")
   tables = [
     grid((*heads, "time [s]"), first),
     grid(("setting", "lives", "lost, `none`", *(f"`{n}`" for n in names if n != "none")), second),

@@ -87,6 +87,7 @@ def show(board: adaptation.Board, lives: list[dict]) -> None:
     "gain",
     *robots,
     "harm",
+    "by agent",
     "worse",
     "recovered",
     "falls",
@@ -100,6 +101,7 @@ def show(board: adaptation.Board, lives: list[dict]) -> None:
       number(r["gain"]) + between(r["gain_ci"]),
       *(number(r.get(f"score_{robot}")) for robot in robots),
       f"{r['harm']} of {r['settings']}",
+      f"{r['harm_agents']} of {r['pairs']}",
       share(r["harm_streams"]),
       f"{r['recovered']} of {r['affected']}",
       number(r["falls"], "+.1f"),
@@ -127,6 +129,6 @@ def show(board: adaptation.Board, lives: list[dict]) -> None:
   )
   say(
     "gain: score less that of the paper's method (`detector`); harm: settings in which it loses "
-    "more than doing nothing; worse: streams that do by a tenth; falls, updates: a stream, falls "
-    "beyond `none`; [95 % interval]"
+    "more than doing nothing; by agent: pairs of a setting and an agent that do; worse: streams "
+    "that do by a tenth; falls, updates: a stream, falls beyond `none`; [95 % interval]"
   )

@@ -49,6 +49,13 @@ COLUMNS = (
     False,
     "Settings in which more is lost than by doing nothing, by paired intervals",
   ),
+  (
+    "harm_agents",
+    "Harm by agent",
+    0,
+    False,
+    "Pairs of a setting and an agent of which the same holds, by the interval of its seeds",
+  ),
   ("harm_streams", "Worse", 0, True, "Lives that lose more than doing nothing by a tenth"),
   ("recovered", "Recovered", 0, False, "Of the lives that lose a tenth without adaptation"),
   ("falls", "Falls", 1, False, "A life, beyond those of doing nothing"),
@@ -144,6 +151,8 @@ def cell(row: dict, key: str, digits: int, share: bool) -> str:
   value = number(row[key], digits, share)
   if key == "harm":
     value = f"{row['harm']} of {row['settings']}"
+  if key == "harm_agents":
+    value = f"{row['harm_agents']} of {row['pairs']}"
   if key == "recovered":
     value = f"{row['recovered']} of {row['affected']}"
   ends = row.get(f"{key}_ci")

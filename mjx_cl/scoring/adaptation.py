@@ -73,8 +73,10 @@ def board(lives: list[dict]) -> Board:
     score_ROBOT_ci; gain, gain_ci, gain_ROBOT, gain_ROBOT_ci: its score less that of the paper's
     method, over the settings, agents and seeds of both; settings; harm: settings in which it loses
     more than `none`, by the paired interval; harm_holm: the same by a sign-flip test at 5 %, lives
-    taken as independent, after Holm's correction; harm_streams: share of streams that lose more
-    than `none` of the same seed by a tenth of the reward before; falls: in the whole life, beyond
+    taken as independent, after Holm's correction; harm_agents: of the `pairs` of a setting and an
+    agent those of which it is told by the interval of the agent's seeds; harm_streams: share of
+    streams that lose more than `none` of the same seed by a tenth of the reward before; falls: in
+    the whole life, beyond
     `none`; updates, wall_s: a stream; false_alarms: share of streams with one before the onset;
     healthy_lost: reward lost before the onset beyond `none` [share]; mean_rank: over the settings
     that all have, by the scores over the agents and seeds that all have there.
@@ -133,7 +135,8 @@ def of_setting(lives: dict[tuple, dict], nothing: dict[tuple, dict]) -> dict[str
 
   Returns:
     streams: pairs; agents; score; lost, lost_none: mean shares; beyond: mean of the pairs'
-    differences in lost, beyond_p (sign flips); worse: pairs that lose more than `none` by a tenth;
+    differences in lost, beyond_p (sign flips); harmed: agents that by themselves lose more than
+    `none`, by the interval of their seeds; worse: pairs that lose more than `none` by a tenth;
     affected: those of which recovery is known; recovered: of these; recovery_steps: mean time to
     recovery up to the longest that could be seen, those that take longer counted as that, with
     recovery_steps_ci; falls, false_alarms, healthy_lost, updates, wall_s: as `board`.
@@ -144,6 +147,8 @@ def of_setting(lives: dict[tuple, dict], nothing: dict[tuple, dict]) -> dict[str
     np.array([share_lost(life, ref) for life, ref in zip(of, other)]) for of in (own, other)
   )
   beyond = lost - none
+  agents = {agent for agent, _ in shared}
+  apart = [beyond[[whose == agent for whose, _ in shared]] for agent in agents]
   known = np.isfinite(beyond)
   lost, none, beyond = lost[known], none[known], beyond[known]
   mean = lambda x: float(np.mean(x)) if len(x) else None
@@ -153,12 +158,13 @@ def of_setting(lives: dict[tuple, dict], nothing: dict[tuple, dict]) -> dict[str
   before = lambda life: (life["reward_pre"] or 0.0) * life["onset"]
   return {
     "streams": len(shared),
-    "agents": len({agent for agent, _ in shared}),
+    "agents": len(agents),
     "score": intervals.finite(score),
     "lost": mean(lost),
     "lost_none": mean(none),
     "beyond": mean(beyond),
     "beyond_p": sign_flips(beyond),
+    "harmed": sum(_above_0(x[np.isfinite(x)]) for x in apart),
     "worse": int(np.sum(beyond > TENTH)),
     "affected": len(hit),
     "recovered": sum(life["recovery_step"] is not None for life in hit),
@@ -175,6 +181,12 @@ def of_setting(lives: dict[tuple, dict], nothing: dict[tuple, dict]) -> dict[str
     "updates": mean([life["updates"] for life in own]),
     "wall_s": mean([life["wall_s"] for life in own if life["wall_s"] is not None]),
   }
+
+
+def _above_0(x: np.ndarray) -> bool:
+  """Whether a mean is above 0, by its interval."""
+  ends = intervals.interval(x, np.mean)
+  return ends is not None and ends[0] > 0
 
 
 def _time(hit: list[dict]) -> dict[str, Any]:
@@ -331,6 +343,8 @@ def _overall(name: str, rows: list[dict], held: dict, drawn: dict[str, _Draws]) 
     "streams": streams,
     "agents": max((r["agents"] for r in own), default=0),
     "harm": sum(r["beyond_ci"] is not None and (r["beyond_ci"][0] or 0) > 0 for r in own),
+    "harm_agents": sum(r["harmed"] for r in own),
+    "pairs": sum(r["agents"] for r in own),
     "harm_holm": sum(h and r["beyond"] > 0 for h, r in zip(hurt, own)),
     "harm_streams": sum(r["worse"] for r in own) / streams if streams else None,
     "recovered": sum(r["recovered"] for r in own),

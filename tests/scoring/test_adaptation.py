@@ -107,6 +107,16 @@ def test_harm_is_told_by_pairs_and_corrected():
   assert (bad["settings"], bad["harm"], bad["harm_holm"], bad["harm_streams"]) == (4, 1, 0, 0.25)
 
 
+def test_harm_by_agent_shows_what_unlike_agents_hide():
+  """One agent of two is undone, the other repaired: together nothing can be said, apart it can."""
+  both = lives({"none": NONE, "mine": [x + 0.3 for x in NONE]}, agent="a")
+  both += lives({"none": NONE, "mine": [0.1 * x for x in NONE]}, agent="b")
+  row = of(adaptation.board(both), "mine")
+  assert (row["harm"], row["harm_agents"], row["pairs"], row["harm_streams"]) == (0, 1, 2, 0.5)
+  alone = [x for x in both if x["seed"] == both[0]["seed"]]  # a seed of an agent tells nothing
+  assert of(adaptation.board(alone), "mine")["harm_agents"] == 0
+
+
 def test_agents_are_drawn_too():
   """Two agents that differ, whose seeds do not: the interval is that of agents."""
   both = lives({"none": [0.4] * 6, "mine": [0.1] * 6}, agent="a")
