@@ -14,6 +14,7 @@ import pytest
 import quick
 from test_arms import EAGER, STEPS, hand_rows, scripted
 
+from benchmarks import methods as told
 from mjx_cl.adapt import decide, methods
 from mjx_cl.adapt.arms import ALARM, ARMS, RULE, Arm
 from mjx_cl.adapt.choices import settings as settings_of
@@ -196,6 +197,24 @@ def test_stages_by_hand(same):
     held = {k for k, part in parts.items() if same(part(kept), part(train))}
     assert held == [set(), {"pol"}, {"pol", "val", "slow", "range"}][still], taken
     assert kept.updates == after.updates
+
+
+def test_a_residual_is_linear_and_bounded_by_hand(same):
+  """Its trunk is that of before; the head moves by 0.02 at most from where it was at the onset."""
+  method = told.residual().method
+  methods.check("residual", method, AGENT)
+  train = jax.jit(AGENT.init)(jax.random.key(0))
+  far = jax.tree.map(lambda x: x + 1, train)
+  near = jax.tree.map(lambda x: x + jnp.asarray(0.01, x.dtype), train)
+  memory = methods.remember(method, train.params)
+  for after, moved in ((far, 0.02), (near, 0.01)):
+    kept = method.keep(memory, train, after)
+    assert same(kept.params["pol"]["mlp"], train.params["pol"]["mlp"])
+    move = jax.tree.map(lambda a, b: a - b, kept.params["pol"]["mean"], train.params["pol"]["mean"])
+    for step in jax.tree.leaves(move):
+      np.testing.assert_allclose(step, moved, atol=1e-6)  # float32 near 1
+    rest = lambda s: {**s.params, "pol": s.params["pol"]["std"]}
+    assert same(rest(kept), rest(after)) and same(kept.slow, after.slow)
 
 
 def test_a_calm_robot_explores_in_dreams_alone(lived):
