@@ -28,7 +28,7 @@ def test_a_recording_is_the_same_wherever_its_parts_are(
   how = ("--out", tmp_path / "set", "--agent", saved, "--physics", "native")
   code, _, err = mjx("record", recorded[1], *how, *where)
   assert code == 0, err
-  assert "recorded, 4 of 4" in err and "steps of 2 robots" in err
+  assert "recorded, 4 of 4" in err  # lines of parts are sampled: a quick part's may be missed
   for name in ("walker.parquet", "walker_latents.parquet", "streams.parquet"):
     assert (tmp_path / "set" / name).read_bytes() == (recorded[0] / name).read_bytes()
   assert not (tmp_path / "set" / "work").exists()

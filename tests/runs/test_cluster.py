@@ -103,6 +103,13 @@ def test_what_a_part_says_last_is_why_it_failed(plan):
   assert type(wrong) is UserError and "part healthy: no agent" in str(wrong)
 
 
+def test_the_newest_line_of_each_part_is_taken_once():
+  board = cluster.Board()
+  for name, line in (("a", "step 1"), ("b", "step 5"), ("a", "step 2")):
+    board.put(name, line)
+  assert board.take() == ["step 2", "step 5"] and board.take() == []
+
+
 def test_a_part_that_is_to_end_saves(plan, monkeypatch):
   """Without an exception from Ray, which C code may drop."""
   monkeypatch.setattr(cluster, "ASK_S", 0.0)
