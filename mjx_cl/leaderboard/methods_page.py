@@ -25,6 +25,7 @@ MORE = (
   "section.setting circle { opacity: 0.55; }\n"
   ".mean { stroke: var(--ink); stroke-width: 2.4; }\n"
 )
+OF = {"harm": "settings", "harm_agents": "pairs", "recovered": "affected"}  # count -> of how many
 # key, header, digits, whether in per cent, tooltip
 COLUMNS = (
   (
@@ -149,12 +150,8 @@ def number(x: float | None, digits: int, share: bool = False) -> str:
 def cell(row: dict, key: str, digits: int, share: bool) -> str:
   """A cell of a table, with its interval where there is one."""
   value = number(row[key], digits, share)
-  if key == "harm":
-    value = f"{row['harm']} of {row['settings']}"
-  if key == "harm_agents":
-    value = f"{row['harm_agents']} of {row['pairs']}"
-  if key == "recovered":
-    value = f"{row['recovered']} of {row['affected']}"
+  if key in OF:
+    value = f"{row[key]} of {row[OF[key]]}"
   ends = row.get(f"{key}_ci")
   between = ""
   if ends is not None:

@@ -76,10 +76,10 @@ def board(lives: list[dict]) -> Board:
     taken as independent, after Holm's correction; harm_agents: of the `pairs` of a setting and an
     agent those of which it is told by the interval of the agent's seeds; harm_streams: share of
     streams that lose more than `none` of the same seed by a tenth of the reward before; falls: in
-    the whole life, beyond
-    `none`; updates, wall_s: a stream; false_alarms: share of streams with one before the onset;
-    healthy_lost: reward lost before the onset beyond `none` [share]; mean_rank: over the settings
-    that all have, by the scores over the agents and seeds that all have there.
+    the whole life, beyond `none`; updates, wall_s: a stream; false_alarms: share of streams with
+    one before the onset; healthy_lost: reward lost before the onset beyond `none` [share];
+    mean_rank: over the settings that all have, by the scores over the agents and seeds that all
+    have there.
 
   Raises:
     UserError: two lives of one method, setting, agent and seed, or a setting without `none`.
