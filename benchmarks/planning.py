@@ -27,7 +27,7 @@ from jaxtyping import PRNGKeyArray  # noqa: E402
 
 from mjx_cl import envs, faults  # noqa: E402
 from mjx_cl.cli import app  # noqa: E402
-from mjx_cl.dreamer import heads, nets, rssm  # noqa: E402
+from mjx_cl.dreamer import heads, nets  # noqa: E402
 from mjx_cl.dreamer.networks import Networks  # noqa: E402
 from mjx_cl.dreamer.state import Carry  # noqa: E402
 from mjx_cl.errors import require  # noqa: E402
@@ -69,11 +69,9 @@ class Planner:
   ) -> tuple[Carry, jax.Array]:
     """As Networks.act, the action planned."""
     agent, (horizon, n, m) = self.agent, self.shape
-    key_z, key_a, key_u = jax.random.split(key, 3)
-    deter = agent._core(params, carry.deter[None], carry.stoch[None], carry.action[None])
-    tokens = agent._encode(params, obs[None])
-    logits = agent._apply(params, "dyn", deter, tokens, method="posterior")
-    stoch = rssm.sample(logits, jax.random.uniform(key_z, (1, agent.size.stoch))).reshape(1, -1)
+    after, _ = agent.act(params, carry, obs, key, True)
+    deter, stoch = after.deter[None], after.stoch[None]
+    _, key_a, key_u = jax.random.split(key, 3)  # the first is the latent's, in act
     noise = self.sigma * jax.random.normal(key_a, (horizon, n, 1, agent.act_size))
     noise = jnp.broadcast_to(noise.at[:, 0].set(0.0), (horizon, n, m, agent.act_size))
     uniform = jax.random.uniform(key_u, (horizon, 1, m, agent.size.stoch))
@@ -98,7 +96,7 @@ class Planner:
     worth = (total + weight * value).reshape(n, m).mean(1)
     _, best = jax.lax.top_k(worth, max(1, n // ELITE))
     action = actions[0].reshape(n, m, -1)[best, 0].mean(0)
-    return Carry(deter[0], stoch[0], action), action
+    return after._replace(action=action), action
 
 
 def drive(
