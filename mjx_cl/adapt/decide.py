@@ -329,7 +329,7 @@ def _judge(
   adapting = state.phase == ADAPTING
   age = now - state.since
   reward = jnp.nanmean(state.ring[:, SIGNALS.index("reward")])
-  accepted = (reward >= acceptance) & (jnp.mean(state.posture) >= least_posture)
+  accepted = (reward >= acceptance) & (jnp.nanmean(state.posture) >= least_posture)
   full = adapting & (state.count >= config.patience) & (age >= config.least)
   # progress: the reward over the patience has not risen by 5 % of |acceptance| above its best for a
   # third of `give_up`

@@ -292,14 +292,15 @@ class Loop:
     _, least = self.spec.posture or (0, -jnp.inf)
     setting = lambda name: choices.settings.get(name, getattr(config, name))
     acceptance = decide.regained(state.phase, acceptance, setting("regain"))
-    signals = seen.signals
+    signals, posture = seen.signals, seen.posture
     own = choices.methods.all
     for i, (method, memory) in enumerate(zip(own, state.memory)):
       if method.hides is not None:  # the rule judges what learns
-        others = (choices.method == i) & jax.vmap(method.hides)(memory)
-        signals = jnp.where((others & (was == decide.ADAPTING))[:, None], jnp.nan, signals)
+        others = (choices.method == i) & jax.vmap(method.hides)(memory) & (was == decide.ADAPTING)
+        signals = jnp.where(others[:, None], jnp.nan, signals)
+        posture = jnp.where(others, jnp.nan, posture)
     phase, decision, settled = decide.decide(
-      state.phase, signals, seen.posture, begin, now, choices, acceptance, least, config
+      state.phase, signals, posture, begin, now, choices, acceptance, least, config
     )
     begins = decision == decide.START
 

@@ -60,13 +60,17 @@ class Robots:
     self.make = functools.cache(envs.make)
     self._agent = functools.cache(self._load)
 
-  def _load(self, name: str, agent: str | None) -> tuple[Any, str]:
+  def _load(self, name: str, agent: str | None) -> tuple[Any, str, int]:
     trained = agents.of(self.make(name, "auto"), agent)
-    return trained.agent.config, agents.called(trained)
+    return trained.agent.config, agents.called(trained), trained.repeat
 
   def learner(self, name: str, agent: str | None) -> Any:
     """DreamerConfig of a robot's agent."""
     return self._agent(name, agent)[0]
+
+  def repeat(self, name: str, agent: str | None) -> int:
+    """Control steps of a decision of the agent."""
+    return self._agent(name, agent)[2]
 
   def called(self, name: str, agent: str | None) -> str:
     """The agent's own name, see `agents.called`."""
@@ -83,7 +87,8 @@ def estimate(part: Part, rate: float, robots: Robots) -> Estimate:
   """
   c = part.config
   env, trained = robots.make(c.env, "auto"), robots.learner(c.env, c.agent)
-  clock = clock_of(c, env.spec, trained, stops=stop_rule.told(c))
+  repeat = robots.repeat(c.env, c.agent)
+  clock = clock_of(c, env.spec, trained, repeat, stops=stop_rule.told(c))
   chunks = clock.expected(0, [Standing()] * len(clock.labels))
   # RATE is that of two cores, `rate` that of all
   slower = work.RATE / 2 / (rate / clock.cores)
@@ -93,7 +98,7 @@ def estimate(part: Part, rate: float, robots: Robots) -> Estimate:
     len(clock.labels) * c.steps,
     float(chunks.updates.sum()),
     compiling + slower * float(work.wall(chunks, clock.core, clock.cores).sum()),
-    room.of(c, env.spec, trained).total,
+    room.of(c, env.spec, trained, repeat).total,
   )
 
 

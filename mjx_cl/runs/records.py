@@ -354,6 +354,14 @@ def came_to(events: list[dict], under_way: bool) -> dict:
   }
 
 
+def begun(event: dict) -> int:
+  """The control step from which an event counts: of a start that of what started it, which the
+  chunk's end, `step`, follows.
+  """
+  since = event.get("since") if event["kind"] == "start" else None
+  return event["step"] if since is None else since
+
+
 def set_apart(rows: list[dict], events: list[dict]) -> list[dict]:
   """Rows with `adapting_at_onset`: whether the stream's finetuning was under way when the change
   came. Such a stream is a false alarm (or one that was told to adapt) and is kept apart from
@@ -367,8 +375,8 @@ def set_apart(rows: list[dict], events: list[dict]) -> list[dict]:
       for e in events
       if r["onset"] is not None
       and e["stream"] == r["stream"]
-      and e["step"] < r["onset"]
       and e["kind"] in ("start", "stop", "abort")
+      and begun(e) < r["onset"]
     ]
     under_way = kinds[-1:] == ["start"]
     unknown = dict.fromkeys(("alarm_step", "latency_steps", "latency_s") if under_way else ())

@@ -17,7 +17,7 @@ from mjx_cl.io import tables
 from mjx_cl.scoring import events, intervals, stop_rule
 
 # settings of AdaptConfig that it may change
-RULE = ("patience", "trend", "fluctuation", "excess", "near", "least", "give_up")
+RULE = ("patience", "trend", "fluctuation", "excess", "near", "least", "give_up", "regain")
 # of a row of stop_rule, where the run has snapshots
 JUDGED = (
   "oracle_stop_steps",
@@ -164,6 +164,8 @@ def _relive(
     def step(state: decide.PhaseState, x: tuple) -> tuple[decide.PhaseState, jax.Array]:
       signals, posture, acceptance, now = x
       falls = (since >= now - length) & (since < now)
+      first = jax.tree.map(lambda x: x[None], state)
+      acceptance = decide.regained(first, acceptance, config.regain)[0]
       state, decision, _ = decide.update(
         state,
         signals,

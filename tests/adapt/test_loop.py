@@ -252,6 +252,17 @@ def test_a_robot_that_lies_has_not_recovered():
   assert happened(live(quiet(40), alarms=[5], posture=0.95)[2]) == {5: START, 9: STOP}
 
 
+def test_a_chunk_that_is_hidden_tells_nothing_of_the_posture():
+  """Chunks of weights that do not learn, nan: neither a low robot beside them counts as upright
+  nor an upright one as low.
+  """
+  hidden, signals = np.arange(40) % 4 == 3, quiet(40)
+  signals[hidden] = np.nan
+  low, high = (np.where(hidden, np.nan, x) for x in (0.85, 0.95))
+  assert happened(live(signals, alarms=[5], posture=low)[2]) == {5: START, 25: ABORT_BELOW}
+  assert happened(live(signals, alarms=[5], posture=high)[2]) == {5: START, 9: STOP}
+
+
 def test_no_settling_in_sight_aborts():
   decisions = live(quiet(40, reward=0.3, dyn_loss=unsettled(40)), alarms=[5])[2]
   assert happened(decisions) == {5: START, 25: ABORT_HOPELESS}

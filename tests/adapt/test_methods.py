@@ -265,6 +265,46 @@ def test_an_update_of_ones_own_takes_the_place_of_dreamers(same):
   assert digests[-1].updates[0] == digests[-1].updates[1] > 0
 
 
+def test_the_rule_reads_nothing_of_a_chunk_that_a_method_hides():
+  counts = Method(
+    init=lambda params: jnp.int32(0),
+    act=lambda chunk, view: methods.average(chunk + 1, view),
+    hides=lambda chunk: chunk % 3 == 1,
+  )
+  ARMS.members["own"] = lambda: Arm("", ALARM, RULE, method=counts)
+  try:
+    states, digests = live(three("own"))
+  finally:
+    del ARMS.members["own"]
+  phase = states[-1].phase
+  for g, want in ((0, True), (1, False)):
+    lived = slice(phase.count[g])
+    hidden = np.isnan(phase.posture[g, lived])
+    assert lived.stop > 4 and hidden.any() == want and not hidden.all()
+    assert (np.isnan(phase.ring[g, lived]).all(1) == hidden).all()
+  assert np.isfinite(digests[-1].signals[0]).all()  # what is written down hides nothing
+
+
+def test_who_is_told_its_stop_keeps_the_weights_of_that_snapshot(same):
+  """A snapshot of an age holds what that chunk has learnt; the arm is told a step more."""
+  arms, onset, chunk = ("oracle-budget", "oracle-stop"), 37, 7
+  age = chunk * STEPS - onset
+  loop = loop_of(arms)
+  labels = [(arm, 0) for arm in arms]
+  chosen = choices(labels, loop.config, STEPS * CHUNKS, [(onset,)] * 2, {0: age + 1})
+  train = jax.jit(AGENT.init)(jax.random.key(0))
+  state = loop.init(train._replace(updates=jnp.int32(2000)), 2, chosen.methods.all)
+  keys, snapshots = jax.vmap(jax.random.key)(jnp.zeros(2, int)), []
+  for c in range(chunk + 2):
+    rows = hand_rows(c * STEPS, 2)
+    state, digest = loop.digest(state, rows, jnp.int32((c + 1) * STEPS), chosen, keys)
+    snapshots.append(jax.tree.map(lambda x: np.array(x[0]), state.acting))
+  assert digest.phase.tolist() == [decide.ADAPTING, decide.ENDED]
+  told = stream(state.acting, 1)
+  assert same(told, snapshots[chunk - 1])
+  assert not same(told, snapshots[chunk - 2]) and not same(told, snapshots[chunk])
+
+
 BROKEN = {
   "init of its method fails: KeyError": Method(init=lambda params: params["policy"]),
   "act of its method fails: AttributeError": Method(act=lambda memory, view: view.weights),

@@ -68,6 +68,9 @@ def test_a_stream_that_is_adapting_at_the_onset_has_no_latency():
   assert all(
     r[k] is None for r in (rows[1], rows[4]) for k in ("alarm_step", "latency_steps", "latency_s")
   )
+  soon = [event(0, 5055, "start") | {"since": 4998}, event(1, 5055, "start") | {"since": 5000}]
+  rows = records.set_apart([row(0), row(1)], soon)  # a chunk's end follows what started it
+  assert [r["adapting_at_onset"] for r in rows] == [True, False]
   later = records.set_apart([row(0, change=1, onset=8000), row(2, change=1, onset=8000)], EVENTS)
   assert [r["adapting_at_onset"] for r in later] == [True, False]
 

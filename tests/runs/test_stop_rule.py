@@ -690,6 +690,15 @@ def test_leaving_out_the_signal_that_holds_up_the_stop(tmp_path):
   assert other[0, ""] > late
   with pytest.raises(UserError, match="no budget; choose from: patience, trend"):
     ablation.ablation(tmp_path, budget=5)
+  again = ablation.ablation(tmp_path, regain=0.9)  # of 0.8, and of 0.3 before: not below the task's
+  assert [r["stop"] for r in again] == [r["stop"] for r in rows.values()]
+  half = np.where(np.tile(chunks, 2) < 5, 1.0, 0.7)  # 0.7 of 1.0: not what is asked for
+  tables.write_table(tmp_path / "signals.parquet", columns | {"reward": half})
+  ends = lambda **rule: {
+    r["outcome"] for r in ablation.ablation(tmp_path, **rule) if r["seed"] == 0
+  }
+  assert ends(regain=0.6) == ends() == {"converged"} and ends(regain=0.9) == {"aborted"}
+  tables.write_table(tmp_path / "signals.parquet", columns)
   assert all(r["outcome"] == "converged" for (seed, _), r in rows.items() if seed == 0)
   assert all(
     r["outcome"] == "aborted" for (seed, _), r in rows.items() if seed == 1
@@ -777,12 +786,14 @@ def test_told_is_the_oracle_stop_of_each_seed(tmp_path):
   tables.write_table(
     tmp_path / "snapshots.parquet",
     {
-      "seed": [4] * 3 + [5] * 3 + [9],
-      "since_start": [3000, 24, 1000] * 2 + [24],
-      "reward_mean": [1.0, 0.5, 0.96, 0.1, 0.99, 0.2, 1.0],
+      "arm": ["oracle-budget"] * 7 + ["mine.py:endless"] * 3,
+      "seed": [4] * 3 + [5] * 3 + [9] + [4, 4, 11],
+      "since_start": [3000, 24, 1000] * 2 + [24] + [3000, 24, 24],
+      "reward_mean": [1.0, 0.5, 0.96, 0.1, 0.99, 0.2, 1.0, 9.0, 9.0, 9.0],
     },
   )
-  assert told() == {4: 1000, 5: 24}  # the first of 95 % of the best; nothing gained from adapting
+  # the first of 95 % of the best, and a step; nothing gained from adapting
+  assert told() == {4: 1001, 5: 25}
   assert told(arms=("none",), stops=None) == {}
   with pytest.raises(UserError, match="no snapshots of seed 6, 7; it has 4, 5, 9"):
     told(seeds=4)
@@ -821,12 +832,8 @@ def test_it_lives_as_the_one_that_never_stops_until_then(lived, config, folder):
   )
   end = json.loads((told / "config.json").read_text())["oracle_stops"][str(SEED)]
   curve = table(out, "snapshots")
-  assert end == max(
-    1,
-    curve[stop_rule.oracle([s["since_start"] for s in curve], [s["reward_mean"] for s in curve])][
-      "since_start"
-    ],
-  )
+  ages, rewards = ([s[k] for s in curve] for k in ("since_start", "reward_mean"))
+  assert end == ages[stop_rule.oracle(ages, rewards)] + 1
   ends = [
     (e["step"], e["reason"])
     for e in table(told, "events")

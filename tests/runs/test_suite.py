@@ -26,6 +26,7 @@ from mjx_cl.render import figures
 from mjx_cl.runs import bench, clock, costs, loops, merge, outlook, run, scores, settings
 from mjx_cl.runs import suite as suites
 from mjx_cl.scoring import stop_rule
+from mjx_cl.training import agents
 
 RESULTS = pathlib.Path(__file__).parents[2] / "results"
 MINI = """
@@ -335,7 +336,7 @@ def test_the_plan_names_what_a_run_would_be_told(mjx, tmp_path):  # noqa: F811
   )
 
 
-def test_updates_of_the_plan():
+def test_updates_of_the_plan(agent, tmp_path):  # noqa: F811
   """An arm that adapts to the end takes ratio / (batch x length) updates a step once its replay
   holds start_windows; one that never does, none.
   """
@@ -349,6 +350,14 @@ def test_updates_of_the_plan():
   )
   assert costs.estimate(suites.Part("a", c), 1e11, costs.Robots()).updates == pytest.approx(
     3 * (5000 - 1000 - 1024 - 64) * 16 / (4 * 64)
+  )
+  held = tmp_path / "held"  # its action for two steps, each decision a record
+  card = {"env": "car", "preset": "tiny", "repeat": 2, "dreamer": dataclasses.asdict(agent.config)}
+  agents.save(held, jax.jit(agent.init)(jax.random.key(0)), card)
+  length = agent.config.length
+  slow = dataclasses.replace(c, env="car", agent=str(held))
+  assert costs.estimate(suites.Part("a", slow), 1e11, costs.Robots()).updates == pytest.approx(
+    3 * ((5000 - 1000) / 2 - 1024 - length) * 16 / (4 * length)
   )
   for arm in ARMS:
     own = RunConfig(
