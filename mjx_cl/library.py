@@ -6,13 +6,12 @@ import pathlib
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from mjx_cl import envs
+from mjx_cl import envs, faults
 from mjx_cl.config import AdaptConfig, RunConfig, replace
 from mjx_cl.detectors import make as make_detector
 from mjx_cl.detectors.python_class import HostDetector
 from mjx_cl.envs import make as make_env
 from mjx_cl.errors import UserError
-from mjx_cl.faults import make as make_fault
 from mjx_cl.leaderboard import score as board
 from mjx_cl.leaderboard import submissions
 from mjx_cl.leaderboard.streams import StreamSet
@@ -33,7 +32,22 @@ def load_agent(env: str, path: str | None = None) -> agents.Trained:
     UserError: for an unknown robot or agent.
     FileError: for a broken file.
   """
+  if env not in envs.ENVS and env in agents.shipped():
+    raise UserError(f"{env!r} is an agent: load_agent(robot, {env!r})")
   return agents.of(envs.make(env), path)
+
+
+def make_fault(name: str, env: Any) -> faults.Fault:
+  """The fault `name` for a robot, see `mjx_cl.faults.make`.
+
+  Args:
+    name: on `mjx-cl list faults`, or "path/to/file.py:function".
+    env: robot's name or environment.
+
+  Raises:
+    UserError: for an unknown robot or fault, or one that the robot cannot have.
+  """
+  return faults.make(name, envs.make(env) if isinstance(env, str) else env)
 
 
 def run(
@@ -70,7 +84,7 @@ def run(
 
 def score(
   detector: str | Callable[[], Any],
-  robots: Sequence[str] = (),
+  robots: str | Sequence[str] = (),
   streams: str | pathlib.Path | None = None,
   channel: str = "opr",
 ) -> list[dict[str, Any]]:
@@ -79,7 +93,7 @@ def score(
   Args:
     detector: name on the board, NAME@CHANNEL, "path/to/file.py:factory", or a class whose objects
       have update(x) -> bool; the latter runs as it is, at a rate of false alarms of its own.
-    robots: of the set; all where empty.
+    robots: of the set, or one; all where empty.
     streams: folder of `mjx-cl record`; None: the set that ships.
     channel: what a class watches.
 
@@ -90,7 +104,7 @@ def score(
     UserError: for an unknown detector, robot or channel.
   """
   held = StreamSet(streams)
-  chosen = held.choose(tuple(robots))
+  chosen = held.choose((robots,) if isinstance(robots, str) else tuple(robots))
   if isinstance(detector, str):
     entries, _ = board.able(board.chosen((detector,), chosen[0]), held, chosen, (detector,))
     extra = []

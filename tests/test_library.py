@@ -27,6 +27,9 @@ def test_robot_fault_detector_and_agent_by_name():
   env = mjx_cl.make_env("walker")
   fault = mjx_cl.make_fault("gear", env)
   assert "right_hip" in fault.targets and env.spec.name == "walker"
+  assert mjx_cl.make_fault("gear", "walker").targets == fault.targets
+  with pytest.raises(UserError, match=r"load_agent\(robot, 'walker-2'\)"):
+    mjx_cl.load_agent("walker-2")
   trained = mjx_cl.load_agent("walker")
   assert jax.tree.leaves(trained.train.params) and trained.card["env"] == "walker"
   assert mjx_cl.make_detector("cusum").init()
@@ -58,8 +61,9 @@ def test_a_score_is_a_row_for_each_fault_and_severity():
   own = [row for row in rows if row["detector"] == "Late"]
   assert {row["robot"] for row in own} == {"car"} and len(own) > 5
   assert len({(row["fault"], row["severity"]) for row in own}) == len(own)
-  with pytest.raises(UserError, match="no robot 'cart'; choose from: walker, car"):
-    mjx_cl.score("cusum", robots=("cart",))
+  for robots in (("cart",), "cart"):
+    with pytest.raises(UserError, match="no robot 'cart'; choose from: walker, car"):
+      mjx_cl.score("cusum", robots=robots)
   with pytest.raises(UserError, match="unknown detector 'cusun'"):
     mjx_cl.score("cusun")
   with pytest.raises(UserError, match="a name or a class with update"):

@@ -120,7 +120,7 @@ class Certify:
   """
 
   env: Positional[tuple[str, ...]] = ()
-  out: str = "results"
+  out: str = "runs/certificates"
   fault: tuple[str, ...] = ()
   episodes: int = 20
   agent: str | None = None
@@ -282,11 +282,13 @@ class Compare:
       The first is what the others are compared with.
     measure: reward_final, reward_kept, return_lost, terminations, updates; default: all.
     out: Picture (.png): shares of streams that keep so much of their reward.
+    change: Of the robot: 0 the first, its fault; 1 what came next, as a repair.
     overwrite: Replace --out.
   """
 
   runs: Positional[tuple[str, ...]]
   measure: tuple[str, ...] = ()
+  change: int = 0
   out: str | None = None
   json: bool = False
   overwrite: bool = False
@@ -311,6 +313,7 @@ class Render(FaultConfig):
     compare: Side by side, from one seed: the robot whole, with the fault, and with the fault and
       each of these trained agents. Its width and height are then those of one robot.
     skip: Control steps before the first picture; --compare alone.
+    overwrite: Replace --out.
   """
 
   fault: str = "none"
@@ -328,6 +331,7 @@ class Render(FaultConfig):
   compare: tuple[str, ...] | None = None
   skip: int = 0
   json: bool = False
+  overwrite: bool = False
 
 
 @dataclass(frozen=True)
@@ -446,7 +450,7 @@ class List:
   Example: mjx-cl list faults
 
   Attributes:
-    what: envs, faults, fault-presets, schedules, detectors, presets, agents, arms, sizes,
+    what: envs, faults, targets, fault-presets, schedules, detectors, presets, agents, arms, sizes,
       suites, benches or all.
   """
 

@@ -26,11 +26,12 @@ ABOUT = {
 }
 
 
-def _live(kinds: Iterable[str]) -> dict[str, dict[str, str]]:
+def _live(kinds: Iterable[str] | None = None) -> dict[str, dict[str, str]]:
+  """What the registries hold of these kinds; None: of all."""
   runtime.setup()
   from mjx_cl.cli import registries  # imports JAX
 
-  return registries.tables(kinds)
+  return registries.tables(registries.TABLES if kinds is None else kinds)
 
 
 def do_list(args: List) -> None:
@@ -52,7 +53,7 @@ def do_list(args: List) -> None:
 
 def write() -> None:
   """Writes names.json."""
-  text = json.dumps(_live(json.loads(FILE.read_text())), indent=1, ensure_ascii=False) + "\n"
+  text = json.dumps(_live(), indent=1, ensure_ascii=False) + "\n"
   folders.atomic(FILE, lambda file: file.write(text.encode()))
 
 

@@ -17,9 +17,23 @@ def first(member: object) -> str:
   return " ".join(inspect.cleandoc(str(member.__doc__ or "")).split("\n\n")[0].split())
 
 
+def targets() -> dict[str, str]:
+  """Robot -> the faults that it can have, with what they can hit, those of the same targets
+  together.
+  """
+  out = {}
+  for robot in envs.ENVS:
+    same: dict[tuple[str, ...], list[str]] = {}
+    for name, fault in faults.available(envs.make(robot)).items():
+      same.setdefault(fault.targets, []).append(name)
+    out[robot] = "; ".join(f"{', '.join(own)}: {', '.join(hit)}" for hit, own in same.items())
+  return out
+
+
 TABLES: dict[str, Callable[[], Mapping[str, str]]] = {
   "envs": lambda: {k: first(v) for k, v in envs.ENVS.items()},
   "faults": lambda: {k: faults.about(k) for k in faults.FAULTS},
+  "targets": targets,
   "detectors": lambda: {k: first(v) for k, v in detectors.DETECTORS.items()},
   "presets": lambda: {k: p.about for k, p in PRESETS.items()},
   "agents": lambda: dict.fromkeys(agents.shipped(), "shipped"),

@@ -49,7 +49,8 @@ def do_render(args: Render) -> None:
   """Films an agent, or several side by side."""
   out = args.out or f"{args.env.rpartition(':')[2]}.gif"
   require(args.compare is not None or args.skip == 0, "--skip goes with --compare; got it without")
-  pictures.check(out, args.steps + args.skip, args.width, args.height, args.fps, args.seed)
+  path = pictures.check(out, args.steps + args.skip, args.width, args.height, args.fps, args.seed)
+  require(args.overwrite or not path.exists(), f"{path} is there; --overwrite replaces it")
   env = envs.make(args.env, args.physics)
   fault = {f.name: getattr(args, f.name) for f in dataclasses.fields(FaultConfig)[1:]}
   acting: dict[str, Any] = {"seed": args.seed, "deterministic": args.deterministic}

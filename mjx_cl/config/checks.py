@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
-from mjx_cl.errors import UserError, require
+from mjx_cl.errors import UserError, choose, require
 
 if TYPE_CHECKING:
   from typing import TypeVar
@@ -134,5 +134,5 @@ def replace(config: Settled, **changes: Any) -> Settled:
   """dataclasses.replace that names the valid fields when it is given an unknown one."""
   known = {f.name for f in dataclasses.fields(config)}
   for name in changes:
-    require(name in known, f"unknown setting {name!r}; choose from: {', '.join(sorted(known))}")
+    choose("setting", name, dict.fromkeys(known))
   return dataclasses.replace(config, **changes)

@@ -36,7 +36,7 @@ from mjx_cl.faults.schedule import FOREVER, Plan, numbers, plan
 from mjx_cl.faults.sensor import SENSOR
 from mjx_cl.faults.task import TASK
 from mjx_cl.faults.transfer import TRANSFER
-from mjx_cl.io.plugins import Registry, line, of_user
+from mjx_cl.io.plugins import Registry, of_user, placed
 from mjx_cl.types import Array
 
 FAMILIES = {
@@ -128,7 +128,7 @@ def make(name: str, env: Any) -> Fault:
     if name in FAULTS.own:
       raise
     raise PluginError(
-      f"fault {name!r} cannot be built for robot {env.spec.name!r}: {line(e)}"
+      f"fault {name!r} cannot be built for robot {env.spec.name!r}: {placed(e)}"
     ) from e
 
 

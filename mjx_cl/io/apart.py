@@ -20,7 +20,7 @@ import numpy as np
 
 from mjx_cl.errors import UserError
 from mjx_cl.io.limits import ran_out
-from mjx_cl.io.plugins import find, line, of_user
+from mjx_cl.io.plugins import find, line, of_user, placed
 
 BEAT_S = 0.5  # how often a process says how far it is
 SAMPLE_S, WHOLE_S = 10.0, 3600.0  # that a sample and a whole run may take
@@ -106,7 +106,7 @@ def run_host(
         if of_user(e):
           raise
         raise UserError(
-          f"host detector {type(detector).__name__} failed at step {t} of stream {s}: {line(e)}"
+          f"host detector {type(detector).__name__} failed at step {t} of stream {s}: {placed(e)}"
         ) from None
   return fired, scores
 

@@ -124,6 +124,12 @@ def place(e: BaseException) -> str | None:
   return found
 
 
+def placed(e: BaseException) -> str:
+  """Exception in one line, with its place in the plug-in where that is known."""
+  where = place(e)
+  return line(e) + (f" ({where})" if where else "")
+
+
 def of_user(e: BaseException) -> bool:
   """Whether an exception is none of a plug-in's making: an interrupt that the user has sent, or the
   end of the memory.

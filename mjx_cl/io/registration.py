@@ -2,6 +2,11 @@
 `gymnasium.make_vec`. JAX comes with the first robot.
 """
 
+import importlib
+from typing import Any
+
+from mjx_cl.io import runtime
+
 # name -> robot; v0 becomes v1 where rewards, observations or episodes of a robot change
 ROBOTS = {
   "Walker-v0": "walker",
@@ -21,7 +26,19 @@ def register_envs() -> None:
       continue
     registration.register(
       id=f"mjx_cl/{name}",
-      entry_point=f"{ADAPTERS}:make",
-      vector_entry_point=f"{ADAPTERS}:make_vec",
+      entry_point=f"{__name__}:make",
+      vector_entry_point=f"{__name__}:make_vec",
       kwargs={"env": robot},
     )
+
+
+def make(**settings: Any) -> Any:
+  """A robot as a `gymnasium.Env`, see the adapter's `make`."""
+  runtime.quiet()  # before JAX
+  return importlib.import_module(ADAPTERS).make(**settings)
+
+
+def make_vec(**settings: Any) -> Any:
+  """Robots as a `gymnasium.vector.VectorEnv`, see the adapter's `make_vec`."""
+  runtime.quiet()
+  return importlib.import_module(ADAPTERS).make_vec(**settings)

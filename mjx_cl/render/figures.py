@@ -110,7 +110,8 @@ def _affected(trace: dict, rows: list[dict]) -> tuple[list[int], str]:
   some = [g for g, seed in streams.items() if seed in seeds]
   if some:
     return some, f"the {len(seeds)} of {len(set(streams.values()))} robots that it costs a tenth"
-  return list(streams), "all robots" + (", none of which it costs a tenth" if rows else "")
+  known = any(r["affected"] is not None for r in rows if not r["change"])
+  return list(streams), "all robots" + (", none of which it costs a tenth" if known else "")
 
 
 def _of(trace: dict, column: str, arm: str, streams: list[int], steps: int) -> np.ndarray:

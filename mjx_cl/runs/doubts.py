@@ -82,10 +82,12 @@ def doubts(config: RunConfig) -> list[str]:
       f"the run ends at step {config.steps:,}, within adapt.warmup={warmup:,}: no alarm can "
       "start anything"
     )
-  elif warmup >= config.onset and any(ARMS[arm].trigger.listens for arm in config.arms):
+  elif warmup >= config.onset:
+    listens = any(ARMS[arm].trigger.listens for arm in config.arms)
     said.append(
-      f"onset {config.onset:,} lies within adapt.warmup={warmup:,}: an alarm before its end "
-      "starts nothing, and without a reward before the onset no stream "
+      f"onset {config.onset:,} lies within adapt.warmup={warmup:,}: "
+      + ("an alarm before its end starts nothing, and " if listens else "")
+      + "without a reward before the onset no stream "
       "counts as affected or recovered; a later --onset or a smaller --adapt.warmup would do"
     )
   return said

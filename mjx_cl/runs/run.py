@@ -74,10 +74,12 @@ def execute(
   """
   config = check(config)
   with folders.alone(out):
+    begins = resume and not pathlib.Path(out, "config.json").exists()
     runner = _begun(config, out, resume, overwrite, programs, healthy)
     if runner is None:
       return tables.read_json(pathlib.Path(out) / "summary.json")
-    for text in notes(config):
+    news = [f"{out} holds no run to go on with: one begins"] if begins else []
+    for text in news + notes(config):
       tell(f"note: {text}")
     tell(
       f"{len(config.arms) * config.seeds} streams of {config.steps:,} control steps; what is not "

@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mjx_cl.errors import FileError, UserError
+from mjx_cl.config import own_agent
+from mjx_cl.errors import FileError, UserError, require
 from mjx_cl.io import tables
 from mjx_cl.scoring import intervals
 
@@ -29,20 +30,24 @@ class Variant(NamedTuple):
   Attributes:
     name: FOLDER:ARM.
     config: of the run.
-    rows: (seed, change) -> row of runs.parquet.
+    rows: seed -> row of runs.parquet.
   """
 
   name: str
   config: dict[str, Any]
-  rows: dict[tuple[int, int], dict[str, Any]]
+  rows: dict[int, dict[str, Any]]
 
 
-def variants(words: list[str]) -> list[Variant]:
+def variants(words: list[str], change: int = 0) -> list[Variant]:
   """Reads FOLDER or FOLDER:ARM each; of one folder alone all of its arms, of several the arm that
   is their only one, or `detector`.
 
+  Args:
+    words: as above.
+    change: of the robot, 0 the first; a later one is a repair or another fault.
+
   Raises:
-    UserError: no run there, no such arm, other robots, fewer than two variants.
+    UserError: no run there, no such arm or change, other robots, fewer than two variants.
   """
   found = []
   for word in words:
@@ -59,7 +64,9 @@ def variants(words: list[str]) -> list[Variant]:
     for name in chosen:
       if name not in arms:
         raise UserError(f"{home} has no arm {name!r}; name one as FOLDER:ARM, of {', '.join(arms)}")
-      own = {(int(r["seed"]), int(r["change"])): r for r in rows if r["arm"] == name}
+      own = {int(r["seed"]): r for r in rows if r["arm"] == name and r["change"] == change}
+      number = 1 + max(int(r["change"]) for r in rows)
+      require(own, f"{home}: change must be below {number}, as its robots change so often")
       label = name if len(words) == 1 else f"{home}:{name}"
       found.append(Variant(label, tables.read_json(home / "config.json"), own))
   if len(found) < 2:
@@ -79,9 +86,9 @@ def variants(words: list[str]) -> list[Variant]:
 
 def unlike(found: list[Variant]) -> list[str]:
   """Settings in which the runs differ that a comparison would have alike."""
-  return [
-    key for key in MUST_AGREE if len({str(one.config.get(key)) for one in found}) > 1
-  ]  # fmt: skip
+  default = {"agent": own_agent(str(found[0].config.get("env")))}
+  own = [default | {k: v for k, v in one.config.items() if v is not None} for one in found]
+  return [key for key in MUST_AGREE if len({str(config.get(key)) for config in own}) > 1]
 
 
 def value(row: dict[str, Any], measure: str) -> float:
@@ -96,9 +103,9 @@ def against(one: Variant, first: Variant, measure: str) -> dict[str, Any]:
   """A variant's measure and its difference from the first variant's.
 
   Returns:
-    streams, iqm and iqm_ci of the variant; pairs (streams of the same seed in both), difference
-    (mean of variant - first over the pairs), difference_ci (bootstrap over pairs), better (share of
-    the pairs in which the variant is better, ties half).
+    streams (one a seed), iqm and iqm_ci of the variant; pairs (of the same seed in both),
+    difference (mean of variant - first over the pairs), difference_ci (bootstrap over pairs),
+    better (share of the pairs in which the variant is better, ties half).
   """
   own = np.array([value(row, measure) for row in one.rows.values()])
   own = own[np.isfinite(own)]

@@ -33,6 +33,7 @@ from mjx_cl.errors import FileError, UserError
 from mjx_cl.faults import presets
 from mjx_cl.io import folders, interrupt
 from mjx_cl.io import tables as store
+from mjx_cl.render import figures
 from mjx_cl.runs import run
 from mjx_cl.training import agents
 
@@ -182,6 +183,7 @@ def test_list(mjx):
   assert {k: set(v) for k, v in tables.items()} == {
     "envs": set(envs.ENVS),
     "faults": set(faults.FAULTS),
+    "targets": set(envs.ENVS),
     "detectors": set(detectors.DETECTORS),
     "presets": set(PRESETS),
     "agents": set(agents.shipped()),
@@ -195,6 +197,8 @@ def test_list(mjx):
   assert all(
     text for table in tables.values() for text in table.values()
   )  # each with a word about it
+  knees = next(x for x in tables["targets"]["walker"].split("; ") if "gear" in x)
+  assert "right_knee" in knees.partition(": ")[2] and "steering" not in knees
   assert json.loads(mjx("list", "faults", "--json")[1]) == {"faults": tables["faults"]}
   text = mjx("list")[1]
   assert all(name in text for table in tables.values() for name in table)
@@ -227,6 +231,22 @@ def test_a_run_is_shown_as_a_table_with_intervals(capsys, monkeypatch):
   ]
   assert [cell for cell in below if cell] == ["[269, 537]", "[30%, 96%]", "[0.85, 0.92]"]
   assert "[steps]" in out and out.endswith("files in runs/x\n")
+
+
+def test_what_was_not_measured_is_not_called_unaffected(capsys, monkeypatch):
+  """A fault within the warm-up: no reward before it."""
+  monkeypatch.setenv("COLUMNS", "200")
+  summary = store.read_json(pathlib.Path(__file__).parents[2] / "results/walker_gear/summary.json")
+  for arm, known in ((summary["arms"]["detector"], False), (summary["arms"]["none"], True)):
+    arm |= {"affected": 0, "affected_ci": [0.0, 2.8] if known else None}
+  shown.show_summary(summary, "runs/x")
+  lines = [line.split("│") for line in capsys.readouterr().out.splitlines()]
+  cells = {line[1].strip(): line[3].strip() for line in lines if len(line) > 3}
+  assert (cells["detector"], cells["none"]) == ("-", "0")
+  trace = {"stream": np.arange(2), "seed": np.arange(2)}
+  rows = lambda affected: [{"seed": 0, "affected": affected, "change": 0}]
+  assert figures._affected(trace, rows(None))[1] == "all robots"
+  assert figures._affected(trace, rows(False))[1] == "all robots, none of which it costs a tenth"
 
 
 @pytest.mark.parametrize("columns", [60, 80, 100, 200])
@@ -715,7 +735,10 @@ def test_resume_with_other_settings_is_refused(mjx, refused, begun):
   text = refused(2, *argv, "--resume", "--seeds", "2", "--set", "patience=9", "--adapt.ratio", "8")
   assert all(word in text for word in ("seeds", "settings", "adapt")) and "severity" not in text
   assert content(out) == before
-  assert mjx(*argv, "--resume")[0] == 130  # the same settings go on
+  code, _, err = mjx(*argv, "--resume")  # the same settings go on
+  assert code == 130 and "holds no run" not in err
+  code, _, err = mjx(*argv[:-1], f"{out}-mistyped", "--resume")
+  assert code == 130 and f"note: {out}-mistyped holds no run to go on with: one begins" in err
 
 
 def test_resume_of_what_is_no_run(refused, begun):

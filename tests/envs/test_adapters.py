@@ -383,6 +383,21 @@ def test_made_by_name_it_is_our_robot():
     gymnasium.make("mjx_cl/Walker-v0", render_mode="human")
 
 
+def test_xla_is_quiet_before_jax_comes():
+  """Once it is loaded its loader prints a page for each cached program."""
+  code = """
+import sys, gymnasium, mjx_cl
+from mjx_cl.io import runtime
+said, quiet = [], runtime.quiet
+runtime.quiet = lambda: said.append("jax" in sys.modules) or quiet()
+gymnasium.make("mjx_cl/Walker-v0")
+gymnasium.make_vec("mjx_cl/Walker-v0", 2, vectorization_mode="vector_entry_point")
+print(said[0], len(said) > 1)
+"""
+  out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+  assert out.stdout.split() == ["False", "True"], out.stderr
+
+
 @pytest.mark.parametrize("name", ["Walker-v0", "Car-v0"])
 def test_stable_baselines_checks_it_and_trains_on_it(name):
   stable = pytest.importorskip("stable_baselines3")

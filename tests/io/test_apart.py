@@ -28,7 +28,9 @@ FAILS = {
   "class Own(Exception):\n        def __str__(self): raise ValueError\n      raise Own": (
     "step 2 of stream 0: Own: its message cannot be read"
   ),
-  "raise ValueError('[/red] two\\nlines')": r"ValueError: \[/red\] two lines",
+  "raise ValueError('[/red] two\\nlines')": (
+    r"ValueError: \[/red\] two lines \(.*mine\.py, line 6\)"
+  ),
   "import os; os._exit(0)": "ended its process, exit status 0, without an answer",
   "import os; os.kill(os.getpid(), 9)": "ended its process, exit status -9",
   "return 'yes'": "update must tell a bool, not str",

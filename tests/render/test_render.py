@@ -434,7 +434,9 @@ def test_side_by_side_by_command(mjx, refused, tmp_path, monkeypatch):  # noqa: 
   code, text, err = mjx("render", "car", *fault, *size, "--out", out, "--json")
   said = json.loads(text)
   assert code == 0 and said["frames"] == len(pictures(out)[0]) and len(said["reward"]) == 3, err
-  say = lambda *flags: refused(2, "render", "walker", "--out", out, *size, *flags)
+  assert "--overwrite replaces it" in refused(2, "render", "walker", *size, "--out", out)
+  other = str(tmp_path / "b.gif")
+  say = lambda *flags: refused(2, "render", "walker", "--out", other, *size, *flags)
   assert "--fault" in say("--compare")
   assert "--skip goes with --compare" in say("--skip", "3")
   assert "2 to 6 robots" in say("--fault", "gear", "--compare", *["walker"] * 5)
@@ -498,7 +500,7 @@ def test_command(mjx, film, tmp_path, monkeypatch, short_walker):  # noqa: F811
     and "GL" in err
   )
   assert len(pictures(tmp_path / "a.gif")[0]) == 3
-  code, out, err = mjx(*argv)
+  code, out, err = mjx(*argv, "--overwrite")
   assert code == 0 and str(tmp_path / "a.gif") in out and "3 pictures" in out
 
 

@@ -64,6 +64,29 @@ def test_versions_of_the_benchmark_are_not_mixed(tmp_path, mjx):
   assert code and "versions 1, 2 of the benchmark cannot be compared" in err
 
 
+def test_a_robot_that_changes_twice_is_one_stream(tmp_path, mjx):
+  """A fault and its repair are two rows of a seed, and no two robots."""
+  run = run_of(tmp_path / "a", {"detector": [1.0, 1.2], "none": [0.5, 1.4]})
+  rows = tables.read_rows(run / "runs.parquet")
+  rows += [row | {"change": 1, "reward_final": 3.0} for row in rows]
+  tables.write_table(run / "runs.parquet", {k: [r[k] for r in rows] for k in rows[0]})
+  for change, want in ((0, [1.0, 1.2]), (1, [3.0, 3.0])):
+    code, out, _ = mjx(run, "--measure", "reward_final", "--change", change, "--json")
+    [first, other] = json.loads(out)
+    assert code == 0 and first["streams"] == other["pairs"] == 2
+    assert first["iqm"] == pytest.approx(np.mean(want))
+  code, _, err = mjx(run, "--change", 2)
+  assert code == 2 and "change must be below 2" in err and err.count("\n") == 1
+
+
+def test_the_default_agent_named_is_the_default_agent(tmp_path, mjx):
+  a, b = (run_of(tmp_path / name, {"detector": [1.0, 1.2]}) for name in "ab")
+  for agent, differ in (("walker", False), ("walker-2", True)):
+    config = tables.read_json(b / "config.json") | {"agent": agent}
+    tables.write_json(b / "config.json", config)
+    assert ("these runs differ in agent" in mjx(a, b)[2]) == differ
+
+
 def test_less_of_a_loss_is_better(tmp_path):
   run = run_of(tmp_path / "a", {"detector": [1.0, 1.0], "none": [1.0, 1.0]})
   one, two = versus.variants([str(run)])

@@ -1,6 +1,6 @@
 """One robot as a `gymnasium.Env`, robots side by side as a `gymnasium.vector.VectorEnv`; see
-`gymnasium_env` and `gymnasium_vector`. Importing this needs gymnasium, which finds `make` and
-`make_vec` by what io.registration tells it.
+`gymnasium_env` and `gymnasium_vector`. Importing this needs gymnasium, which comes to `make` and
+`make_vec` by io.registration.
 """
 
 from collections.abc import Sequence
