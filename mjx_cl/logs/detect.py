@@ -243,7 +243,7 @@ def _said_of(own: Watch, names: list[str], known: np.ndarray, rows: int, arl0: f
       f"{', '.join(drifts)}: drifting while healthy, so only changes quicker than "
       f"{own.model.slow} samples are seen there"
     )
-  if blind := int((~known).sum()):
+  if blind := int((~known).any(1).sum()):
     notes.append(
       f"{blind:,} of {len(known):,} samples are not judged: columns are missing there for too long"
     )

@@ -63,7 +63,7 @@ class Found(NamedTuple):
     scores: chart -> (T, W), of `joint` (T, 1).
     fired: chart -> bool, likewise: the score rises above its threshold.
     above: bool (T,), some score is.
-    known: bool (T,), the sample is judged.
+    known: bool (T, W), the sample is judged.
   """
 
   residuals: np.ndarray
@@ -79,12 +79,15 @@ def watch(own: Watch, xs: np.ndarray) -> Found:
 
 
 def _watch(own: Watch, xs: np.ndarray) -> Found:
-  z = healthy.standard(own.model, healthy.held(xs))
-  residuals = healthy.judged(healthy.residuals(own.model, z), xs, own.model.held)
+  z, error = healthy.filled(own.model, healthy.standard(own.model, healthy.held(xs)), xs)
+  residuals = healthy.residuals(own.model, z, error=error)
+  residuals = healthy.judged(residuals, xs, own.model.held)
   scores = charts.scores(residuals, own.scales)
   fired = {name: charts.alarms(x, own.thresholds[name]) for name, x in scores.items()}
   above = [(x > own.thresholds[name]).any(1) for name, x in scores.items()]
-  known = healthy.known(xs, own.model.held)
+  known = np.isfinite(residuals).any(0)
+  settling = slice(0, max(*healthy.NOW, *healthy.BEFORE))
+  known[settling] = healthy.known(xs[settling], own.model.held)[:, None]
   return Found(residuals, scores, fired, np.any(above, 0), known)
 
 
@@ -100,7 +103,7 @@ def _in_parts(own: Watch, xs: np.ndarray, rows: int = ROWS, kind: Any = np.float
     {name: np.empty((total, n), kind) for name, n in size.items()},
     {name: np.empty((total, n), bool) for name, n in size.items()},
     np.empty(total, bool),
-    np.empty(total, bool),
+    np.empty((total, columns), bool),
   )
   for begin in range(0, total, rows):
     from_ = max(0, begin - warm)
