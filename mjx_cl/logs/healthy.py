@@ -31,7 +31,8 @@ SLOW = 1000  # samples of a drifting column's average, a tenth of the nominal lo
 # rows that a missing sample is filled for; twice the usual distance of a column that is written less
 # often than others
 HELD = 3
-DOUBTFUL = 1.0  # variance that filled samples may add to a residual, in its healthy variance
+DOUBTFUL = 0.5  # variance that filled samples may add to a residual, in its healthy variance
+SURE, LOST = 0.5, 0.9  # errors of what is filled [nominal deviations]: after one row, at most
 FARTHEST = 10.0  # deviations at which a residual is cut
 ROWS = 20_000  # predicted at a time
 MOST = 10_000_000  # samples of all columns of a nominal log that are used
@@ -136,17 +137,17 @@ def filled(model: Healthy, z: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np
   """Z of `standard`, what is `absent` in x (T, C) filled, and the deviation (T, C) of the error of
   that, 0 where there is a sample; None where nothing is filled.
 
-  For as long as `Healthy.held` says by the prediction from the past, or where that errs more, as
-  for commands, by the last sample; from then on nothing is known of it but the nominal mean.
+  By the prediction from the past, or where that errs more, as for commands, by the last sample; once
+  the longest lag is over, nothing is known of it but the nominal mean.
   """
   missing = absent(x, model.held)
   if not missing.any():
     return z, None
   age, own, error = ages(x), model.watched, missing.astype(float)
   lags, weights = np.array(_before(own, z)), model.past[-1].reshape(-1, *[len(model.mean)] * 2)
-  z = np.where(missing & (age > model.held), 0.0, z)
+  near = missing & (age <= model.held + max(*NOW, *BEFORE))
+  z = np.where(missing & ~near, 0.0, z)
   step = np.minimum(1.0, model.step * np.sqrt(age))
-  near = missing & (age <= model.held)
   foretold = np.r_[model.scale[1] < model.step[:own], np.zeros(len(model.mean) - own, bool)]
   error = np.where(near & ~foretold, step, error)
   near &= foretold
@@ -173,17 +174,25 @@ def _added(
   return found / scale**2
 
 
-def judged(residuals: np.ndarray, x: np.ndarray, longest: np.ndarray) -> np.ndarray:
-  """Residuals (2, T, W) of x (T, C), where a sample is missing those of the last one, nan where it
-  is missing for more than `longest` (C,) rows and in rows that are not `known`.
+def judged(
+  model: Healthy, residuals: np.ndarray, x: np.ndarray, error: np.ndarray | None = None
+) -> np.ndarray:
+  """Residuals (2, T, W) of x (T, C), nan in rows that are not `known` and where a sample is `absent`;
+  but a column that its past alone foretells keeps what was `filled`, unless with too large an error
+  (SURE, LOST), as an average of a swing must not miss a part of it. Where a healthy log has no sample either they are
+  those of the last one.
   """
-  own = x[:, : residuals.shape[-1]]
-  age = ages(own)
-  at = np.maximum(np.arange(len(x))[:, None] - age, 0)
-  found = np.take_along_axis(residuals, at[None], 1)
-  found[:, ~known(x, longest)] = np.nan
-  found[:, age > longest[: own.shape[1]]] = np.nan
-  found[:, : max(*NOW, *BEFORE)] = np.nan
+  own, reach = x[:, : residuals.shape[-1]], max(*NOW, *BEFORE)
+  missing = absent(x, model.held)[:, : own.shape[1]]
+  at = np.where(missing, 0, np.minimum(ages(own), np.arange(len(x))[:, None]))
+  found = np.take_along_axis(residuals, (np.arange(len(x))[:, None] - at)[None], 1)
+  found[:, ~known(x, model.held)] = np.nan
+  found[1][missing] = np.nan
+  if error is not None:
+    sure = ~model.others.any((0, 1))[: own.shape[1]] & (model.scale[1] < SURE)
+    missing &= ~sure | (error[:, : own.shape[1]] > LOST)
+  found[0][missing] = np.nan
+  found[:, :reach] = np.nan
   return found
 
 
@@ -383,16 +392,14 @@ def fit(x: np.ndarray, model: str = "ar", commands: int = 0) -> tuple[Healthy, n
   for _ in range(REFITS if absent(samples, longest).any() else 0):
     z, error = filled(fitted, standard(fitted, x), samples)
     fitted = _scaled(_weighed(fitted, z) if able else fitted, z, samples, error)
-  return fitted, judged(unseen(fitted, z, error), samples, longest)
+  return fitted, judged(fitted, unseen(fitted, z, error), samples, error)
 
 
 def _weighed(model: Healthy, z: np.ndarray) -> Healthy:
   """A model with the weights that z (N, C) gives."""
   commands = len(model.mean) - model.watched
   others, first = _regression(z, NOW, False)
-  past, second = _regression(
-    z, _before(model.watched, z), True, model.watched if commands else 0
-  )
+  past, second = _regression(z, _before(model.watched, z), True, model.watched if commands else 0)
   return model._replace(others=others, past=past, explained=np.stack([first, second]))
 
 
@@ -404,7 +411,7 @@ def _scaled(
   """
   if error is None:
     model = model._replace(middle=0 * model.middle, scale=0 * model.scale + 1)
-  found = judged(unseen(model, z, error), samples, model.held)
+  found = judged(model, unseen(model, z, error), samples, error)
   middle, scale = np.nanmean(found, 1), np.maximum(np.nanstd(found, 1), 1e-9)
   if error is not None:
     middle, scale = model.middle + model.scale * middle, model.scale * scale

@@ -81,11 +81,12 @@ def watch(own: Watch, xs: np.ndarray) -> Found:
 def _watch(own: Watch, xs: np.ndarray) -> Found:
   z, error = healthy.filled(own.model, healthy.standard(own.model, healthy.held(xs)), xs)
   residuals = healthy.residuals(own.model, z, error=error)
-  residuals = healthy.judged(residuals, xs, own.model.held)
+  residuals = healthy.judged(own.model, residuals, xs, error)
   scores = charts.scores(residuals, own.scales)
   fired = {name: charts.alarms(x, own.thresholds[name]) for name, x in scores.items()}
   above = [(x > own.thresholds[name]).any(1) for name, x in scores.items()]
   known = np.isfinite(residuals).any(0)
+  known &= ~healthy.absent(xs, own.model.held)[:, : own.model.watched]
   settling = slice(0, max(*healthy.NOW, *healthy.BEFORE))
   known[settling] = healthy.known(xs[settling], own.model.held)[:, None]
   return Found(residuals, scores, fired, np.any(above, 0), known)
