@@ -371,6 +371,7 @@ class Detect:
       or less is refused.
     out: Folder for the results; default: only the table.
     overwrite: Replace an earlier detection in --out.
+    fail_on_change: Exit with code 3 where the log has changed.
   """
 
   file: Positional[str]
@@ -388,6 +389,7 @@ class Detect:
   out: str | None = None
   json: bool = False
   overwrite: bool = False
+  fail_on_change: bool = False
 
 
 @dataclass(frozen=True)

@@ -45,7 +45,7 @@ class Scales(NamedTuple):
 def averages(
   x: np.ndarray, start: np.ndarray | float = 0.0, paused: np.ndarray | None = None
 ) -> Iterator[np.ndarray]:
-  """Exponentially weighted averages of x (..., T, C) over each of SPANS, which begin at `start`, and
+  """Exponentially weighted averages of x (..., T, C) over each of SPANS, which begin at `start` and
   stand still where x (T, C) is `paused`.
   """
   still = () if paused is None else np.flatnonzero(paused.any(0))

@@ -28,8 +28,8 @@ USEFUL = 0.05  # share of a column's variance that a prediction has to explain t
 DRIFTS = 0.2  # share of a column's variance in the means of DRIFT_BLOCKS shares: above, it drifts
 DRIFT_BLOCKS = 10
 SLOW = 1000  # samples of a drifting column's average, a tenth of the nominal log at most
-# rows that a missing sample is filled for; twice the usual distance of a column that is written less
-# often than others
+# rows that a missing sample is replaced for; twice the usual distance of a column that is written
+# less often than others
 HELD = 3
 DOUBTFUL = 0.5  # variance that filled samples may add to a residual, in its healthy variance
 SURE, LOST = 0.5, 0.9  # errors of what is filled [nominal deviations]: after one row, at most
@@ -49,7 +49,7 @@ class Healthy(NamedTuple):
     spread: (C,) its standard deviation.
     drifts: bool (C,), taken relative to its slow average.
     slow: samples of that average.
-    held: (C,) rows that a missing sample is filled for.
+    held: (C,) rows that a missing sample is replaced for.
     others: (FOLDS + 1, len(NOW) * C, C) weights, each fold's from the other folds, the last from
       all.
     past: (FOLDS + 1, len(BEFORE) * C, C), likewise; where there are commands of lag 0 too.
@@ -108,37 +108,40 @@ def ages(x: np.ndarray) -> np.ndarray:
   return rows - np.maximum.accumulate(np.where(np.isfinite(x), rows, -1), 0)
 
 
-def _nothing(x: np.ndarray, longest: np.ndarray) -> np.ndarray:
-  """Bool (T,): rows before which no column of x (T, C) has had a sample for `longest` (C,) rows."""
-  return (ages(x) > longest).all(1)
+def _apart(x: np.ndarray, longest: np.ndarray) -> np.ndarray:
+  """Bool (T,): rows of a stretch without any sample that is longer than `longest` (C,) and the
+  longest lag; what comes after it begins anew.
+  """
+  whole, rows = ~np.isfinite(x).any(1), np.arange(len(x))
+  ends = np.where(whole & ~np.r_[whole[1:], False], rows, len(x) - 1)
+  end = np.minimum.accumulate(ends[::-1])[::-1]
+  return whole & np.all(ages(x) > longest + max(*NOW, *BEFORE), 1)[end]
 
 
 def known(x: np.ndarray, longest: np.ndarray) -> np.ndarray:
-  """Bool (T,): rows of x (T, C) whose predictions reach into no stretch in which all columns are
-  missing for more than `longest` (C,) rows.
+  """Bool (T,): rows of x (T, C) whose predictions do not reach into stretches that set them
+  `_apart`, from `longest` (C,) rows after the last sample on.
   """
-  reach = np.cumsum(np.r_[0, _nothing(x, longest)])
+  nothing = _apart(x, longest) & (ages(x) > longest).all(1)
+  reach = np.cumsum(np.r_[0, nothing])
   begin = np.maximum(0, np.arange(len(x)) - max(*NOW, *BEFORE))
   return reach[1:] == reach[begin]
 
 
 def absent(x: np.ndarray, longest: np.ndarray) -> np.ndarray:
   """Bool (T, C): samples of x that are missing where a healthy log has one; not those of a column
-  that is seldom written, nor of a stretch that ends in rows that are not `known`.
+  that is seldom written, nor of stretches that set rows `_apart`.
   """
   missing = ages(x) > np.where(longest > HELD, longest, 0)
-  whole, rows = ~np.isfinite(x).any(1), np.arange(len(x))
-  ends = np.where(whole & ~np.r_[whole[1:], False], rows, len(x) - 1)
-  end = np.minimum.accumulate(ends[::-1])[::-1]
-  return missing & ~(whole & _nothing(x, longest)[end])[:, None]
+  return missing & ~_apart(x, longest)[:, None]
 
 
 def filled(model: Healthy, z: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
   """Z of `standard`, what is `absent` in x (T, C) filled, and the deviation (T, C) of the error of
   that, 0 where there is a sample; None where nothing is filled.
 
-  By the prediction from the past, or where that errs more, as for commands, by the last sample; once
-  the longest lag is over, nothing is known of it but the nominal mean.
+  By the prediction from the past, or where that errs more, as for commands, by the last sample;
+  once the longest lag is over, nothing is known of it but the nominal mean.
   """
   missing = absent(x, model.held)
   if not missing.any():
@@ -177,21 +180,21 @@ def _added(
 def judged(
   model: Healthy, residuals: np.ndarray, x: np.ndarray, error: np.ndarray | None = None
 ) -> np.ndarray:
-  """Residuals (2, T, W) of x (T, C), nan in rows that are not `known` and where a sample is `absent`;
-  but a column that its past alone foretells keeps what was `filled`, unless with too large an error
-  (SURE, LOST), as an average of a swing must not miss a part of it. Where a healthy log has no sample either they are
-  those of the last one.
+  """Residuals (2, T, W) of x (T, C), nan in rows that are not `known` and where a sample is
+  `absent`; but a column that its past alone foretells keeps what was `filled`, unless with too
+  large an error (SURE, LOST), as an average of a swing must not miss a part of it. Where a healthy
+  log has no sample either they are those of the last one.
   """
   own, reach = x[:, : residuals.shape[-1]], max(*NOW, *BEFORE)
   missing = absent(x, model.held)[:, : own.shape[1]]
   at = np.where(missing, 0, np.minimum(ages(own), np.arange(len(x))[:, None]))
   found = np.take_along_axis(residuals, (np.arange(len(x))[:, None] - at)[None], 1)
   found[:, ~known(x, model.held)] = np.nan
-  found[1][missing] = np.nan
+  found[1, missing] = np.nan
   if error is not None:
-    sure = ~model.others.any((0, 1))[: own.shape[1]] & (model.scale[1] < SURE)
-    missing &= ~sure | (error[:, : own.shape[1]] > LOST)
-  found[0][missing] = np.nan
+    sure = ~np.any(model.others, (0, 1))[: own.shape[1]] & (model.scale[1] < SURE)
+    missing = missing & (~sure | (error[:, : own.shape[1]] > LOST))
+  found[0, missing] = np.nan
   found[:, :reach] = np.nan
   return found
 
