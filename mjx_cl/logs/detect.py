@@ -18,7 +18,7 @@ import numpy as np
 from mjx_cl.detectors import python_class
 from mjx_cl.errors import FileError, PluginError, UserError, choose
 from mjx_cl.io import plugins
-from mjx_cl.logs import charts, gaps, healthy, verdict
+from mjx_cl.logs import charts, clocks, gaps, healthy, verdict
 from mjx_cl.logs import inject as injection
 from mjx_cl.logs.columns import choose_columns
 from mjx_cl.logs.programs import LEVELS, Program, joint, table
@@ -34,6 +34,7 @@ FEW = 50  # alarms below which a measured run length is marked
 MARGIN = 0.25
 CHUNK = 2048  # rows of one call of a program
 MANY = 8  # columns that a line names
+SAME = 1.2  # ratio of two rates above which they are not the same
 # nominal deviations at which a sample is cut, so that no sum of squares overflows float32
 FARTHEST = 1e6
 
@@ -150,6 +151,8 @@ def detect(
   warmup = min(1000, len(past) // 3)
   names = _able(names, len(found), len(past), warmup, "all" not in detectors)
   given = rate is not None
+  if not given:
+    _same_rate(log, nominal, path, nominal_path)
   seconds, rate = _clock(log, rate, len(xs))
   if not names:
     own = found[: len(found) - len(set(commands))]
@@ -388,6 +391,30 @@ def _short(x: np.ndarray) -> bool:
   """Whether float32 rounds a column by less than a thousandth of its deviation."""
   highest = max(abs(float(np.nanmin(x))), abs(float(np.nanmax(x))))
   return highest * 2.0**-24 <= 1e-3 * float(np.nanstd(x[::97], dtype=np.float64))
+
+
+def _same_rate(
+  log: Log, nominal: Log, path: pathlib.Path | str, nominal_path: pathlib.Path | str
+) -> None:
+  """Refuses logs whose clocks tell that one has SAME times as many rows per second as the other."""
+  if log.time is None or nominal.time is None:
+    return
+  now, past = clocks.rate(log.time), clocks.rate(nominal.time)
+  if now is None or past is None:
+    return
+  if all(not 1 / SAME < a / b < SAME for a, b in zip(now, past)):
+    slow, fast = sorted((now[0], past[0]))
+    times = round(fast / slow)
+    dense = path if now[0] > past[0] else nominal_path
+    remedy = (
+      f"keep one row of {times} of {dense}"
+      if times > 1 and abs(fast / slow - times) < 0.05 * times
+      else "bring both to one rate"
+    )
+    raise FileError(
+      f"{path} has {now[0]:,.4g} rows a second and {nominal_path} {past[0]:,.4g}: {remedy}, or "
+      "give --rate to compare them row by row all the same"
+    )
 
 
 def _clock(log: Log, rate: float | None, samples: int) -> tuple[np.ndarray | None, float | None]:

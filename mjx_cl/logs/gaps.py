@@ -15,6 +15,8 @@ MOST = LONG  # rows that a gap is filled up by
 RARE = 0.1  # share of the rows before which a gap may lie; above, the clock itself is uneven
 HALF = 0.5  # of its samples that are not judged: of such a column nothing is said
 
+RARELY = "most of the samples are missing"
+
 
 def places(seconds: np.ndarray | None) -> np.ndarray | None:
   """(T,) rows of the samples in an even series; None where no row is missing. A late time stamp
@@ -158,7 +160,7 @@ def told(
       continue
     begin, end = own[0]
     if (begin, end) == (0, total):
-      said[name] = "most of its samples are missing"
+      said[name] = RARELY
     elif begin == 0:
       said[name] = f"no samples before {at(end)}"
     elif end >= total:
