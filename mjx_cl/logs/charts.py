@@ -65,7 +65,8 @@ def _paused(x: np.ndarray) -> np.ndarray | None:
   begins with; None where there is none.
   """
   unknown = np.isnan(x)
-  if x.ndim > 2 or not unknown.any():
+  some = unknown.any(-1)
+  if x.ndim > 2 or not some[int(np.argmin(some)) :].any():
     return None
   rows = np.arange(len(x))[:, None]
   before = np.maximum.accumulate(np.where(unknown, -1, rows), 0)

@@ -109,7 +109,7 @@ def detect(
     detectors: of `table()`, "all" of them; or host detectors, module:Class or file.py:Class, which
       bring a threshold of their own and see samples in the file's own units.
     arl0: wanted mean number of samples between false alarms, all columns of a detector together.
-    rate: samples per second, for times; default: from the column `time` or one of seconds,
+    rate: samples per second, for times; default: from the clocks of the logs, which must agree,
       otherwise times are unknown. With a column `step`: steps per second.
     logarithm: watch ln max(x, 1e-9), for positive and skewed residuals; x <= 0 is refused.
     settings: of the host detectors.
@@ -251,7 +251,9 @@ def _judged(
   if inject is not None:
     within = times.samples(inject, 1)
     tell("faults put into the nominal log")
-    found_faults, places = injection.smallest(own, healthy.held(used), names, within)
+    found_faults, places = injection.smallest(
+      own, healthy.completed(own.model, used), names, within
+    )
     said["inject"] = {"within": within, "places": places, "faults": found_faults}
     if not places:
       said["notes"].append(

@@ -77,16 +77,21 @@ def silent(x: np.ndarray, longest: np.ndarray) -> Silent:
   without any sample make none silent.
   """
   total, reach = len(x), max(*healthy.NOW, *healthy.BEFORE)
-  rows, stretches = np.zeros(total, bool), []
+  rows = np.zeros(total, bool)
+  stretches: list[list[tuple[int, int]]] = []
   there = np.isfinite(x)
-  some = np.r_[0, np.cumsum(there.any(1))]
-  absent = healthy.absent(x, longest)
+  some = np.r_[0, np.cumsum(there.any(1))]  # rows before each that hold any sample
   for c, least in enumerate(longest):
+    if there[:, c].all():
+      stretches.append([])
+      continue
     edges = np.r_[-1, np.flatnonzero(there[:, c]), total]
     begin, end = edges[:-1] + 1, edges[1:]
-    long = some[end] - some[begin] > max(LONG, least)
+    size = some[end] - some[begin]
+    long = size > max(LONG, least)
     own = list(zip(begin[long].tolist(), end[long].tolist()))
-    if absent[:, c].mean() > HALF and sum(b - a for a, b in own) <= HALF * total:
+    lacking = np.maximum(0, size - (least if least > healthy.HELD else 0)).sum()
+    if lacking > HALF * some[-1] >= sum(b - a for a, b in own):
       own = [(0, total)]
     for a, b in own:
       rows[a : b + reach] = True

@@ -104,8 +104,10 @@ def usual(x: np.ndarray) -> np.ndarray:
 
 def ages(x: np.ndarray) -> np.ndarray:
   """(T, C) rows since the last sample of x; before the first one, since the row before x."""
-  rows = np.arange(len(x))[:, None]
-  return rows - np.maximum.accumulate(np.where(np.isfinite(x), rows, -1), 0)
+  rows, there = np.arange(len(x))[:, None], np.isfinite(x)
+  if there.all():
+    return np.zeros(x.shape, int)
+  return rows - np.maximum.accumulate(np.where(there, rows, -1), 0)
 
 
 def _apart(x: np.ndarray, longest: np.ndarray) -> np.ndarray:
@@ -113,6 +115,8 @@ def _apart(x: np.ndarray, longest: np.ndarray) -> np.ndarray:
   longest lag; what comes after it begins anew.
   """
   whole, rows = ~np.isfinite(x).any(1), np.arange(len(x))
+  if not whole.any():
+    return whole
   ends = np.where(whole & ~np.r_[whole[1:], False], rows, len(x) - 1)
   end = np.minimum.accumulate(ends[::-1])[::-1]
   return whole & np.all(ages(x) > longest + max(*NOW, *BEFORE), 1)[end]
@@ -122,7 +126,10 @@ def known(x: np.ndarray, longest: np.ndarray) -> np.ndarray:
   """Bool (T,): rows of x (T, C) whose predictions do not reach into stretches that set them
   `_apart`, from `longest` (C,) rows after the last sample on.
   """
-  nothing = _apart(x, longest) & (ages(x) > longest).all(1)
+  nothing = _apart(x, longest)
+  if not nothing.any():
+    return ~nothing
+  nothing &= (ages(x) > longest).all(1)
   reach = np.cumsum(np.r_[0, nothing])
   begin = np.maximum(0, np.arange(len(x)) - max(*NOW, *BEFORE))
   return reach[1:] == reach[begin]
@@ -163,6 +170,15 @@ def filled(model: Healthy, z: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np
   return z, error
 
 
+def completed(model: Healthy, x: np.ndarray) -> np.ndarray:
+  """(T, C) `held`, and what is `absent` of columns that do not drift as it is `filled`."""
+  known_last = held(x)
+  z, error = filled(model, standard(model, known_last), x)
+  if error is None:
+    return known_last
+  return np.where((error > 0) & ~model.drifts, model.mean + model.spread * z, known_last)
+
+
 def _added(
   weights: np.ndarray, lags: tuple[int, ...], error: np.ndarray, scale: np.ndarray
 ) -> np.ndarray:
@@ -186,6 +202,8 @@ def judged(
   log has no sample either they are those of the last one.
   """
   own, reach = x[:, : residuals.shape[-1]], max(*NOW, *BEFORE)
+  if np.isfinite(x).all():
+    return np.ascontiguousarray(residuals)
   missing = absent(x, model.held)[:, : own.shape[1]]
   at = np.where(missing, 0, np.minimum(ages(own), np.arange(len(x))[:, None]))
   found = np.take_along_axis(residuals, (np.arange(len(x))[:, None] - at)[None], 1)

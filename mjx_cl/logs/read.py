@@ -69,11 +69,12 @@ def read(path: pathlib.Path | str) -> Log:
   numbers may have a decimal comma, if most that have a fraction do: one sign for the whole file, a
   cell with the other is no number. A column with no more than STRAY of such cells has them missing
   and is noted, one with more is left out. A second row without a number above columns of numbers is
-  taken for units. A column `time` [s] or `step` tells when samples were taken and is not watched; a
-  column of seconds by another name (`time_s`, `seconds`) is taken as `time` if there is none and it
-  rises throughout. A first column without a name, among others, is called `index`. Where nothing
-  else tells times, a column of time stamps does: ISO 8601, or seconds, ms, us or ns since 1970;
-  gaps and repeated ones are noted.
+  taken for units. A column `time` or `step` tells when samples were taken and is not watched; a
+  clock whose name tells a unit (`time_ms`, `seconds`) is taken as `time` if there is none and it
+  rises throughout, at last one without (`t`, `timestamp`). Of a clock without a unit that follows
+  from how far it rises; what was guessed is noted. A first column without a name, among others, is
+  called `index`. Where nothing else tells times, a column of time stamps does: ISO 8601, or
+  seconds, ms, us or ns since 1970; gaps and repeated ones are noted.
   """
   with contextlib.suppress(OSError):  # whoever opens it says what is wrong
     mode = os.stat(path).st_mode

@@ -9,7 +9,7 @@ import pytest
 from test_verdict import gait, save
 
 from mjx_cl.cli import app
-from mjx_cl.logs import charts, detect, gaps, healthy, verdict
+from mjx_cl.logs import charts, detect, gaps, healthy, inject, verdict
 
 NAMES = ["hip", "knee", "current"]
 
@@ -214,7 +214,7 @@ def test_what_is_not_judged_is_not_called_unchanged(tmp_path, nominal, mjx):
   x[:, 0] = np.where(np.arange(2000) % 10 == 6, 0.1, np.nan)
   code, out, err = mjx(save(tmp_path / "all.csv", x, NAMES), "--nominal", nominal)
   assert code == 1 and "no change" not in out
-  assert "could not be judged: hip, knee, current (most of the samples are missing)" in err
+  assert "could not be judged: hip, knee, current (" in err
   x = leg(2000, 1001)
   x[:, 0] = np.nan
   code, out, err = mjx(save(tmp_path / "none.csv", x, NAMES), "--nominal", nominal)
@@ -258,3 +258,18 @@ def test_a_wide_log_with_missing_cells_is_judged():
   assert found.known.mean() > 0.98
   events = verdict.judge(own, found, [f"c{k}" for k in range(28)], 500)
   assert not [event for event in events if event["believed"]]
+
+
+def test_faults_are_put_into_a_nominal_log_with_missing_cells():
+  """At as many places as into a whole one, or nearly."""
+  past = leg(6000, 0)
+  cells(0.02)(past, np.random.default_rng(0))
+  own = verdict.calibrated(past, 10_000)
+  whole = healthy.completed(own.model, past)
+  there = np.isfinite(past)
+  np.testing.assert_array_equal(whole[there], past[there])
+  hip = (there[:, 1:].all(1) & ~there[:, 0])[20:]
+  assert np.abs(whole - leg(6000, 0))[20:][hip, 0].max() < 0.06  # of 0.8, with noise of 0.01
+  assert inject._places(len(past), 100)
+  _, places = inject.smallest(own, whole, NAMES, 100)
+  assert places >= 8
