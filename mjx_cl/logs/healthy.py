@@ -106,7 +106,7 @@ def ages(x: np.ndarray) -> np.ndarray:
   """(T, C) rows since the last sample of x; before the first one, since the row before x."""
   rows, there = np.arange(len(x))[:, None], np.isfinite(x)
   if there.all():
-    return np.zeros(x.shape, int)
+    return np.zeros_like(x, int)
   return rows - np.maximum.accumulate(np.where(there, rows, -1), 0)
 
 
@@ -202,8 +202,6 @@ def judged(
   log has no sample either they are those of the last one.
   """
   own, reach = x[:, : residuals.shape[-1]], max(*NOW, *BEFORE)
-  if np.isfinite(x).all():
-    return np.ascontiguousarray(residuals)
   missing = absent(x, model.held)[:, : own.shape[1]]
   at = np.where(missing, 0, np.minimum(ages(own), np.arange(len(x))[:, None]))
   found = np.take_along_axis(residuals, (np.arange(len(x))[:, None] - at)[None], 1)
