@@ -25,6 +25,12 @@ class FileError(UserError):
   exit_code = 1
 
 
+class ChangeError(UserError):
+  """A log that has changed, where that was to be a failure: exit code 3."""
+
+  exit_code = 3
+
+
 def require(holds: object, text: str) -> None:
   """Raises UserError with this text unless the condition holds."""
   if not holds:

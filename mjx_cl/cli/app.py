@@ -1,8 +1,8 @@
 """The command line. Nothing here imports JAX before a command that computes runs, so `--help`
 answers at once.
 
-Exit codes: 0 done; 2 arguments, names, ranges, refused --out; 1 files, disk, numeric failure; 130
-Ctrl-C, after state is saved.
+Exit codes: 0 done; 2 arguments, names, ranges, refused --out; 1 files, disk, numeric failure; 3 a
+change that was to be a failure; 130 Ctrl-C, after state is saved.
 
 What each command takes stands in flags.py, what does it in the module that COMMANDS names.
 """

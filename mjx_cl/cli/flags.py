@@ -340,10 +340,10 @@ class Detect:
 
   Read are Parquet and MCAP files (rosbag2; extra [ros]), and CSV files, also .csv.gz, with a header
   row (a row of units may follow) and cells between commas, semicolons (then with a decimal comma
-  too) or tabulators; an empty cell or nan is a missing sample. `time` [s], `step` or time stamps
-  tell when samples were taken. Not watched are clocks and counters, columns that are constant in
-  the nominal log, that hold text or that one log lacks; all of it is printed, --column watches even
-  a clock.
+  too) or tabulators; an empty cell or nan is a missing sample. `time`, `t`, a clock with its unit
+  (`time_ms`), `step` or time stamps tell when samples were taken. Not watched are clocks and
+  counters, columns that are constant in the nominal log, that hold text or that one log lacks; all
+  of it is printed, --column watches even a clock.
 
   The nominal log is modelled: each column from the others and from the recent past, drifting ones
   relative to their slow average. Three charts watch what deviates. --detector runs detectors of the
@@ -363,8 +363,8 @@ class Detect:
     set: Settings of such a class, name=value ...
     arl0: Wanted mean number of samples between false alarms of one detector or chart, all columns
       together.
-    rate: Samples (or steps of the column `step`) per second; default: from the column `time`,
-      one of seconds (`time_s`) or time stamps.
+    rate: Samples (or steps of the column `step`) per second, whatever clocks the logs hold;
+      default: from those.
     model: Of the nominal log: ar, or none (the columns themselves).
     command: Columns that explain others and are not watched themselves, such as set points.
     refractory: Alarms of the charts that are closer than this are one event [s], in samples where
@@ -375,6 +375,7 @@ class Detect:
       or less is refused.
     out: Folder for the results; default: only the table.
     overwrite: Replace an earlier detection in --out.
+    fail_on_change: Exit with code 3 where the log has changed.
   """
 
   file: Positional[str]
@@ -392,6 +393,7 @@ class Detect:
   out: str | None = None
   json: bool = False
   overwrite: bool = False
+  fail_on_change: bool = False
 
 
 @dataclass(frozen=True)

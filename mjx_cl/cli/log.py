@@ -6,11 +6,16 @@ from mjx_cl.cli.flags import Detect
 from mjx_cl.cli.output import emit, say
 from mjx_cl.cli.tables import show_detections, show_verdict
 from mjx_cl.config import settings
+from mjx_cl.errors import ChangeError, FileError, require
 from mjx_cl.logs import detect, results
 
 
 def do_detect(args: Detect) -> None:
   """Watches a log."""
+  require(
+    not (args.fail_on_change and args.detector),
+    "--fail-on-change goes by the verdict of the charts; leave out --detector",
+  )
   out = None if args.out is None else results.claim(args.out, args.overwrite)
   result = detect.detect(
     args.file,
@@ -38,3 +43,15 @@ def do_detect(args: Detect) -> None:
       show_verdict(result.summary)
     else:
       show_detections(result.summary["detectors"])
+  if unjudged := result.summary.get("unjudged"):
+    reasons: dict[str, list[str]] = {}
+    for name, why in unjudged.items():
+      reasons.setdefault(why, []).append(name)
+    text = "; ".join(f"{', '.join(names)} ({why})" for why, names in reasons.items())
+    unjudged = f"could not be judged: {text}"
+  if args.fail_on_change and result.summary["verdict"]["changed"]:
+    if unjudged:
+      say(f"note: {unjudged}")
+    raise ChangeError("the log has changed")
+  if unjudged:
+    raise FileError(unjudged)

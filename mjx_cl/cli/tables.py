@@ -234,9 +234,12 @@ def detect_table(rows: list[dict], columns: bool) -> Table:
 
 def _columns(event: dict) -> str:
   """Columns of an event, with what happened to them."""
-  how = lambda c: (
-    f"mean by about {c['by']:+.2g}" if c["how"] == "mean" else f"spread x{c['by']:.2f}"
-  )
+
+  def how(c: dict) -> str:
+    if c["how"] == "course":
+      return "another course in time"
+    return f"mean by about {c['by']:+.2g}" if c["how"] == "mean" else f"spread x{c['by']:.2f}"
+
   return ", ".join(f"{c['column']} ({how(c)})" for c in event["columns"]) or "all a little"
 
 
@@ -257,8 +260,8 @@ def show_verdict(summary: dict) -> None:
       f"  {len(event['charts'])} of {verdict['of']} charts agree; in a healthy log of this length "
       f"{chance} such events are expected"
     )
-  if not believed:
-    names = summary["columns"]
+  names = [name for name in summary["columns"] if name not in summary["unjudged"]]
+  if not believed and names:
     which = ", ".join(names) if len(names) <= 8 else f"{len(names)} columns"
     print(f"no change in {which} that a healthy log of this length would not show as well")
   if doubted:

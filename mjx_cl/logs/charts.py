@@ -21,6 +21,7 @@ import numpy as np
 from scipy import signal, special
 
 SPANS = (5, 25, 125)  # samples
+PAUSE = 32  # samples for which nothing may be known before an average falls back to what is healthy
 CHARTS = ("level", "spread", "joint")
 LEAST_BLOCKS = 20  # of which maxima are taken; blocks of a short log are shorter than the last span
 HEAVIEST = 0.3  # of the tails that are believed, as shape of the distribution
@@ -41,12 +42,36 @@ class Scales(NamedTuple):
   joint: np.ndarray
 
 
-def averages(x: np.ndarray, start: np.ndarray | float = 0.0) -> Iterator[np.ndarray]:
-  """Exponentially weighted averages of x (..., T, C) over each of SPANS, which begin at `start`."""
+def averages(
+  x: np.ndarray, start: np.ndarray | float = 0.0, paused: np.ndarray | None = None
+) -> Iterator[np.ndarray]:
+  """Exponentially weighted averages of x (..., T, C) over each of SPANS, which begin at `start` and
+  stand still where x (T, C) is `paused`.
+  """
+  still = () if paused is None else np.flatnonzero(paused.any(0))
   for span in SPANS:
     rate = 2 / (span + 1)
     begin = np.broadcast_to(start, (*x.shape[:-2], 1, x.shape[-1])) * (1 - rate)
-    yield signal.lfilter([rate], [1, rate - 1], x, -2, begin)[0]
+    found = signal.lfilter([rate], [1, rate - 1], x, -2, begin)[0]
+    for c in still:
+      moving = ~paused[:, c]  # type: ignore[index]
+      own = signal.lfilter([rate], [1, rate - 1], x[moving, c], 0, begin[:, c])[0]
+      found[:, c] = np.r_[begin[:, c] / (1 - rate), own][np.cumsum(moving)]
+    yield found
+
+
+def _paused(x: np.ndarray) -> np.ndarray | None:
+  """Bool (T, C): stretches of nan in x (T, C) of no more than PAUSE rows, but for those that x
+  begins with; None where there is none.
+  """
+  unknown = np.isnan(x)
+  some = unknown.any(-1)
+  if x.ndim > 2 or not some[int(np.argmin(some)) :].any():
+    return None
+  rows = np.arange(len(x))[:, None]
+  before = np.maximum.accumulate(np.where(unknown, -1, rows), 0)
+  after = np.minimum.accumulate(np.where(unknown, len(x), rows)[::-1], 0)[::-1]
+  return unknown & (before >= 0) & (after - before <= PAUSE + 1)
 
 
 def logs(residuals: np.ndarray) -> np.ndarray:
@@ -72,16 +97,18 @@ def _shrunk(x: np.ndarray) -> np.ndarray:
 
 
 def scales(residuals: np.ndarray) -> Scales:
-  """Of the nominal log's residuals (2, N, C); nan counts as neither high nor low."""
+  """Of the nominal log's residuals (2, N, C); at nan averages stand still, then count it as neither
+  high nor low.
+  """
   level, joint = [], []
-  for average in averages(_known(residuals[0])):
+  for average in averages(_known(residuals[0]), 0.0, _paused(residuals[0])):
     level.append(average.std(0))
     joint.append(np.linalg.inv(_shrunk(average)))
   spread = []
-  for one in residuals:
-    energy = logs(one)
+  for energy in logs(residuals):
     middle = np.nanmean(energy, 0, keepdims=True)
-    spread.append([(x.mean(0), x.std(0)) for x in averages(_known(energy, middle), middle)])
+    energies = averages(_known(energy, middle), middle, _paused(energy))
+    spread.append([(x.mean(0), x.std(0)) for x in energies])
   mean, deviation = np.moveaxis(np.array(spread), 2, 0)
   return Scales(
     np.maximum(level, 1e-9), np.stack([mean, np.maximum(deviation, 1e-9)]), np.stack(joint)
@@ -92,11 +119,12 @@ def scores(residuals: np.ndarray, own: Scales) -> dict[str, np.ndarray]:
   """Chart -> (..., T, C), of `joint` (..., T, 1), for residuals (2, ..., T, C)."""
   shape = residuals.shape[1:]
   level, spread, joint = np.zeros(shape), np.zeros(shape), np.zeros(shape[:-1])
-  for x, deviation, inverse in zip(averages(_known(residuals[0])), own.level, own.joint):
+  level_of = averages(_known(residuals[0]), 0.0, _paused(residuals[0]))
+  for x, deviation, inverse in zip(level_of, own.level, own.joint):
     joint = np.maximum(joint, ((x @ inverse) * x).sum(-1))
     level = np.maximum(level, np.abs(x / deviation))
-  for one, means, deviations in zip(residuals, *own.spread):
-    energies = averages(_known(logs(one), means[-1]), means[-1])
+  for energy, means, deviations in zip(logs(residuals), *own.spread):
+    energies = averages(_known(energy, means[-1]), means[-1], _paused(energy))
     for x, mean, deviation in zip(energies, means, deviations):
       spread = np.maximum(spread, np.abs((x - mean) / deviation))
   return {"level": level, "spread": spread, "joint": np.sqrt(joint)[..., None]}

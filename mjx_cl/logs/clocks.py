@@ -7,7 +7,14 @@ from collections.abc import Sequence
 import numpy as np
 
 SECONDS = frozenset(("s", "sec", "secs", "second", "seconds"))
-UNITS = SECONDS | {"ms", "msec", "us", "µs", "usec", "ns", "nsec", "min", "h"}
+# words of a name -> seconds of the unit that they tell
+UNITS = {word: 1.0 for word in SECONDS} | {
+  "ms": 1e-3, "msec": 1e-3, "millis": 1e-3, "milliseconds": 1e-3,
+  "us": 1e-6, "µs": 1e-6, "usec": 1e-6, "micros": 1e-6, "microseconds": 1e-6,
+  "ns": 1e-9, "nsec": 1e-9, "nanos": 1e-9, "nanoseconds": 1e-9,
+  "min": 60.0, "h": 3600.0,
+}  # fmt: skip
+ABBREVIATED = {"s", "ms", "us", "µs", "ns", "min", "h"}  # tell no clock by themselves
 CLOCKS = SECONDS - {"s"} | {  # words of a name; such a column is a clock if it also rises
   "time",
   "timestamp",
@@ -52,23 +59,53 @@ def told_by_name(name: str, label: str) -> str | None:
   )
 
 
-def of_seconds(label: str) -> bool:
-  """Whether a name tells a clock in seconds: `time_s`, `t [s]`, `seconds`; not `t` or `timestamp`,
-  whose unit nobody knows.
+def unit(label: str) -> float | None:
+  """Seconds of the unit that a clock's name tells: `time_s`, `t [ms]`, `micros`; None for `t` or
+  `timestamp`, whose unit nobody knows.
   """
   *rest, last = _words(label) or [""]
-  return last in SECONDS and set(rest) <= CLOCKS | {"t"} and (bool(rest) or last in CLOCKS)
+  told = last in UNITS and set(rest) <= CLOCKS | {"t"} and (bool(rest) or last not in ABBREVIATED)
+  return UNITS[last] if told else None
+
+
+def of_seconds(label: str) -> bool:
+  """Whether a name tells a clock in seconds."""
+  return unit(label) == 1.0
 
 
 def called_clock(label: str) -> bool:
   """Whether a name has a word of CLOCKS, or is `t` with or without a unit."""
   words = _words(label)
-  return not CLOCKS.isdisjoint(words) or words[:1] == ["t"] and UNITS.issuperset(words[1:])
+  return not CLOCKS.isdisjoint(words) or words[:1] == ["t"] and UNITS.keys() >= set(words[1:])
 
 
 def throughout(x: np.ndarray) -> bool:
   """Whether x has no gap and rises at every row."""
   return len(x) > 0 and bool(np.isfinite(x).all() and (np.diff(x) > 0).all())
+
+
+# names of a clock that may tell times without a unit
+UNITLESS = {"time", "t", "timestamp", "stamp", "elapsed", "uptime"}
+# rise per row of such a clock, of whole numbers, from which its unit follows: 1 Hz to 1 kHz
+RISES = {1e6: ("nanoseconds", 1e-9), 1e3: ("microseconds", 1e-6)}
+
+
+def unitless(label: str) -> bool:
+  """Whether a name tells a clock and no unit."""
+  words = _words(label)
+  return len(words) == 1 and words[0] in UNITLESS
+
+
+def guessed(x: np.ndarray) -> tuple[str, float] | None:
+  """Unit of the times x, in words and in seconds, by how far they rise in a row; None where it may
+  be one of several.
+  """
+  rise = float(np.median(np.diff(x))) if len(x) > 1 else 0.0
+  whole = bool((x[:1000] == np.round(x[:1000])).all())
+  for least, told in RISES.items():
+    if whole and rise >= least:
+      return told
+  return ("seconds", 1.0) if 0 < rise < 1 else None
 
 
 # first value from which a number is taken for a time since 1970 -> seconds of its unit
@@ -104,6 +141,15 @@ def epoch_seconds(x: np.ndarray) -> np.ndarray | None:
 def never_falls(x: np.ndarray) -> bool:
   """Whether x has no gap, does not fall and rises in all."""
   return len(x) > 1 and bool(np.isfinite(x).all() and (np.diff(x) >= 0).all() and x[-1] > x[0])
+
+
+def rate(seconds: np.ndarray) -> tuple[float, float] | None:
+  """Rows per second by the median distance of two and by the mean one without gaps; None where that
+  tells nothing.
+  """
+  steps = np.diff(seconds)
+  usual = float(np.median(steps)) if len(steps) else 0.0
+  return (1 / usual, 1 / float(steps[steps <= GAP * usual].mean())) if usual > 0 else None
 
 
 def irregular(seconds: np.ndarray) -> list[str]:

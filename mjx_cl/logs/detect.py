@@ -18,7 +18,7 @@ import numpy as np
 from mjx_cl.detectors import python_class
 from mjx_cl.errors import FileError, PluginError, UserError, choose
 from mjx_cl.io import plugins
-from mjx_cl.logs import charts, healthy, verdict
+from mjx_cl.logs import charts, clocks, gaps, healthy, verdict
 from mjx_cl.logs import inject as injection
 from mjx_cl.logs.columns import choose_columns
 from mjx_cl.logs.programs import LEVELS, Program, joint, table
@@ -33,6 +33,8 @@ FEW = 50  # alarms below which a measured run length is marked
 # calibrated
 MARGIN = 0.25
 CHUNK = 2048  # rows of one call of a program
+MANY = 8  # columns that a line names
+SAME = 1.2  # ratio of two rates above which they are not the same
 # nominal deviations at which a sample is cut, so that no sum of squares overflows float32
 FARTHEST = 1e6
 
@@ -107,7 +109,7 @@ def detect(
     detectors: of `table()`, "all" of them; or host detectors, module:Class or file.py:Class, which
       bring a threshold of their own and see samples in the file's own units.
     arl0: wanted mean number of samples between false alarms, all columns of a detector together.
-    rate: samples per second, for times; default: from the column `time` or one of seconds,
+    rate: samples per second, for times; default: from the clocks of the logs, which must agree,
       otherwise times are unknown. With a column `step`: steps per second.
     logarithm: watch ln max(x, 1e-9), for positive and skewed residuals; x <= 0 is refused.
     settings: of the host detectors.
@@ -127,6 +129,11 @@ def detect(
     raise UserError(
       "commands explain others in the model alone: leave out --detector and --model none"
     )
+  dead = [
+    name
+    for name, x in log.columns.items()
+    if np.isnan(x).all() and np.isfinite(nominal.columns.get(name, x)).any()
+  ]
   found, left = choose_columns(log, nominal, columns, path, nominal_path)
   if commands:
     told, _ = choose_columns(log, nominal, commands, path, nominal_path)
@@ -143,10 +150,16 @@ def detect(
   middle, spread = _spread(past, found, nominal_path, logarithm)
   warmup = min(1000, len(past) // 3)
   names = _able(names, len(found), len(past), warmup, "all" not in detectors)
+  given = rate is not None
+  if not given:
+    _same_rate(log, nominal, path, nominal_path)
   seconds, rate = _clock(log, rate, len(xs))
   if not names:
     own = found[: len(found) - len(set(commands))]
-    judged = _judged(xs, past, own, Times(seconds, rate), arl0, model, refractory, inject, tell)
+    times = Times(seconds, rate, None if given else gaps.places(log.time))
+    places = None if given else gaps.places(nominal.time)
+    judged = _judged(xs, past, own, times, places, arl0, model, refractory, inject, tell)
+    judged.summary["unjudged"] |= {name: "no samples" for name in dead if name not in found}
     notes = [*dict.fromkeys(nominal.notes + log.notes), *left, *judged.summary["notes"]]
     judged.summary.update(
       log=str(path), nominal=str(nominal_path), columns=own, logarithm=logarithm, notes=notes,
@@ -185,6 +198,7 @@ def _judged(
   past: np.ndarray,
   names: list[str],
   times: Times,
+  past_places: np.ndarray | None,
   arl0: float,
   model: str,
   refractory: float | None,
@@ -197,25 +211,38 @@ def _judged(
       raise UserError(f"{what} must lie in 0..1e9 seconds (or samples); got {value}")
   choose("model", model, dict.fromkeys(healthy.MODELS))
   tell("model of the nominal log")
-  used, at = healthy.thinned(past)
+  even, even_past = gaps.evened(xs, times.places), gaps.evened(past, past_places)
+  used, at = healthy.thinned(even_past)
   own = verdict.calibrated(used, arl0, model, past.shape[1] - len(names))
-  found = verdict.watch(own, xs)
+  found, lost = verdict.watch(own, even), gaps.silent(even, own.model.held)
   default = times.samples(10.0, 500) if times.rate else 500
   pause = times.samples(refractory, default)
   scores = charts.scores(own.unseen, own.scales)
   before = {}
   for k, score in scores.items():
-    before[k] = np.zeros(len(past), bool)
+    before[k] = np.zeros(len(even_past), bool)
     before[k][at[charts.alarms(score, own.thresholds[k]).any(1) & (at >= 0)]] = True
-  rows = []
+    before[k] = before[k] if past_places is None else before[k][past_places]
+  events = []
+  if lost.columns.any():
+    found, other, seen, keep = gaps.without(own, found, used, even, lost, arl0, model)
+    if other is not None and seen is not None:
+      left = [name for name, there in zip(names, keep) if there]
+      events = verdict.judge(other, seen, left, pause)
+  events = verdict.together(verdict.judge(own, found, names, pause), events, pause)
+  found, rows = gaps.taken(found, times.places), []
   for name in charts.CHARTS:
     run: Run = None, True, before[name], found.fired[name], found.scores[name]
     row = _row(run, name, 0, names, times.seconds)
     labels = names if found.scores[name].shape[1] == len(names) else [ALL]
     rows.append(row | {"thresholds": dict(zip(labels, own.thresholds[name].tolist()))})
-  said = verdict.summary(own, found, names, times, arl0, pause)
+  said = verdict.summary(own, events, names, times, arl0)
+  silent = gaps.told(lost, names, times.seconds, times.places, len(even))
+  unjudged = gaps.unjudged(found.known, names, silent)
+  said |= {"silent": silent, "unjudged": unjudged, "refractory": pause}
   said |= {"arl0": arl0, "rate_hz": times.rate, "detectors": rows}
-  said |= {**_sizes(xs, past, 0), "notes": _said_of(own, names, found.known, len(used), arl0)}
+  notes = _said_of(own, names, found.known, len(used), arl0, silent, unjudged)
+  said |= {**_sizes(xs, past, 0), "notes": notes}
   if len(used) < len(past):
     said["notes"].append(
       f"of the {len(past):,} nominal samples {int((at >= 0).sum()):,} are used, in {healthy.FOLDS} "
@@ -224,7 +251,9 @@ def _judged(
   if inject is not None:
     within = times.samples(inject, 1)
     tell("faults put into the nominal log")
-    found_faults, places = injection.smallest(own, healthy.held(used), names, within)
+    found_faults, places = injection.smallest(
+      own, healthy.completed(own.model, used), names, within
+    )
     said["inject"] = {"within": within, "places": places, "faults": found_faults}
     if not places:
       said["notes"].append(
@@ -235,7 +264,15 @@ def _judged(
   return Detection(said, shown, own_past, found.fired, found.scores, before, times.seconds)
 
 
-def _said_of(own: Watch, names: list[str], known: np.ndarray, rows: int, arl0: float) -> list[str]:
+def _said_of(
+  own: Watch,
+  names: list[str],
+  known: np.ndarray,
+  rows: int,
+  arl0: float,
+  silent: dict[str, str],
+  unjudged: dict[str, str],
+) -> list[str]:
   """What a reader must know of the model, one line each."""
   notes = []
   if drifts := [name for name, yes in zip(names, own.model.drifts) if yes]:
@@ -243,9 +280,19 @@ def _said_of(own: Watch, names: list[str], known: np.ndarray, rows: int, arl0: f
       f"{', '.join(drifts)}: drifting while healthy, so only changes quicker than "
       f"{own.model.slow} samples are seen there"
     )
-  if blind := int((~known).sum()):
+  notes += [
+    f"{name} has {why}; there the other columns are judged without it"
+    for name, why in silent.items()
+    if name not in unjudged
+  ]
+  blind = {name: int(n) for name, n in zip(names, (~known).sum(0)) if n}
+  most = sorted(set(blind) - {*silent, *unjudged}, key=lambda name: -blind[name])
+  if most:
+    rest = f" and {len(most) - MANY} more columns" if len(most) > MANY else ""
     notes.append(
-      f"{blind:,} of {len(known):,} samples are not judged: columns are missing there for too long"
+      f"not judged of {len(known):,} samples, as they or too many that foretell them are missing: "
+      + ", ".join(f"{name} {blind[name]:,}" for name in most[:MANY])
+      + rest
     )
   if rows < arl0 * len(names):
     notes.append(
@@ -346,6 +393,30 @@ def _short(x: np.ndarray) -> bool:
   """Whether float32 rounds a column by less than a thousandth of its deviation."""
   highest = max(abs(float(np.nanmin(x))), abs(float(np.nanmax(x))))
   return highest * 2.0**-24 <= 1e-3 * float(np.nanstd(x[::97], dtype=np.float64))
+
+
+def _same_rate(
+  log: Log, nominal: Log, path: pathlib.Path | str, nominal_path: pathlib.Path | str
+) -> None:
+  """Refuses logs whose clocks tell that one has SAME times as many rows per second as the other."""
+  if log.time is None or nominal.time is None:
+    return
+  now, past = clocks.rate(log.time), clocks.rate(nominal.time)
+  if now is None or past is None:
+    return
+  if all(not 1 / SAME < a / b < SAME for a, b in zip(now, past)):
+    slow, fast = sorted((now[0], past[0]))
+    times = round(fast / slow)
+    dense = path if now[0] > past[0] else nominal_path
+    remedy = (
+      f"keep one row of {times} of {dense}"
+      if times > 1 and abs(fast / slow - times) < 0.05 * times
+      else "bring both to one rate"
+    )
+    raise FileError(
+      f"{path} has {now[0]:,.4g} rows a second and {nominal_path} {past[0]:,.4g}: {remedy}, or "
+      "give --rate to compare them row by row all the same"
+    )
 
 
 def _clock(log: Log, rate: float | None, samples: int) -> tuple[np.ndarray | None, float | None]:

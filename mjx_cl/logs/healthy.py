@@ -7,6 +7,10 @@ commands, which predict and are not judged. Columns that drift while healthy,
 such as a battery's voltage, are taken relative to a slow average of their own first. Which columns
 predict which follows Gertler, "Fault Detection and Diagnosis in Engineering Systems" (1998),
 chapter 4, with regression in place of a physical model.
+
+A missing sample is filled with what `past` foretells, and the error of that widens the deviation in
+which all that rests on it is measured; what would be measured in more than twice the healthy
+variance is not judged.
 """
 
 from typing import NamedTuple
@@ -24,13 +28,16 @@ USEFUL = 0.05  # share of a column's variance that a prediction has to explain t
 DRIFTS = 0.2  # share of a column's variance in the means of DRIFT_BLOCKS shares: above, it drifts
 DRIFT_BLOCKS = 10
 SLOW = 1000  # samples of a drifting column's average, a tenth of the nominal log at most
-# rows that a missing sample is replaced by the last known one for; twice the usual distance of a
-# column that is written less often than others
+# rows that a missing sample is replaced for; twice the usual distance of a column that is written
+# less often than others
 HELD = 3
+DOUBTFUL = 0.5  # variance that filled samples may add to a residual, in its healthy variance
+SURE, LOST = 0.5, 0.9  # errors of what is filled [nominal deviations]: after one row, at most
 FARTHEST = 10.0  # deviations at which a residual is cut
 ROWS = 20_000  # predicted at a time
 MOST = 10_000_000  # samples of all columns of a nominal log that are used
 MODELS = ("ar", "none")
+REFITS = 2  # of the model, each with missing samples filled by the one before
 
 
 class Healthy(NamedTuple):
@@ -49,6 +56,7 @@ class Healthy(NamedTuple):
     explained: (2, C) share of the variance that each prediction explains of folds it has not seen.
     middle: (2, W) mean of the residuals.
     scale: (2, W) their standard deviation.
+    step: (C,) root mean square change from one row to the next, in deviations.
   """
 
   watched: int
@@ -62,6 +70,7 @@ class Healthy(NamedTuple):
   explained: np.ndarray
   middle: np.ndarray
   scale: np.ndarray
+  step: np.ndarray
 
 
 def held(x: np.ndarray) -> np.ndarray:
@@ -93,26 +102,116 @@ def usual(x: np.ndarray) -> np.ndarray:
   return np.maximum(HELD, np.ceil(2 * gaps)).astype(int)
 
 
-def known(x: np.ndarray, longest: np.ndarray) -> np.ndarray:
-  """Bool (T,): rows of x (T, C) whose predictions rest on samples of which none is missing for more
-  than `longest` (C,) rows.
+def ages(x: np.ndarray) -> np.ndarray:
+  """(T, C) rows since the last sample of x; before the first one, since the row before x."""
+  rows, there = np.arange(len(x))[:, None], np.isfinite(x)
+  if there.all():
+    return np.zeros_like(x, int)
+  return rows - np.maximum.accumulate(np.where(there, rows, -1), 0)
+
+
+def _apart(x: np.ndarray, longest: np.ndarray) -> np.ndarray:
+  """Bool (T,): rows of a stretch without any sample that is longer than `longest` (C,) and the
+  longest lag; what comes after it begins anew.
   """
-  at = np.where(np.isfinite(x), np.arange(len(x))[:, None], -1)
-  age = np.arange(len(x))[:, None] - np.maximum.accumulate(at, 0)
-  reach = np.cumsum(np.r_[0, (age > longest).any(1)])
+  whole, rows = ~np.isfinite(x).any(1), np.arange(len(x))
+  if not whole.any():
+    return whole
+  ends = np.where(whole & ~np.r_[whole[1:], False], rows, len(x) - 1)
+  end = np.minimum.accumulate(ends[::-1])[::-1]
+  return whole & np.all(ages(x) > longest + max(*NOW, *BEFORE), 1)[end]
+
+
+def known(x: np.ndarray, longest: np.ndarray) -> np.ndarray:
+  """Bool (T,): rows of x (T, C) whose predictions do not reach into stretches that set them
+  `_apart`, from `longest` (C,) rows after the last sample on.
+  """
+  nothing = _apart(x, longest)
+  if not nothing.any():
+    return ~nothing
+  nothing &= (ages(x) > longest).all(1)
+  reach = np.cumsum(np.r_[0, nothing])
   begin = np.maximum(0, np.arange(len(x)) - max(*NOW, *BEFORE))
   return reach[1:] == reach[begin]
 
 
-def judged(residuals: np.ndarray, x: np.ndarray, longest: np.ndarray) -> np.ndarray:
-  """Residuals (2, T, W) of x (T, C), where a sample is missing those of the last known one, nan in
-  rows that are not `known`.
+def absent(x: np.ndarray, longest: np.ndarray) -> np.ndarray:
+  """Bool (T, C): samples of x that are missing where a healthy log has one; not those of a column
+  that is seldom written, nor of stretches that set rows `_apart`.
   """
-  there = np.isfinite(x[:, : residuals.shape[-1]])
-  at = np.maximum.accumulate(np.where(there, np.arange(len(x))[:, None], 0), 0)
-  found = np.take_along_axis(residuals, at[None], 1)
-  found[:, ~known(x, longest)] = np.nan
-  found[:, : max(*NOW, *BEFORE)] = np.nan
+  missing = ages(x) > np.where(longest > HELD, longest, 0)
+  return missing & ~_apart(x, longest)[:, None]
+
+
+def filled(model: Healthy, z: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+  """Z of `standard`, what is `absent` in x (T, C) filled, and the deviation (T, C) of the error of
+  that, 0 where there is a sample; None where nothing is filled.
+
+  By the prediction from the past, or where that errs more, as for commands, by the last sample;
+  once the longest lag is over, nothing is known of it but the nominal mean.
+  """
+  missing = absent(x, model.held)
+  if not missing.any():
+    return z, None
+  age, own, error = ages(x), model.watched, missing.astype(float)
+  lags, weights = np.array(_before(own, z)), model.past[-1].reshape(-1, *[len(model.mean)] * 2)
+  near = missing & (age <= model.held + max(*NOW, *BEFORE))
+  z = np.where(missing & ~near, 0.0, z)
+  step = np.minimum(1.0, model.step * np.sqrt(age))
+  foretold = np.r_[model.scale[1] < model.step[:own], np.zeros(len(model.mean) - own, bool)]
+  error = np.where(near & ~foretold, step, error)
+  near &= foretold
+  for t in np.flatnonzero(near.any(1)):
+    at, columns = np.maximum(t - lags, 0), np.flatnonzero(near[t])
+    used = weights[:, :, columns]
+    z[t, columns] = np.einsum("lc,lck->k", z[at], used) + model.middle[1, columns]
+    doubt = np.einsum("lc,lck->ck", error[at], np.abs(used))
+    error[t, columns] = np.minimum(1.0, np.sqrt(model.scale[1, columns] ** 2 + (doubt**2).sum(0)))
+  return z, error
+
+
+def completed(model: Healthy, x: np.ndarray) -> np.ndarray:
+  """(T, C) `held`, and what is `absent` of columns that do not drift as it is `filled`."""
+  known_last = held(x)
+  z, error = filled(model, standard(model, known_last), x)
+  if error is None:
+    return known_last
+  return np.where((error > 0) & ~model.drifts, model.mean + model.spread * z, known_last)
+
+
+def _added(
+  weights: np.ndarray, lags: tuple[int, ...], error: np.ndarray, scale: np.ndarray
+) -> np.ndarray:
+  """Variance (T, W) that errors (T, C) of the features add to a prediction, in squares of `scale`
+  (W,): those of one column as if they were one, those of several independent.
+  """
+  found = np.zeros((len(error), len(scale)))
+  by_column = np.abs(weights.reshape(len(lags), -1, weights.shape[-1])[..., : len(scale)])
+  at = np.maximum(np.arange(len(error))[:, None] - np.array(lags), 0)
+  for c in np.flatnonzero(error.any(0)):
+    found += (error[at, c] @ by_column[:, c]) ** 2
+  return found / scale**2
+
+
+def judged(
+  model: Healthy, residuals: np.ndarray, x: np.ndarray, error: np.ndarray | None = None
+) -> np.ndarray:
+  """Residuals (2, T, W) of x (T, C), nan in rows that are not `known` and where a sample is
+  `absent`; but a column that its past alone foretells keeps what was `filled`, unless with too
+  large an error (SURE, LOST), as an average of a swing must not miss a part of it. Where a healthy
+  log has no sample either they are those of the last one.
+  """
+  own, reach = x[:, : residuals.shape[-1]], max(*NOW, *BEFORE)
+  missing = absent(x, model.held)[:, : own.shape[1]]
+  at = np.where(missing, 0, np.minimum(ages(own), np.arange(len(x))[:, None]))
+  found = np.take_along_axis(residuals, (np.arange(len(x))[:, None] - at)[None], 1)
+  found[:, ~known(x, model.held)] = np.nan
+  found[1, missing] = np.nan
+  if error is not None:
+    sure = ~np.any(model.others, (0, 1))[: own.shape[1]] & (model.scale[1] < SURE)
+    missing = missing & (~sure | (error[:, : own.shape[1]] > LOST))
+  found[0, missing] = np.nan
+  found[:, :reach] = np.nan
   return found
 
 
@@ -157,9 +256,12 @@ def _predicted(weights: np.ndarray, lags: tuple[int, ...], z: np.ndarray) -> np.
   return np.concatenate(parts, -2)
 
 
-def residuals(model: Healthy, z: np.ndarray, fold: int = -1) -> np.ndarray:
+def residuals(
+  model: Healthy, z: np.ndarray, fold: int = -1, error: np.ndarray | None = None
+) -> np.ndarray:
   """(2, ..., T, W): what z (..., T, C), from `standard`, deviates from both predictions, in
-  deviations; nan where the past is unknown.
+  deviations, which an error (T, C) of samples that are `filled` widens; nan where the past is
+  unknown or the error too large.
   """
   own = model.watched
   found = np.stack(
@@ -171,6 +273,12 @@ def residuals(model: Healthy, z: np.ndarray, fold: int = -1) -> np.ndarray:
   shape = (2, *[1] * (z.ndim - 1), own)
   found -= model.middle.reshape(shape)
   found /= model.scale.reshape(shape)
+  if error is not None:
+    used = (model.others, NOW), (model.past, _before(own, z))
+    for one, scale, (weights, lags) in zip(found, model.scale, used):
+      more = _added(weights[fold], lags, error, scale)
+      one /= np.sqrt(1 + more)
+      one[more > DOUBTFUL] = np.nan
   found[..., : max(*NOW, *BEFORE), :] = np.nan
   return np.clip(found, -FARTHEST, FARTHEST, out=found)
 
@@ -181,12 +289,14 @@ def folds(rows: int) -> list[slice]:
   return [slice(a, b) for a, b in zip(ends[:-1], ends[1:])]
 
 
-def unseen(model: Healthy, z: np.ndarray) -> np.ndarray:
-  """(2, N, W) residuals of the nominal log, each fold by the weights of the others."""
+def unseen(model: Healthy, z: np.ndarray, error: np.ndarray | None = None) -> np.ndarray:
+  """(2, N, W) `residuals` of the nominal log, each fold by the weights of the others."""
   parts = []
   for k, share in enumerate(folds(len(z))):
     begin = max(0, share.start - 2 * max(*NOW, *BEFORE))
-    parts.append(residuals(model, z[begin : share.stop], k)[:, share.start - begin :])
+    at = slice(begin, share.stop)
+    part = residuals(model, z[at], k, None if error is None else error[at])
+    parts.append(part[:, share.start - begin :])
   return np.concatenate(parts, 1)
 
 
@@ -275,7 +385,7 @@ def fit(x: np.ndarray, model: str = "ar", commands: int = 0) -> tuple[Healthy, n
     UserError: too much of the log is missing.
   """
   columns, longest, samples = x.shape[1], usual(x), x
-  if known(x, longest).mean() < 0.5:
+  if (ages(x) > longest).mean(0).max() > 0.5 or known(x, longest).mean() < 0.5:
     raise UserError(
       "columns of the nominal log are missing for so long that less than half of it can be used; "
       "name others by --column"
@@ -290,14 +400,38 @@ def fit(x: np.ndarray, model: str = "ar", commands: int = 0) -> tuple[Healthy, n
   none, one = np.zeros((2, columns)), np.ones((2, own))
   blank = lambda lags: np.zeros((FOLDS + 1, len(lags) * columns, columns))
   fitted = Healthy(
-    own, mean, spread, drifts, slow, longest, blank(NOW), blank(_before(own, x)), none, 0 * one, one
+    own, mean, spread, drifts, slow, longest, blank(NOW), blank(_before(own, x)), none, 0 * one,
+    one, one[0],
   )  # fmt: skip
   z = standard(fitted, x)
-  if model == "ar" and len(x) >= 20 * columns + 200:
-    others, first = _regression(z, NOW, False)
-    past, second = _regression(z, _before(own, z), True, own if commands else 0)
-    fitted = fitted._replace(others=others, past=past, explained=np.stack([first, second]))
-  found = judged(unseen(fitted, z), samples, longest)
+  fitted = fitted._replace(step=np.sqrt((np.diff(z, axis=0) ** 2).mean(0)))
+  able = model == "ar" and len(x) >= 20 * columns + 200
+  fitted = _scaled(_weighed(fitted, z) if able else fitted, z, samples)
+  error = None
+  for _ in range(REFITS if absent(samples, longest).any() else 0):
+    z, error = filled(fitted, standard(fitted, x), samples)
+    fitted = _scaled(_weighed(fitted, z) if able else fitted, z, samples, error)
+  return fitted, judged(fitted, unseen(fitted, z, error), samples, error)
+
+
+def _weighed(model: Healthy, z: np.ndarray) -> Healthy:
+  """A model with the weights that z (N, C) gives."""
+  commands = len(model.mean) - model.watched
+  others, first = _regression(z, NOW, False)
+  past, second = _regression(z, _before(model.watched, z), True, model.watched if commands else 0)
+  return model._replace(others=others, past=past, explained=np.stack([first, second]))
+
+
+def _scaled(
+  model: Healthy, z: np.ndarray, samples: np.ndarray, error: np.ndarray | None = None
+) -> Healthy:
+  """A model with mean and deviation of the `unseen` residuals of z (N, C); with an error of what is
+  filled, relative to those it has.
+  """
+  if error is None:
+    model = model._replace(middle=0 * model.middle, scale=0 * model.scale + 1)
+  found = judged(model, unseen(model, z, error), samples, error)
   middle, scale = np.nanmean(found, 1), np.maximum(np.nanstd(found, 1), 1e-9)
-  fitted = fitted._replace(middle=middle, scale=scale)
-  return fitted, judged(unseen(fitted, z), samples, longest)
+  if error is not None:
+    middle, scale = model.middle + model.scale * middle, model.scale * scale
+  return model._replace(middle=middle, scale=scale)

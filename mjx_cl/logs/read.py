@@ -19,14 +19,17 @@ import pyarrow.parquet
 
 from mjx_cl.errors import FileError
 from mjx_cl.logs.clocks import (
+  EPOCHS,
   called_clock,
   epoch_seconds,
+  guessed,
   irregular,
   iso_seconds,
   never_falls,
-  of_seconds,
   throughout,
   told_by_name,
+  unit,
+  unitless,
 )
 from mjx_cl.logs.mcap_file import read_mcap
 
@@ -66,11 +69,12 @@ def read(path: pathlib.Path | str) -> Log:
   numbers may have a decimal comma, if most that have a fraction do: one sign for the whole file, a
   cell with the other is no number. A column with no more than STRAY of such cells has them missing
   and is noted, one with more is left out. A second row without a number above columns of numbers is
-  taken for units. A column `time` [s] or `step` tells when samples were taken and is not watched; a
-  column of seconds by another name (`time_s`, `seconds`) is taken as `time` if there is none and it
-  rises throughout. A first column without a name, among others, is called `index`. Where nothing
-  else tells times, a column of time stamps does: ISO 8601, or seconds, ms, us or ns since 1970;
-  gaps and repeated ones are noted.
+  taken for units. A column `time` or `step` tells when samples were taken and is not watched; a
+  clock whose name tells a unit (`time_ms`, `seconds`) is taken as `time` if there is none and it
+  rises throughout, at last one without (`t`, `timestamp`). Of a clock without a unit that follows
+  from how far it rises; what was guessed is noted. A first column without a name, among others, is
+  called `index`. Where nothing else tells times, a column of time stamps does: ISO 8601, or
+  seconds, ms, us or ns since 1970; gaps and repeated ones are noted.
   """
   with contextlib.suppress(OSError):  # whoever opens it says what is wrong
     mode = os.stat(path).st_mode
@@ -188,15 +192,15 @@ def _timed(
     if len(at) and not throughout(at):
       why = "".join(f"; {note}" for note in notes if f" column {name} " in note)
       raise FileError(f"{path}: column {name} must rise from row to row and have no gap{why}")
-  seconds = (
-    {name: x for name, x in columns.items() if of_seconds(labels[name])}
-    if "time" not in told
-    else {}
-  )
-  told |= dict(zip(["time"], filter(throughout, seconds.values())))
-  if seconds and "time" not in told and rows:
+  if "time" in told and rows:
+    name = next(n for n in clocks if told_by_name(n, labels[n]) == "time")
+    told["time"] = _in_seconds(name, told["time"], labels[name], notes)
+  units = {} if "time" in told else {n: u for n in columns if (u := unit(labels[n])) is not None}
+  rising = {n: columns[n] * u for n, u in units.items() if throughout(columns[n])}
+  told |= dict(zip(["time"], rising.values()))
+  if units and not rising and rows:
     notes.append(
-      f"{path}: column {next(iter(seconds))} tells no times, as it does not rise at every row"
+      f"{path}: column {next(iter(units))} tells no times, as it does not rise at every row"
     )
   if "time" not in told:
     for name in [n for n in columns if called_clock(labels[n])]:
@@ -208,10 +212,33 @@ def _timed(
       told.setdefault("time", at) if never_falls(at) else notes.append(
         f"{path}: column {name} tells no times, as it has gaps or falls"
       )
+  for name in [n for n in columns if unitless(labels[n]) and throughout(columns[n])]:
+    if "time" not in told and rows > 1:
+      if guessed(columns[name]):
+        told["time"] = _in_seconds(name, columns[name], labels[name], notes)
+      else:
+        notes.append(f"column {name} tells no times, as its unit is unknown: give --rate")
   clocks += tuple(stamps)
   if "time" in told:
     notes.extend(f"{path}: {text}" for text in irregular(told["time"]))
   return Log(columns, told.get("time"), told.get("step"), ignored, clocks, labels, tuple(notes))
+
+
+def _in_seconds(name: str, x: np.ndarray, label: str, notes: list[str]) -> np.ndarray:
+  """Times x of a clock without a unit in seconds, with a note where that was a guess."""
+  if x[0] >= min(EPOCHS) and (found := epoch_seconds(x)) is not None:
+    return found
+  if unit(label) is not None or len(x) < 2:
+    return x * (unit(label) or 1.0)
+  rise, own = float(np.median(np.diff(x))), guessed(x)
+  text = f"{rise:,.0f}" if rise >= 10 else f"{rise:.4g}"
+  word, size = own or ("seconds", 1.0)
+  if not (name.lower() == "time" and rise <= 1):
+    notes.append(
+      f"column {name} rises by {text} a row and is taken for {word} "
+      f"({1 / (rise * size):,.4g} Hz); if it is not, give --rate"
+    )
+  return x * size
 
 
 def _parquet(path: pathlib.Path | str) -> Log:

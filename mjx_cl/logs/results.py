@@ -24,7 +24,8 @@ class Detection(NamedTuple):
   """What was found; C is 1 in what a detector gives that watches all columns together.
 
   Attributes:
-    summary: what detect.json holds; of the charts also verdict, events, false_alarms, model and,
+    summary: what detect.json holds; of the charts also verdict, events, false_alarms, model,
+      silent (column: when it has no samples), unjudged (column: why nothing is said of it) and,
       where faults were put into the nominal log, inject.
     xs: float (T, C), the log as read.
     past: float (N, C), the nominal log as read.

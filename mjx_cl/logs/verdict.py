@@ -16,6 +16,8 @@ from mjx_cl.logs.charts import CHARTS, SPANS
 DOUBT = 0.01  # expected number of such events in a healthy log, above which one is not believed
 MOST = 4  # columns that an event names
 GAIN = 25.0  # squared deviations that a column has to explain to be named
+FACTOR = 1.2  # of a spread, below which it is not said to have changed
+SHIFT = 3.0  # healthy deviations of the longest average, above which a mean has moved
 SHARE = 0.1  # of what the first column explains, that each of the others has to
 ROWS = 50_000  # of a large log watched at a time
 LARGE = 10_000_000  # samples of all columns from which a log is watched so and kept in 16 bits
@@ -63,7 +65,7 @@ class Found(NamedTuple):
     scores: chart -> (T, W), of `joint` (T, 1).
     fired: chart -> bool, likewise: the score rises above its threshold.
     above: bool (T,), some score is.
-    known: bool (T,), the sample is judged.
+    known: bool (T, W), the sample is judged.
   """
 
   residuals: np.ndarray
@@ -79,12 +81,16 @@ def watch(own: Watch, xs: np.ndarray) -> Found:
 
 
 def _watch(own: Watch, xs: np.ndarray) -> Found:
-  z = healthy.standard(own.model, healthy.held(xs))
-  residuals = healthy.judged(healthy.residuals(own.model, z), xs, own.model.held)
+  z, error = healthy.filled(own.model, healthy.standard(own.model, healthy.held(xs)), xs)
+  residuals = healthy.residuals(own.model, z, error=error)
+  residuals = healthy.judged(own.model, residuals, xs, error)
   scores = charts.scores(residuals, own.scales)
   fired = {name: charts.alarms(x, own.thresholds[name]) for name, x in scores.items()}
   above = [(x > own.thresholds[name]).any(1) for name, x in scores.items()]
-  known = healthy.known(xs, own.model.held)
+  known = np.isfinite(residuals).any(0)
+  known &= ~healthy.absent(xs, own.model.held)[:, : own.model.watched]
+  settling = slice(0, max(*healthy.NOW, *healthy.BEFORE))
+  known[settling] = healthy.known(xs[settling], own.model.held)[:, None]
   return Found(residuals, scores, fired, np.any(above, 0), known)
 
 
@@ -93,6 +99,7 @@ def _in_parts(own: Watch, xs: np.ndarray, rows: int = ROWS, kind: Any = np.float
   difference; residuals and scores are kept as `kind`.
   """
   warm = WARM * max(SPANS[-1], own.model.slow if own.model.drifts.any() else 0)
+  ahead = int(own.model.held.max()) + max(*healthy.NOW, *healthy.BEFORE) + 1  # ends of stretches
   total, columns = len(xs), own.model.watched
   size = {name: 1 if name == "joint" else columns for name in CHARTS}
   found = Found(
@@ -100,12 +107,12 @@ def _in_parts(own: Watch, xs: np.ndarray, rows: int = ROWS, kind: Any = np.float
     {name: np.empty((total, n), kind) for name, n in size.items()},
     {name: np.empty((total, n), bool) for name, n in size.items()},
     np.empty(total, bool),
-    np.empty(total, bool),
+    np.empty((total, columns), bool),
   )
   for begin in range(0, total, rows):
     from_ = max(0, begin - warm)
-    part = _watch(own, np.ascontiguousarray(xs[from_ : begin + rows], np.float64))
-    at, new = slice(begin, begin + rows), slice(begin - from_, None)
+    part = _watch(own, np.ascontiguousarray(xs[from_ : begin + rows + ahead], np.float64))
+    at, new = slice(begin, begin + rows), slice(begin - from_, begin - from_ + rows)
     found.residuals[:, at] = part.residuals[:, new]
     for name in CHARTS:
       found.scores[name][at] = np.minimum(part.scores[name][new], TOP)
@@ -191,8 +198,8 @@ def _moved(own: Watch, shift: np.ndarray) -> list[tuple[int, float]]:
 def _where(
   own: Watch, found: Found, begin: int, end: int, names: list[str]
 ) -> list[dict[str, Any]]:
-  """Columns that an event is in: those whose mean moved, else those whose spread did, since the
-  former changes the spread of what is predicted from it.
+  """Columns that an event is in: those whose mean moved, else those whose spread was noticed, since
+  the former changes the spread of what is predicted from it.
   """
   columns = []
   shift = np.nan_to_num(found.residuals[0, begin:end]).mean(0)
@@ -207,10 +214,27 @@ def _where(
   for c in np.argsort(-excess)[:MOST]:
     if excess[c] < 1 or excess[c] < 0.5 * excess.max():
       break
-    before, after = (np.nanstd(x[:, c]) for x in (own.unseen[0], found.residuals[0, begin:end]))
-    how = {"column": names[c], "how": "spread", "by": float(after / before), "deviations": None}
-    columns.append(how)
-  return columns
+    columns.append({"column": names[c]} | _how(own, found, int(c), slice(begin, end)))
+  clear = [column for column in columns if column["how"] != "course"]
+  return clear or columns[:1]
+
+
+def _how(own: Watch, found: Found, c: int, within: slice) -> dict[str, Any]:
+  """What happened to a column whose spread was noticed: a factor of what others or its past do not
+  foretell, or else a shift, or else another course in time.
+  """
+  factors, shift = [1.0, 1.0], 0.0
+  for k, (before, now) in enumerate(zip(own.unseen[:, :, c], found.residuals[:, within, c])):
+    if np.isfinite(now).sum() > 1:
+      factors[k] = float(np.nanstd(now.astype(float)) / np.nanstd(before))
+      shift = float(np.nanmean(now.astype(float))) if k == 0 else shift
+  clear = [not 1 / FACTOR < factor < FACTOR for factor in factors]
+  if not clear[0] and abs(shift) > SHIFT * own.scales.level[-1, c]:
+    by = shift * float(own.model.scale[0, c])
+    return {"how": "mean", "by": by * float(own.model.spread[c]), "deviations": by}
+  if any(clear):
+    return {"how": "spread", "by": factors[clear.index(True)], "deviations": None}
+  return {"how": "course", "by": None, "deviations": None}
 
 
 def judge(own: Watch, found: Found, names: list[str], refractory: int) -> list[dict[str, Any]]:
@@ -257,22 +281,36 @@ class Times(NamedTuple):
   Attributes:
     seconds: (T,) since the first sample, or None.
     rate: samples per second, or None.
+    places: see gaps; None where no row is missing.
   """
 
   seconds: np.ndarray | None
   rate: float | None
+  places: np.ndarray | None = None
 
   def samples(self, seconds: float | None, otherwise: int) -> int:
     """A time in samples; of a log without a clock it is given in samples."""
     return otherwise if seconds is None else max(1, round(seconds * (self.rate or 1.0)))
 
 
-def summary(
-  own: Watch, found: Found, names: list[str], times: Times, arl0: float, refractory: int
-) -> dict[str, Any]:
-  """What detect.json holds of it: verdict, events, false_alarms, model."""
-  events = judge(own, found, names, refractory)
+def together(events: list[dict], more: list[dict], refractory: int) -> list[dict]:
+  """Events and those that another model gives, in order of time, less those of the latter that lie
+  within the refractory time of a believed one.
+  """
+  near = lambda one, other: (
+    other["begin"] - refractory <= one["end"] and one["begin"] <= other["end"] + refractory
+  )
+  sure = [event for event in events if event["believed"]]
+  more = [event for event in more if not any(near(event, other) for other in sure)]
+  return sorted([*events, *more], key=lambda event: event["begin"])
+
+
+def summary(own: Watch, events: list[dict], names: list[str], times: Times, arl0: float) -> dict:
+  """What detect.json holds of events of `judge`: verdict, events, false_alarms, model."""
   for event in events:
+    if times.places is not None:
+      for what in ("begin", "first_alarm", "end"):
+        event[what] = int(np.searchsorted(times.places, event[what]))
     known = times.seconds is not None
     event["begin_s"] = float(times.seconds[event["begin"]]) if known else None  # type: ignore[index]
   believed = [event for event in events if event["believed"]]
@@ -287,7 +325,6 @@ def summary(
       ),
     },
     "events": events,
-    "refractory": refractory,
     "false_alarms": {"counted": counted, "expected": wanted},
     "model": {
       "explained": dict(zip(names, np.round(own.model.explained[0], 3).tolist())),

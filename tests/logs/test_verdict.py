@@ -303,18 +303,16 @@ def test_a_long_nominal_log_is_used_in_five_stretches(monkeypatch, tmp_path):
 
 
 def test_missing_samples_are_neither_high_nor_low(watched):
-  """A stretch is not judged, in no column, until the longest lag has passed it; a few here and there
-  are held.
-  """
+  """What is missing is not judged, nor what rests on it, until the longest lag has passed it."""
   _, own = watched
   x = gait(3000, 7)
   x[1000:1500, 0] = np.nan
   x[2000:2300:10, 2] = np.nan
   found = verdict.watch(own, x)
-  unknown = np.isnan(found.residuals).all((0, 2))
-  assert np.flatnonzero(unknown).tolist() == [*range(16), *range(1003, 1516)]
-  one = found.residuals[:, :, 2]
-  np.testing.assert_array_equal(one[:, 2000:2300:10], one[:, 1999:2299:10])
+  assert np.flatnonzero(~found.known[:, 0]).tolist() == [*range(1000, 1500)]
+  assert np.isnan(found.residuals[1, 1000:1516, 0]).all()
+  assert np.flatnonzero(~found.known[1516:, 2]).tolist() == [*range(2000 - 1516, 2300 - 1516, 10)]
+  assert found.known[:, 5:].all()  # battery and heat rest on others
   assert all(np.isfinite(score).all() for score in found.scores.values())
   assert not [e for e in verdict.judge(own, found, NAMES, 500) if e["believed"]]
 
@@ -496,6 +494,61 @@ def test_time_stamps_tell_times(tmp_path):
     log = read(tmp_path / "epoch.csv")
     np.testing.assert_allclose(log.time, np.arange(100) / 4, atol=1e-6, err_msg=unit)
     assert list(log.columns) == ["x"]
+
+
+def clocked(path, name, at):
+  path.write_text(f"{name},x\n" + "".join(f"{t:.20g},{k % 7}\n" for k, t in enumerate(at)))
+  return path
+
+
+@pytest.mark.parametrize(
+  "name, unit, note",
+  (
+    ("time_ms", 1e-3, ""),
+    ("t [us]", 1e-6, ""),
+    ("Micros", 1e-6, ""),
+    ("timestamp_ns", 1e-9, ""),
+    ("time", 1.0, ""),
+    ("time", 1e-6, "rises by 20,000 a row and is taken for microseconds (50 Hz)"),
+    ("timestamp", 1e-9, "rises by 20,000,000 a row and is taken for nanoseconds (50 Hz)"),
+    ("t", 1.0, "rises by 0.02 a row and is taken for seconds (50 Hz)"),
+    ("time", 1e-3, "rises by 20 a row and is taken for seconds (0.05 Hz)"),
+    ("t", 1e-3, "tells no times, as its unit is unknown: give --rate"),
+    ("tick", 1e-3, ""),
+  ),
+)
+def test_a_clock_in_another_unit(tmp_path, name, unit, note):
+  """By its name, else by its size, with a note of what was guessed."""
+  log = read(clocked(tmp_path / "log.csv", name, np.round(np.arange(100) * 0.02 / unit, 6)))
+  guess = 1e3 if note.endswith("(0.05 Hz)") else 1.0
+  if "unknown" in note or name == "tick":
+    assert log.time is None
+  else:
+    np.testing.assert_allclose(log.time, np.arange(100) * 0.02 * guess, atol=1e-9)
+  assert len(log.notes) == bool(note) and all(note in one and "--rate" in one for one in log.notes)
+
+
+def test_a_clock_since_1970_may_be_called_time(tmp_path):
+  """As `rostopic echo -p` writes it."""
+  at = 1_700_000_000_000_000_000 + np.arange(100) * 20_000_000
+  log = read(clocked(tmp_path / "log.csv", "%time", at))
+  np.testing.assert_allclose(log.time, np.arange(100) * 0.02, atol=1e-6)
+  assert log.notes == () and list(log.columns) == ["x"]
+
+
+def test_logs_of_two_rates_are_not_compared(logs, tmp_path, mjx):
+  x = gait(4000, 5)[::2]
+  rows = np.c_[np.arange(2000) / 25, x]
+  head = ",".join(["time", *NAMES])
+  np.savetxt(tmp_path / "half.csv", rows, "%.7g", ",", header=head, comments="")
+  code, out, err = mjx(tmp_path / "half.csv", "--nominal", logs[2])
+  assert code == 1 and not out and err.count("\n") == 1
+  assert "half.csv has 25 rows a second and" in err and "nominal.csv 50: keep one row of 2" in err
+  assert mjx(tmp_path / "half.csv", "--nominal", logs[2], "--rate", 25)[0] == 0
+  late = np.random.default_rng(0).uniform(0, 0.012, 9000)
+  rows = np.c_[np.arange(9000) / 50 + late, gait(9000, 1)]
+  np.savetxt(tmp_path / "late.csv", rows, "%.7g", ",", header=head, comments="")
+  assert mjx(tmp_path / "late.csv", "--nominal", logs[2])[0] == 0
 
 
 def test_gaps_and_repeated_times_are_named(tmp_path):
