@@ -271,11 +271,11 @@ def test_the_rule_reads_nothing_of_a_chunk_that_a_method_hides():
     act=lambda chunk, view: methods.average(chunk + 1, view),
     hides=lambda chunk: chunk % 3 == 1,
   )
-  ARMS.members["own"] = lambda: Arm("", ALARM, RULE, method=counts)
+  ARMS.members["hiding"] = lambda: Arm("", ALARM, RULE, method=counts)
   try:
-    states, digests = live(three("own"))
+    states, digests = live(three("hiding"))
   finally:
-    del ARMS.members["own"]
+    del ARMS.members["hiding"]
   phase = states[-1].phase
   for g, want in ((0, True), (1, False)):
     lived = slice(phase.count[g])
