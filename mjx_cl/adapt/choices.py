@@ -84,7 +84,8 @@ def choices(
     steps: of the run.
     onsets: true onsets of each robot, unless its arm spares it, as control steps, FOREVER: not
       known yet; None: no faults.
-    stops: seed -> control steps after which an arm that is told its oracle stop ends.
+    stops: seed -> age of the snapshot [control steps] whose weights an arm that is told its oracle
+      stop ends with.
 
   Raises:
     UserError where an arm's schedule does not fit into the run.
@@ -102,7 +103,8 @@ def choices(
   own = methods.used(tuple(arm for arm, _ in labels))
   flags = lambda get: jnp.asarray([get(arm) for arm in arms], bool)
   limits = [
-    min(arm.end.limit(config), (stops or {})[seed]) if arm.end.told else arm.end.limit(config)
+    # the chunk in which an arm ends is not learnt from: a step more keeps the snapshot's weights
+    min(arm.end.limit(config), (stops or {})[seed] + 1) if arm.end.told else arm.end.limit(config)
     for arm, (_, seed) in zip(arms, labels)
   ]
   return Choices(

@@ -15,7 +15,7 @@ from mjx_cl.cli.output import clock
 # columns of a run's table, by heading; below each number its 95 % interval
 COLUMNS: dict[str, Callable[[dict], str]] = {
   "streams": lambda arm: str(arm["seeds"]),
-  "affected": lambda arm: str(arm["affected"]) if arm["affected_ci"] else "-",  # -: not measured
+  "affected": lambda arm: "-" if arm.get("affected_ci", 0) is None else str(arm["affected"]),
   "alarmed": lambda arm: str(arm["alarms"]),
   "false\nalarms": lambda arm: str(arm["false_alarm_streams"]),
   "latency\n[steps]": lambda arm: _cell(arm, "latency_median_steps", ".0f"),

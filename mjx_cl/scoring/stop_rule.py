@@ -287,8 +287,8 @@ def told(config: RunConfig) -> dict[int, int]:
   there; {} where none does.
 
   The run in `config.stops` lived the same lives with weights that never stopped, and its snapshots
-  say which were the first that were good enough (`oracle`). The arm ends a step later, since the
-  chunk in which it ends is not learnt from: so it keeps the weights of the snapshot.
+  say which were the first that were good enough (`oracle`). A stop at 0, where the weights of
+  before were already, is one of a single step: a robot that adapts does so for a chunk at least.
 
   Args:
     config: RunConfig.
@@ -319,13 +319,13 @@ def told(config: RunConfig) -> dict[int, int]:
       f"stops: {folder} has no snapshots.parquet; run arm oracle-budget with --snapshots 1000 there"
     )
   points: dict[int, list] = {}
-  endless = [s for s in read(folder, "snapshots") if s["arm"] == "oracle-budget"]
+  endless = [s for s in read(folder, "snapshots") if s.get("arm") == "oracle-budget"]
   for s in endless:
     points.setdefault(s["seed"], []).append((s["since_start"], s["reward_mean"]))
   out = {}
   for seed, own in points.items():
     age, reward = zip(*sorted(own))
-    out[seed] = int(age[oracle(age, reward)]) + 1
+    out[seed] = max(1, int(age[oracle(age, reward)]))
   seeds = range(config.first_seed, config.first_seed + config.seeds)
   missing = [s for s in seeds if s not in out]
   if missing:

@@ -131,10 +131,10 @@ def test_choices_of_all_arms():
     "randomised": FOREVER,
     "periodic": 30,
     "random": 60,
-    "oracle-stop": 333,
+    "oracle-stop": 334,
   }
   late = choices([("oracle-stop", 5), ("oracle-stop", 6)], c, 1500, None, {5: 778, 6: 1})
-  assert late.limit.tolist() == [777, 1]  # no later than the budget
+  assert late.limit.tolist() == [777, 2]  # no later than the budget
   assert [name for name, arm in ARMS.items() if not arm.breaks] == ["no-fault"]
 
 
@@ -798,7 +798,12 @@ def lived(tiny, tmp_path_factory):
   tables.write_json(stops / "config.json", {"env": "walker", "onset": FAULT, "adapt": {}})
   tables.write_table(
     stops / "snapshots.parquet",
-    {"seed": [SEED] * 3, "since_start": [20, 148, 212], "reward_mean": [0.1, 0.99, 1.0]},
+    {
+      "arm": ["oracle-budget"] * 3,
+      "seed": [SEED] * 3,
+      "since_start": [20, 148, 212],
+      "reward_mean": [0.1, 0.99, 1.0],
+    },
   )
   for path, seed in ((agent, 0), (agent.with_name("agent-randomised"), 1)):
     agents.save(path, jax.jit(tiny.init)(jax.random.key(seed)), card | {"seed": seed})
@@ -877,8 +882,8 @@ def test_events_say_what_started_and_ended_each_arm(lived):
     "oracle-stop": [over],
   }
   assert [s for s, _ in events(out, "oracle-stop", "stop")] == [
-    447
-  ]  # the chunk that ends 148 steps after step 300
+    511
+  ]  # the chunk after the one that ends 148 steps after step 300, whose weights stay
   outcome = dict(zip(*(columns(out, "runs")[k] for k in ("arm", "outcome"))))
   assert {
     name: outcome[name]

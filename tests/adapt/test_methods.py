@@ -286,12 +286,12 @@ def test_the_rule_reads_nothing_of_a_chunk_that_a_method_hides():
 
 
 def test_who_is_told_its_stop_keeps_the_weights_of_that_snapshot(same):
-  """A snapshot of an age holds what that chunk has learnt; the arm is told a step more."""
+  """A snapshot of an age holds what that chunk has learnt."""
   arms, onset, chunk = ("oracle-budget", "oracle-stop"), 37, 7
   age = chunk * STEPS - onset
   loop = loop_of(arms)
   labels = [(arm, 0) for arm in arms]
-  chosen = choices(labels, loop.config, STEPS * CHUNKS, [(onset,)] * 2, {0: age + 1})
+  chosen = choices(labels, loop.config, STEPS * CHUNKS, [(onset,)] * 2, {0: age})
   train = jax.jit(AGENT.init)(jax.random.key(0))
   state = loop.init(train._replace(updates=jnp.int32(2000)), 2, chosen.methods.all)
   keys, snapshots = jax.vmap(jax.random.key)(jnp.zeros(2, int)), []
