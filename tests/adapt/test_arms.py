@@ -993,7 +993,7 @@ def test_the_ledger_of_each_arm(lived):
       and row["updates"] >= max(trace["updates"])
       and row["updates"] % 1 == 0
     )
-    assert (row["updates"] > 0) == (name not in ("none", "randomised"))
+    assert (row["updates"] > 0) == (name not in ("none", "randomised", "still"))
     for key in ("updates", "adapted_steps", "terminations", "return_lost_healthy"):
       assert (
         arm[f"{key}_mean"] == row[key] and arm[f"{key}_mean_ci"] is None
