@@ -1,6 +1,7 @@
 """What the registries hold, name by name."""
 
 import inspect
+import itertools
 from collections.abc import Callable, Iterable, Mapping
 
 from mjx_cl import detectors, envs, faults
@@ -17,6 +18,16 @@ def first(member: object) -> str:
   return " ".join(inspect.cleandoc(str(member.__doc__ or "")).split("\n\n")[0].split())
 
 
+def shortened(names: Iterable[str]) -> str:
+  """Names in a row; of x_00, x_01, ... the first and the last."""
+  out = []
+  for stem, own in itertools.groupby(names, lambda name: name.rstrip("0123456789")):
+    same = list(own)
+    numbered = len(same) > 2 and stem != same[0]
+    out += [f"{same[0]} to {same[-1]}"] if numbered else same
+  return ", ".join(out)
+
+
 def targets() -> dict[str, str]:
   """Robot -> the faults that it can have, with what they can hit, those of the same targets
   together.
@@ -26,7 +37,7 @@ def targets() -> dict[str, str]:
     same: dict[tuple[str, ...], list[str]] = {}
     for name, fault in faults.available(envs.make(robot)).items():
       same.setdefault(fault.targets, []).append(name)
-    out[robot] = "; ".join(f"{', '.join(own)}: {', '.join(hit)}" for hit, own in same.items())
+    out[robot] = "; ".join(f"{', '.join(own)}: {shortened(hit)}" for hit, own in same.items())
   return out
 
 

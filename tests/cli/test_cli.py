@@ -199,6 +199,7 @@ def test_list(mjx):
   )  # each with a word about it
   knees = next(x for x in tables["targets"]["walker"].split("; ") if "gear" in x)
   assert "right_knee" in knees.partition(": ")[2] and "steering" not in knees
+  assert "lidar_00 to lidar_63," in tables["targets"]["car"]
   assert json.loads(mjx("list", "faults", "--json")[1]) == {"faults": tables["faults"]}
   text = mjx("list")[1]
   assert all(name in text for table in tables.values() for name in table)
