@@ -25,7 +25,6 @@ def do_compare(args: Compare) -> None:
     require(out.suffix == ".png", f"--out is a picture, .png; got {args.out}")
     require(not out.is_dir(), f"--out {out} is a folder")
     require(args.overwrite or not out.exists(), f"{out} is there; --overwrite replaces it")
-  require(args.change >= 0, f"--change must be at least 0; got {args.change}")
   found = versus.variants(list(args.runs), args.change)
   if other := versus.unlike(found):
     say(f"note: these runs differ in {', '.join(other)}")

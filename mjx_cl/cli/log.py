@@ -43,15 +43,14 @@ def do_detect(args: Detect) -> None:
       show_verdict(result.summary)
     else:
       show_detections(result.summary["detectors"])
-  if unjudged := result.summary.get("unjudged"):
-    reasons: dict[str, list[str]] = {}
-    for name, why in unjudged.items():
-      reasons.setdefault(why, []).append(name)
-    text = "; ".join(f"{', '.join(names)} ({why})" for why, names in reasons.items())
-    unjudged = f"could not be judged: {text}"
+  reasons: dict[str, list[str]] = {}
+  for name, why in result.summary.get("unjudged", {}).items():
+    reasons.setdefault(why, []).append(name)
+  columns = "; ".join(f"{', '.join(names)} ({why})" for why, names in reasons.items())
+  text = f"could not be judged: {columns}"
   if args.fail_on_change and result.summary["verdict"]["changed"]:
-    if unjudged:
-      say(f"note: {unjudged}")
+    if columns:
+      say(f"note: {text}")
     raise ChangeError("the log has changed")
-  if unjudged:
-    raise FileError(unjudged)
+  if columns:
+    raise FileError(text)

@@ -64,9 +64,9 @@ def variants(words: list[str], change: int = 0) -> list[Variant]:
     for name in chosen:
       if name not in arms:
         raise UserError(f"{home} has no arm {name!r}; name one as FOLDER:ARM, of {', '.join(arms)}")
+      last = max(int(r["change"]) for r in rows)
+      require(0 <= change <= last, f"{home}: --change must lie in 0..{last}; got {change}")
       own = {int(r["seed"]): r for r in rows if r["arm"] == name and r["change"] == change}
-      number = 1 + max(int(r["change"]) for r in rows)
-      require(own, f"{home}: change must be below {number}, as its robots change so often")
       label = name if len(words) == 1 else f"{home}:{name}"
       found.append(Variant(label, tables.read_json(home / "config.json"), own))
   if len(found) < 2:

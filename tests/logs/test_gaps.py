@@ -6,9 +6,9 @@ import json
 
 import numpy as np
 import pytest
+from test_detect import mjx  # noqa: F401  a fixture
 from test_verdict import gait, save
 
-from mjx_cl.cli import app
 from mjx_cl.logs import charts, detect, gaps, healthy, inject, verdict
 
 NAMES = ["hip", "knee", "current"]
@@ -34,17 +34,6 @@ def own():
 @pytest.fixture(scope="module")
 def nominal(tmp_path_factory):
   return save(tmp_path_factory.mktemp("gaps") / "healthy.csv", leg(6000, 0), NAMES)
-
-
-@pytest.fixture
-def mjx(capsys):
-  """mjx(*argv): (exit code, standard output, standard error) of `mjx-cl detect`."""
-
-  def call(*argv):
-    capsys.readouterr()
-    return app.main(["detect", *map(str, argv)]), *capsys.readouterr()
-
-  return call
 
 
 def cells(share):
@@ -153,7 +142,7 @@ def test_a_long_stretch_without_any_sample_begins_anew(own):
 # ---- rows that the clock tells of ----------------------------------------------------------------
 
 
-def test_rows_that_are_missing_are_put_back(tmp_path, nominal, mjx):
+def test_rows_that_are_missing_are_put_back(tmp_path, nominal, mjx):  # noqa: F811
   x, t = leg(2000, 1001, 1000), np.arange(2000) / 50
   keep = np.ones(2000, bool)
   for at in range(102, 1900, 180):
@@ -184,7 +173,7 @@ def test_what_is_no_missing_row():
 # ---- a column that is silent ---------------------------------------------------------------------
 
 
-def test_a_silent_column_is_named_and_the_others_are_judged_without_it(tmp_path, nominal, mjx):
+def test_a_silent_column_is_named_and_the_others_are_judged_without_it(tmp_path, nominal, mjx):  # noqa: F811
   x = leg(3000, 1001)
   x[1400:, 0] = np.nan
   code, out, err = mjx(save(tmp_path / "ends.csv", x, NAMES), "--nominal", nominal)
@@ -203,7 +192,7 @@ def test_a_silent_column_is_named_and_the_others_are_judged_without_it(tmp_path,
   assert "hip has no samples from 28.00 s to 32.00 s; there the other columns" in err
 
 
-def test_what_is_not_judged_is_not_called_unchanged(tmp_path, nominal, mjx):
+def test_what_is_not_judged_is_not_called_unchanged(tmp_path, nominal, mjx):  # noqa: F811
   x = leg(2000, 1001)
   x[np.arange(2000) % 5 != 0, 0] = np.nan
   code, out, err = mjx(save(tmp_path / "rare.csv", x, NAMES), "--nominal", nominal)
@@ -236,7 +225,7 @@ def test_no_factor_of_one_is_named(tmp_path, nominal):
   assert not [c for c in said["columns"] if c["how"] == "spread" and 0.84 < c["by"] < 1.19]
 
 
-def test_a_change_can_be_a_failure(tmp_path, nominal, mjx):
+def test_a_change_can_be_a_failure(tmp_path, nominal, mjx):  # noqa: F811
   fine = save(tmp_path / "fine.csv", leg(2000, 1001), NAMES)
   wrong = save(tmp_path / "wrong.csv", leg(2000, 1001, 1000), NAMES)
   assert mjx(fine, "--nominal", nominal, "--fail-on-change")[0] == 0

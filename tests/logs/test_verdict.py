@@ -8,9 +8,8 @@ import pyarrow
 import pyarrow.parquet
 import pytest
 from scipy import stats
-from test_detect import example
+from test_detect import example, mjx  # noqa: F401  a fixture
 
-from mjx_cl.cli import app
 from mjx_cl.errors import FileError, UserError
 from mjx_cl.logs import charts, detect, healthy, inject, mcap_file, verdict
 from mjx_cl.logs import read as reading
@@ -19,17 +18,6 @@ from mjx_cl.logs.read import read
 
 HZ = 50
 NAMES = ["hip_encoder", "knee_encoder", "hip_current", "knee_current", "pitch", "battery", "heat"]
-
-
-@pytest.fixture
-def mjx(capsys):
-  """mjx(*argv): (exit code, standard output, standard error) of `mjx-cl detect`."""
-
-  def call(*argv):
-    capsys.readouterr()
-    return app.main(["detect", *map(str, argv)]), *capsys.readouterr()
-
-  return call
 
 
 def smooth(rng, samples, span):
@@ -138,7 +126,7 @@ def driven(samples, seed, about, since=None):
   return np.stack([joint + off + noise(), motor + off, told], 1)
 
 
-def test_commands_explain_and_are_not_watched(tmp_path, mjx):
+def test_commands_explain_and_are_not_watched(tmp_path, mjx):  # noqa: F811
   """A robot told to stand elsewhere has not changed; one that stands other than told has."""
   columns = ["joint", "motor", "set_point"]
   past = save(tmp_path / "past.csv", driven(12_000, 0, 0), columns)
@@ -182,7 +170,7 @@ def test_a_command_predicts_at_once_and_changes_nothing_else():
     (["--command", "pitch", "--detector", "cusum"], "leave out --detector and --model none"),
   ),
 )
-def test_a_command_that_cannot_be_one_is_one_line(logs, mjx, more, words):
+def test_a_command_that_cannot_be_one_is_one_line(logs, mjx, more, words):  # noqa: F811
   code, out, err = mjx(logs[0], "--nominal", logs[2], *more)
   assert code == 2 and words in err and err.count("\n") == 1 and not out
 
@@ -434,7 +422,7 @@ def test_the_smallest_fault_that_is_seen(watched):
 # ---- the command ---------------------------------------------------------------------------------
 
 
-def test_the_command_answers_three_questions(mjx, logs, tmp_path):
+def test_the_command_answers_three_questions(mjx, logs, tmp_path):  # noqa: F811
   out = tmp_path / "out"
   few = "--column", *NAMES[:5]
   argv = logs[0], "--nominal", logs[2], *few, "--inject", 2, "--out", out
@@ -461,13 +449,13 @@ def test_the_command_answers_three_questions(mjx, logs, tmp_path):
     (("--refractory", "-1"), ("refractory",)),
   ],
 )
-def test_wrong_settings_are_one_line(mjx, logs, more, words):
+def test_wrong_settings_are_one_line(mjx, logs, more, words):  # noqa: F811
   code, out, err = mjx(logs[0], "--nominal", logs[2], *more)
   assert code == 2 and out == "" and err.startswith("mjx-cl: ") and err.count("\n") == 1
   assert all(word in err for word in words)
 
 
-def test_the_gait_of_the_example(mjx, tmp_path, monkeypatch):
+def test_the_gait_of_the_example(mjx, tmp_path, monkeypatch):  # noqa: F811
   monkeypatch.chdir(tmp_path)
   exec(compile(example("log.py"), "log.py", "exec"), {})
   code, text, err = mjx("today.csv", "--nominal", "healthy.csv", "--out", "detected")
@@ -536,7 +524,7 @@ def test_a_clock_since_1970_may_be_called_time(tmp_path):
   assert log.notes == () and list(log.columns) == ["x"]
 
 
-def test_logs_of_two_rates_are_not_compared(logs, tmp_path, mjx):
+def test_logs_of_two_rates_are_not_compared(logs, tmp_path, mjx):  # noqa: F811
   x = gait(4000, 5)[::2]
   rows = np.c_[np.arange(2000) / 25, x]
   head = ",".join(["time", *NAMES])

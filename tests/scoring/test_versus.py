@@ -75,8 +75,9 @@ def test_a_robot_that_changes_twice_is_one_stream(tmp_path, mjx):
     [first, other] = json.loads(out)
     assert code == 0 and first["streams"] == other["pairs"] == 2
     assert first["iqm"] == pytest.approx(np.mean(want))
-  code, _, err = mjx(run, "--change", 2)
-  assert code == 2 and "change must be below 2" in err and err.count("\n") == 1
+  for wrong in (2, -1):
+    code, _, err = mjx(run, "--change", wrong)
+    assert code == 2 and "--change must lie in 0..1" in err and err.count("\n") == 1
 
 
 def test_the_default_agent_named_is_the_default_agent(tmp_path, mjx):
