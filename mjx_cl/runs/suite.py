@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 from mjx_cl.adapt.arms import ARMS
 from mjx_cl.config import AdaptConfig, RunConfig, field_kinds, replace
-from mjx_cl.errors import UserError, choose, require
+from mjx_cl.errors import UserError, require
 from mjx_cl.io import folders, tables
 from mjx_cl.runs import merge, settings
 
@@ -180,12 +180,6 @@ def config(where: str, values: dict) -> RunConfig:
   Raises:
     UserError: for an unknown setting or a value that RunConfig refuses.
   """
-  known = {f.name for f in dataclasses.fields(RunConfig)}
-  for name in sorted(set(values) - known):
-    try:
-      choose("setting", name, dict.fromkeys(known))
-    except UserError as e:
-      raise UserError(f"{where}: {e}") from None
   require("env" in values, f"{where}: it needs an env")
   arms, adapt = values.get("arms", RunConfig.arms), values.get("adapt", {})
   require(
@@ -196,7 +190,7 @@ def config(where: str, values: dict) -> RunConfig:
   field_kinds(where, AdaptConfig, adapt, "adapt.")
   try:
     whole = values | {"arms": tuple(arms), "adapt": replace(AdaptConfig(), **adapt)}
-    return settings.check(RunConfig(**whole))
+    return settings.check(replace(RunConfig(values["env"]), **whole))
   except UserError as e:
     raise UserError(f"{where}: {e}") from None
   except TypeError as e:
