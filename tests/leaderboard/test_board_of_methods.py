@@ -1,5 +1,6 @@
 """The board of methods: what it reads and refuses, and lives of one's own beside the published."""
 
+import collections
 import dataclasses
 import json
 import pathlib
@@ -237,19 +238,28 @@ def test_a_setting_without_none_and_broken_files_are_said(tmp_path):
     methods.of_folder(folder)
 
 
+def _seeds(lives: list[dict], parts: dict) -> list[tuple[RunConfig, list[int]]]:
+  rows = collections.defaultdict(list)
+  for x in lives:
+    rows[x["setting"], x["agent"], x["arm"]].append(x["seed"])
+  return [(parts[setting], sorted(seeds)) for (setting, *_), seeds in rows.items()]
+
+
 def test_lives_that_ship_are_of_the_suite_that_ships():
   lives = methods.shipped()
   parts = {part.name: part.config for part in suite.suite(methods.SUITE).parts}
   assert lives and {x["setting"] for x in lives} <= set(parts)
   for x in lives:
     config = parts[x["setting"]]
-    assert x["robot"] == config.env and x["seed"] < config.seeds
+    assert x["robot"] == config.env
     lived = json.loads(x["settings"])
     if x["agent"] != (config.agent or own_agent(config.env)):  # of another agent as hard
       lived["severity"] = config.severity
     lived = methods.settings(lived)  # settings that came since: their defaults
     assert lived == methods.settings(dataclasses.asdict(config)), x["setting"]
     assert np.isfinite([x["return_lost"], x["reward_pre"]]).all()
+  for config, seeds in _seeds(lives, parts):  # from 0 on without a gap, the suite's or more
+    assert seeds == list(range(max(config.seeds, len(seeds)))), (config.env, seeds)
   methods.whole(lives)
 
 
