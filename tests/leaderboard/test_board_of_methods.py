@@ -241,7 +241,7 @@ def test_a_setting_without_none_and_broken_files_are_said(tmp_path):
 def _seeds(lives: list[dict], parts: dict) -> list[tuple[RunConfig, list[int]]]:
   rows = collections.defaultdict(list)
   for x in lives:
-    rows[x["setting"], x["agent"], x["arm"]].append(x["seed"])
+    rows[x["setting"], x["agent"], x["method"]].append(x["seed"])
   return [(parts[setting], sorted(seeds)) for (setting, *_), seeds in rows.items()]
 
 
