@@ -108,7 +108,26 @@ def parse(argv: list[str] | None) -> Any:
     choose("command", argv[0], {kind.__name__.lower(): kind for kind in COMMANDS})
   about = "Robots that notice a fault, adapt to it and know when they are done."
   command = read(Command, argv, prog="mjx-cl", args=argv or ["--help"], description=about)
+  check_lists(command, argv)
   return quickly(command, argv[1:]) if isinstance(command, Run) and command.quick else command
+
+
+def check_lists(command: Any, argv: list[str]) -> None:
+  """Refuses a flag of several values that is given twice, of which the last alone would count, or
+  without any, as with a shell's variable that is not set.
+  """
+  several = {f.name for f in dataclasses.fields(command) if isinstance(f.default, tuple)}
+  seen: set[str] = set()
+  for k, word in enumerate(argv):
+    flag, given, _ = word.partition("=")
+    name = flag[2:].replace("-", "_")
+    if not flag.startswith("--") or not {name, f"{name}s"} & several:
+      continue
+    if flag in seen:
+      raise UserError(f"{flag} is there twice; give it once, with all its values behind it")
+    seen.add(flag)
+    if not given and (argv[k + 1 :] or ["--"])[0].startswith("--"):
+      raise UserError(f"{flag} got no value; leave it out for the default")
 
 
 def quickly(command: Run, argv: list[str]) -> Run:
@@ -116,11 +135,14 @@ def quickly(command: Run, argv: list[str]) -> Run:
   own comes without target and severity of quick's.
   """
   kind = Annotated[Run, tyro.conf.PositionalRequiredArgs]
-  defaults = quick.defaults(command.env)
+  defaults = {"fault": Run.fault} | quick.defaults(command.env)
+  several = {f.name for f in dataclasses.fields(Run) if isinstance(f.default, tuple)}
+  for name in several & set(defaults):
+    defaults[name] = defaults[name] if isinstance(defaults[name], tuple) else (defaults[name],)
   for left_out in ((), quick.FAULT):
     own = {name: value for name, value in defaults.items() if name not in left_out}
     asked: Run = read(kind, argv, args=argv, default=Run(env=tyro.MISSING, **own))
-    if asked.fault == defaults.get("fault", Run.fault):
+    if asked.fault == defaults["fault"]:
       break
   quick.check(asked, any(ARMS[arm].learns for arm in asked.arms if arm in ARMS))
   return asked

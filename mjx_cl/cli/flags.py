@@ -24,9 +24,12 @@ class Run(RunConfig):
   Example: mjx-cl run walker --fault gear --severity 0.5 --seeds 2 --out runs/gear
 
   Attributes:
+    fault: Faults, see `mjx-cl list faults`, or presets, see `mjx-cl list fault-presets`; `none`
+      for the healthy robot. Of several faults, severities or agents each combination is a run of
+      its own, in OUT/fault=NAME,severity=X,agent=NAME; OUT/bench.json says what they say together.
+    severity: In [0, 1]; 0 is nominal. Default: 0.5, or the preset's own.
     agent: Trained agents: shipped names or folders; default: the robot's own (walker, car,
-      quadruped-trot-2); `all`: it and its like of other training seeds. Of several each lives a
-      run of its own in OUT/agent=NAME, and OUT/bench.json says what they say together.
+      quadruped-trot-2); `all`: it and its like of other training seeds.
     out: Result folder.
     quick: A whole loop in about two minutes, for a first look: other defaults of fault, seeds,
       onset, steps and stop rule, for walker, quadruped and car.
@@ -36,7 +39,10 @@ class Run(RunConfig):
     overwrite: Replace an earlier run in --out.
   """
 
-  agent: tuple[str, ...] = ()  # type: ignore[assignment]  # of a RunConfig: one
+  # of a RunConfig: one each
+  fault: tuple[str, ...] = (RunConfig.fault,)  # type: ignore[assignment]
+  severity: tuple[float | None, ...] = ()  # type: ignore[assignment]
+  agent: tuple[str, ...] = ()  # type: ignore[assignment]
   out: str = "runs/latest"
   quick: bool = False
   track: tuple[str, ...] = ()

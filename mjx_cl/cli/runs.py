@@ -19,7 +19,7 @@ from mjx_cl.config import RunConfig, quick
 from mjx_cl.errors import UserError, require
 from mjx_cl.io import folders, memory
 from mjx_cl.runs import bench, cluster, costs, run, workers
-from mjx_cl.runs.suite import Part, Suite, by_agent, finished, of_agents, pick, standing, suite
+from mjx_cl.runs.suite import Part, Suite, by_agent, finished, of_each, pick, standing, suite
 from mjx_cl.training.agents import numbered
 
 
@@ -30,11 +30,16 @@ def do_run(args: Run) -> None:
   if "all" in names:
     require(len(names) == 1, "--agent: 'all' stands alone")
     names = tuple(numbered(args.env))
-  config = RunConfig(**given | {"agent": names[0] if len(names) == 1 else None})
+  choices = {
+    "fault": args.fault or (RunConfig.fault,),
+    "severity": args.severity or (None,),
+    "agent": names or (None,),
+  }
+  config = RunConfig(**given | {field: values[0] for field, values in choices.items()})
   if args.quick:
     say(f"note: {quick.said(config)}")
-  if len(names) > 1:
-    several(args, of_agents(config, names))
+  if any(len(values) > 1 for values in choices.values()):
+    several(args, of_each(config, choices))
     return
   track.check(args.track)
   with (
@@ -57,9 +62,9 @@ def do_run(args: Run) -> None:
 
 
 def several(args: Run, plan: Suite) -> None:
-  """Lives the run of each agent and prints what they say together."""
-  require(not args.track, "--track is of one agent; give one --agent")
-  require(args.stops is None, "--stops is a run of one agent; give one --agent")
+  """Lives each run and prints what they say, of several agents together."""
+  for flag, given in (("track", args.track), ("stops", args.stops)):
+    require(not given, f"--{flag} is of one run; give one --fault, --severity and --agent")
   require(not (args.resume and args.overwrite), "--resume and --overwrite exclude each other")
   out = folders.usable(args.out)
   begun = [f for f in (out, *(out / p.name for p in plan.parts)) if (f / "config.json").exists()]
@@ -75,9 +80,10 @@ def several(args: Run, plan: Suite) -> None:
   if args.json:
     emit(value)
     return
-  apart = {p.config.agent or p.config.env: value["entries"][p.name] for p in plan.parts}
-  for together in value["agents"].values():
-    show_agents(together, apart)
+  together = by_agent(plan.parts)
+  if not together:
+    show_parts(value, out)
+  show_together(value, together)
   print(f"files in {out}")
 
 
@@ -108,17 +114,27 @@ def do_bench(args: Bench) -> None:
   if args.json:
     emit(value)
     return
+  show_parts(value, out)
+  show_together(value, by_agent(plan.parts))
+  print(f"{value['finished']} of {value['parts']} parts finished; files in {out}")
+
+
+def show_parts(value: dict, out: pathlib.Path) -> None:
+  """Prints the table of each part of bench.json's value."""
   for name, summary in value["entries"].items():
     print(f"{name}: ", end="")
     show_summary(summary, str(out / name))
-  for name, own in by_agent(plan.parts).items():
+
+
+def show_together(value: dict, groups: Mapping[str, Mapping[str, Part]]) -> None:
+  """Prints what the agents of each group of `by_agent` say together, as far as they have lived."""
+  for name, own in groups.items():
     if name in value.get("agents", {}):
-      print(f"{name}: ", end="")
+      print(f"{name}: " * (len(groups) > 1), end="")
       names = value["agents"][name]["agents"]
       show_agents(
         value["agents"][name], {agent: value["entries"][own[agent].name] for agent in names}
       )
-  print(f"{value['finished']} of {value['parts']} parts finished; files in {out}")
 
 
 class Planned(NamedTuple):

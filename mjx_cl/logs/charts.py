@@ -1,6 +1,7 @@
 """Control charts on the residuals of `healthy`, and thresholds that reach beyond the nominal log.
 
-Three charts, each of exponentially weighted averages over spans of 5, 25 and 125 samples:
+Three charts, each of exponentially weighted averages over spans of 5, 25 and 125 samples, as far as
+the nominal log has LEAST_BLOCKS of them:
 
 - `level`: |average| of a column's residual against its neighbours, in its healthy deviations: the
   column reads too high or too low. Blind to what changes all columns in their usual relation.
@@ -11,7 +12,9 @@ Three charts, each of exponentially weighted averages over spans of 5, 25 and 12
 
 A chart's threshold for an average run length follows from the generalised extreme value
 distribution of its healthy maxima over blocks, by L-moments (Hosking, Wallis and Wood 1985), with a
-tail that is exponential or heavier: so that it may lie above all that the nominal log has shown.
+tail that is exponential or heavier: so that it may lie above all that the nominal log has shown. A
+score is in healthy deviations that n independent averages gave, so its tail is at least that of
+Student's t with n degrees of freedom, of shape 1 / n.
 """
 
 from collections.abc import Iterator
@@ -23,7 +26,7 @@ from scipy import signal, special
 SPANS = (5, 25, 125)  # samples
 PAUSE = 32  # samples for which nothing may be known before an average falls back to what is healthy
 CHARTS = ("level", "spread", "joint")
-LEAST_BLOCKS = 20  # of which maxima are taken; blocks of a short log are shorter than the last span
+LEAST_BLOCKS = 20  # of which maxima are taken, and independent averages that a span needs
 HEAVIEST = 0.3  # of the tails that are believed, as shape of the distribution
 
 
@@ -35,11 +38,18 @@ class Scales(NamedTuple):
     spread: (2, 2, spans, C) mean and deviation of those of ln(residual^2 + 0.01), of both
       predictions.
     joint: (spans, C, C) inverse covariance of the averages, of one span each.
+
+  Of a span that is not `used` deviations are inf, and inverse covariances 0.
   """
 
   level: np.ndarray
   spread: np.ndarray
   joint: np.ndarray
+
+
+def used(rows: int) -> int:
+  """How many of SPANS a nominal log of so many rows gives scales of."""
+  return max(1, sum(LEAST_BLOCKS * span <= rows for span in SPANS))
 
 
 def averages(
@@ -110,9 +120,12 @@ def scales(residuals: np.ndarray) -> Scales:
     energies = averages(_known(energy, middle), middle, _paused(energy))
     spread.append([(x.mean(0), x.std(0)) for x in energies])
   mean, deviation = np.moveaxis(np.array(spread), 2, 0)
-  return Scales(
+  found = Scales(
     np.maximum(level, 1e-9), np.stack([mean, np.maximum(deviation, 1e-9)]), np.stack(joint)
   )
+  few = slice(used(residuals.shape[1]), None)
+  found.level[few], found.spread[1, :, few], found.joint[few] = np.inf, np.inf, 0.0
+  return found
 
 
 def scores(residuals: np.ndarray, own: Scales) -> dict[str, np.ndarray]:
@@ -137,7 +150,7 @@ class Tail(NamedTuple):
   Attributes:
     middle: (C,).
     width: (C,).
-    shape: (C,) 0 to HEAVIEST.
+    shape: (C,) up to HEAVIEST.
     block: samples.
   """
 
@@ -170,7 +183,8 @@ class Tail(NamedTuple):
 
 def tail(score: np.ndarray) -> Tail:
   """Of a healthy score (N, C)."""
-  block = max(1, min(SPANS[-1], len(score) // LEAST_BLOCKS))
+  longest = SPANS[used(len(score)) - 1]
+  block = max(1, min(longest, len(score) // LEAST_BLOCKS))
   usable = len(score) // block * block
   maxima = np.sort(score[:usable].reshape(-1, block, score.shape[1]).max(1), 0)
   n = len(maxima)
@@ -183,7 +197,7 @@ def tail(score: np.ndarray) -> Tail:
   k = -(
     7.8590 * c + 2.9554 * c**2
   )  # Hosking, Wallis and Wood (1985), equation 14; theirs is -shape
-  shape = np.clip(k, 0.0, HEAVIEST)
+  shape = np.clip(k, min(HEAVIEST, longest / len(score)), HEAVIEST)
   small = shape < 1e-6
   safe = np.where(small, 0.1, shape)
   gamma = special.gamma(1 - safe)

@@ -17,7 +17,7 @@ DOUBT = 0.01  # expected number of such events in a healthy log, above which one
 MOST = 4  # columns that an event names
 GAIN = 25.0  # squared deviations that a column has to explain to be named
 FACTOR = 1.2  # of a spread, below which it is not said to have changed
-SHIFT = 3.0  # healthy deviations of the longest average, above which a mean has moved
+SHIFT = 3.0  # healthy deviations of the longest average in use, above which a mean has moved
 SHARE = 0.1  # of what the first column explains, that each of the others has to
 ROWS = 50_000  # of a large log watched at a time
 LARGE = 10_000_000  # samples of all columns from which a log is watched so and kept in 16 bits
@@ -34,7 +34,8 @@ class Watch(NamedTuple):
     tails: chart -> distribution of its healthy maxima.
     thresholds: chart -> (W,), of `joint` (1,).
     unseen: (2, N, W) residuals of the nominal log.
-    means: (W, W) inverse covariance of the healthy averages over the middle span.
+    means: (W, W) inverse covariance of the healthy averages over the middle span, or the longest
+      that is used.
   """
 
   model: healthy.Healthy
@@ -54,7 +55,8 @@ def calibrated(past: np.ndarray, arl0: float, model: str = "ar", commands: int =
   scales = charts.scales(unseen)
   tails = {name: charts.tail(score) for name, score in charts.scores(unseen, scales).items()}
   thresholds = {name: tail.threshold(arl0) for name, tail in tails.items()}
-  return Watch(fitted, scales, tails, thresholds, unseen, scales.joint[1])
+  middle = scales.joint[min(1, charts.used(unseen.shape[1]) - 1)]
+  return Watch(fitted, scales, tails, thresholds, unseen, middle)
 
 
 class Found(NamedTuple):
@@ -229,7 +231,8 @@ def _how(own: Watch, found: Found, c: int, within: slice) -> dict[str, Any]:
       factors[k] = float(np.nanstd(now.astype(float)) / np.nanstd(before))
       shift = float(np.nanmean(now.astype(float))) if k == 0 else shift
   clear = [not 1 / FACTOR < factor < FACTOR for factor in factors]
-  if not clear[0] and abs(shift) > SHIFT * own.scales.level[-1, c]:
+  longest = charts.used(own.unseen.shape[1]) - 1
+  if not clear[0] and abs(shift) > SHIFT * own.scales.level[longest, c]:
     by = shift * float(own.model.scale[0, c])
     return {"how": "mean", "by": by * float(own.model.spread[c]), "deviations": by}
   if any(clear):

@@ -15,7 +15,7 @@ import os
 import pathlib
 import re
 import tomllib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from mjx_cl.adapt.arms import ARMS
@@ -229,19 +229,31 @@ def pick(
   return chosen[k::n]
 
 
-def of_agents(run: RunConfig, agents: Iterable[str]) -> Suite:
-  """The suite whose parts are `run` with each of the agents.
+def of_each(run: RunConfig, choices: Mapping[str, Sequence[Any]]) -> Suite:
+  """The suite whose parts are `run` with each combination of values.
+
+  Args:
+    run: settings of all of them.
+    choices: field of RunConfig -> its values; more than one stands in the parts' names.
 
   Raises:
-    UserError: for an agent named twice, or what `settings.check` refuses.
+    UserError: for a value named twice, or what `settings.check` refuses.
   """
-  parts: dict[str, Part] = {}
-  for agent in agents:
-    name = "agent=" + re.sub("[/,]", "-", agent)
-    require(name not in parts, f"name each agent once; got {agent} twice")
+  label = lambda field, value: f"{field}={re.sub('[/,]', '-', str(value))}"
+  several = [field for field, values in choices.items() if len(values) > 1]
+  for field in several:
+    seen: set[str] = set()
+    for value in choices[field]:
+      require(label(field, value) not in seen, f"name each {field} once; got {value} twice")
+      seen.add(label(field, value))
+  parts = []
+  for values in itertools.product(*choices.values()):
+    own = dict(zip(choices, values))
+    name = ",".join(label(field, own[field]) for field in several)
     _check_folder("part", name)
-    parts[name] = Part(name, settings.check(dataclasses.replace(run, agent=agent)))
-  return Suite("agents", f"one run with each of {len(parts)} agents", tuple(parts.values()))
+    parts.append(Part(name, settings.check(dataclasses.replace(run, **own))))
+  about = ", ".join(f"{len(choices[field])} of {field}" for field in several)
+  return Suite("run", f"a run with each of: {about}", tuple(parts))
 
 
 def by_agent(parts: Iterable[Part]) -> dict[str, dict[str, Part]]:

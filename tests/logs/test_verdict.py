@@ -7,7 +7,7 @@ import numpy as np
 import pyarrow
 import pyarrow.parquet
 import pytest
-from scipy import stats
+from scipy import signal, stats
 from test_detect import example, mjx  # noqa: F401  a fixture
 
 from mjx_cl.errors import FileError, UserError
@@ -92,6 +92,41 @@ def test_ten_healthy_minutes_hold_no_event(logs):
   assert not [e for e in said["events"] if e["believed"]]
 
 
+def healthy_log(rng, rows, memory):
+  """Three columns that share noise, each with a first-order memory."""
+  e = signal.lfilter([1], [1, -memory], rng.normal(size=(rows + 1000, 3)), 0)[1000:]
+  return e @ np.array([[1, 0.5, 0], [0, 1, 0.3], [0, 0, 1]])
+
+
+@pytest.mark.parametrize("rows", [100, 300, 1000, 2500])
+@pytest.mark.parametrize("memory", [0.0, 0.95])
+def test_a_short_nominal_log_makes_no_healthy_one_changed(rows, memory):
+  """DOUBT promises less than one in a hundred; before spans had to be there LEAST_BLOCKS times,
+  twelve of twelve logs of 100 rows were called changed. Two of twelve have a chance of 0.6 % if
+  one in a hundred is.
+  """
+  changed = 0
+  for seed in range(12):
+    rng = np.random.default_rng(seed)
+    own = verdict.calibrated(healthy_log(rng, rows, memory), 10_000)
+    found = verdict.watch(own, healthy_log(rng, 3000, memory))
+    changed += any(e["believed"] for e in verdict.judge(own, found, ["a", "b", "c"], 500))
+  assert changed < 2
+
+
+@pytest.mark.parametrize("rows", [100, 300, 1000])
+def test_a_short_nominal_log_shows_a_clear_change(rows):
+  """Three deviations of one column, from sample 1,500 on."""
+  rng = np.random.default_rng(0)
+  own = verdict.calibrated(healthy_log(rng, rows, 0.0), 10_000)
+  log = healthy_log(rng, 3000, 0.0)
+  log[1500:, 0] += 3 * log[:, 0].std()
+  found = [e for e in verdict.judge(own, verdict.watch(own, log), ["a", "b", "c"], 500)]
+  (event,) = [e for e in found if e["believed"]]
+  assert abs(event["begin"] - 1500) < 10 and event["columns"][0]["column"] == "a"
+  assert event["columns"][0]["how"] == "mean"
+
+
 def test_a_frozen_sensor_and_one_that_drops_out(logs, tmp_path):
   frozen = gait(9000, 4)
   frozen[5000:, 1] = frozen[5000, 1]
@@ -130,8 +165,8 @@ def test_commands_explain_and_are_not_watched(tmp_path, mjx):  # noqa: F811
   """A robot told to stand elsewhere has not changed; one that stands other than told has."""
   columns = ["joint", "motor", "set_point"]
   past = save(tmp_path / "past.csv", driven(12_000, 0, 0), columns)
-  more = save(tmp_path / "more.csv", driven(6_000, 1, 5), columns)
-  wrong = save(tmp_path / "wrong.csv", driven(6_000, 2, 5, 3_000), columns)
+  more = save(tmp_path / "more.csv", driven(6_000, 1, 8), columns)
+  wrong = save(tmp_path / "wrong.csv", driven(6_000, 2, 8, 3_000), columns)
   told = dict(commands=("set_point",))
   assert detect.detect(more, past).summary["verdict"]["changed"]
   said = detect.detect(more, past, **told).summary

@@ -1,5 +1,6 @@
-"""Several agents in one command: their parts, and what they say together."""
+"""Several agents, faults and severities in one command: their parts, and what they say together."""
 
+import dataclasses
 import json
 import shutil
 
@@ -176,6 +177,32 @@ def test_each_agent_lives_its_run_and_one_table_says_all(
   assert left and not any("agent=" in name for name in left)
 
 
+def test_each_fault_and_severity_is_a_run_of_its_own(mjx, tmp_path):  # noqa: F811
+  """Bit for bit the run of that fault alone; what one fault has, its name does not say."""
+  plain = [*SHORT[:2], *SHORT[6:]]
+  both, alone = tmp_path / "both", tmp_path / "alone"
+  given = ("--fault", "friction", "offset", "--severity", "0.4", "0.6")
+  code, text, _ = mjx(*plain, *given, "--out", both)
+  parts = [f"fault={f},severity={s}" for f in ("friction", "offset") for s in (0.4, 0.6)]
+  assert code == 0 and all(f"{name}: car, " in text for name in parts)
+  assert list(json.loads((both / "bench.json").read_text())["entries"]) == parts
+  assert mjx(*plain, "--fault", "offset", "--severity", "0.6", "--out", alone)[0] == 0
+  own = lambda folder: pyarrow.parquet.read_table(folder / "trace.parquet").to_pydict()
+  assert own(both / parts[-1]) == own(alone) != own(both / parts[-2])
+
+
+def test_parts_are_named_after_what_differs():
+  run = dataclasses.replace(WALKER, fault="gear")
+  choices = {"fault": ["gear", "walker/gear-half"], "severity": [None], "agent": ["walker"]}
+  names = [part.name for part in suite.of_each(run, choices).parts]
+  assert names == ["fault=gear", "fault=walker-gear-half"]
+  choices |= {"fault": ["gear"], "severity": [0.5, 1.0], "agent": ["walker", "walker-2"]}
+  parts = suite.of_each(run, choices).parts
+  assert parts[1].name == "severity=0.5,agent=walker-2"
+  assert (parts[1].config.severity, parts[1].config.agent) == (0.5, "walker-2")
+  assert set(suite.by_agent(parts)) == {"severity=0.5", "severity=1.0"}
+
+
 @pytest.mark.parametrize(
   "more, words",
   [
@@ -184,9 +211,15 @@ def test_each_agent_lives_its_run_and_one_table_says_all(
     (("--agent", "car", "walker"), "was trained on 'walker', not on 'car'"),
     (("--agent", "car", ""), "empty name"),
     (("--agent", "car", "all"), "'all' stands alone"),
-    (("--agent", "all", "--track", "csv"), "--track is of one agent"),
+    (("--agent", "all", "--track", "csv"), "--track is of one run"),
     (("--agent", "all", "--resume", "--overwrite"), "exclude each other"),
-    (("--agent", "all", "--arm", "oracle-stop", "--stops", "x"), "--stops is a run of one agent"),
+    (("--agent", "all", "--arm", "oracle-stop", "--stops", "x"), "--stops is of one run"),
+    (("--fault", "bias", "friction"), "fault 'bias'"),  # of one target
+    (("--fault", "friction", "grip"), "unknown fault 'grip'"),
+    (("--severity", "0.5", "0.50"), "name each severity once; got 0.5 twice"),
+    (("--severity", "0.5", "2"), "severity"),
+    (("--severity",), "--severity got no value"),
+    (("--agent", "car", "--agent", "car-2"), "--agent is there twice"),
   ],
 )
 def test_what_several_agents_refuse_is_one_line(refused, tmp_path, more, words):  # noqa: F811
