@@ -75,5 +75,8 @@ def _show_comparison(rows: list[dict], first: str) -> None:
     f"n: streams; IQM: interquartile mean; difference: from {first[shared:]}, mean over pairs of "
     "one seed; better: of pairs, a tie is half a pair; [95 % interval]"
   )
-  if any(0 < row["pairs"] < FEW for row in rows if row["variant"] != first):
+  others = [row for row in rows if row["variant"] != first]
+  if alone := list(dict.fromkeys(row["variant"] for row in others if not row["pairs"])):
+    print(f"no pair of one seed with {', '.join(alone)}: nothing is said of the difference")
+  if any(0 < row["pairs"] < FEW for row in others):
     print(f"fewer than {FEW} pairs: such intervals are too narrow; take more seeds")

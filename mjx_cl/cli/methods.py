@@ -31,8 +31,10 @@ def do_methods(args: Leaderboard) -> None:
   require(out.is_dir() or not out.exists(), f"--out {args.out} is a file")
   require(not (args.beside and args.arm), "--beside is of lives that are there; leave out --arm")
   robots = tuple(args.robot)
-  given = [life for folder in args.beside for life in methods.of_folder(folder, robots)]
-  published = given if args.beside else methods.shipped()
+  beside: list[dict] = []
+  for theirs in args.beside:
+    beside = methods.joined(beside, methods.of_folder(theirs, robots))
+  published = beside if args.beside else methods.shipped()
   lived = (out / "suite.json").exists()
   require(
     args.overwrite or (args.arm and lived) or not (out / methods.FILES[-1]).exists(),

@@ -73,6 +73,9 @@ def several(args: Run, plan: Suite) -> None:
     f"{out} holds another run; give --resume to go on with it, --overwrite to replace it, or "
     "another --out",
   )
+  robots = costs.Robots()
+  for part in plan.parts:  # what is refused is refused before anything is removed
+    costs.check(part, robots)
   for folder in begun if args.overwrite else ():
     with folders.alone(folder):
       run.clear(folder)

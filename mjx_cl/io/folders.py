@@ -24,8 +24,8 @@ ASIDE: list[list[tuple[pathlib.Path, pathlib.Path]]] = []
 
 @contextlib.contextmanager
 def together() -> Iterator[None]:
-  """Files of one result, written within by `atomic`: they are renamed at the end, all or none. One
-  within another ends with it.
+  """Files of one result, written within by `atomic`: they are renamed at the end, once all are
+  written. One within another ends with it.
 
   Raises:
     FileError: as `atomic`.
@@ -36,8 +36,12 @@ def together() -> Iterator[None]:
   ASIDE.append([])
   try:
     yield
-    for tmp, path in ASIDE[-1]:
-      _rename(tmp, path)
+    for k, (tmp, path) in enumerate(ASIDE[-1]):
+      try:
+        _rename(tmp, path)
+      except FileError as e:
+        new = ", ".join(path.name for _, path in ASIDE[-1][:k])
+        raise (FileError(f"{e}, but {new} are new") if new else e) from None
   finally:
     for tmp, _ in ASIDE.pop():
       tmp.unlink(missing_ok=True)

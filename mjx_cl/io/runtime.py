@@ -1,8 +1,7 @@
 """What must be decided before JAX starts its first backend: devices, compile cache, dispatch.
 
 Importing this module is free of JAX; `setup()` is idempotent. The command line calls it before a
-command that computes; a program of one's own calls it before its first use of JAX: `from mjx_cl
-import runtime; runtime.setup()`.
+command that computes; a program of one's own calls `mjx_cl.setup()` before its first use of JAX.
 """
 
 import ctypes

@@ -7,6 +7,7 @@ import json
 import pathlib
 from typing import Any
 
+from mjx_cl import BENCHMARK
 from mjx_cl.config import AdaptConfig, RunConfig, own_agent
 from mjx_cl.errors import FileError, UserError, choose, require
 from mjx_cl.io import folders, tables
@@ -88,6 +89,12 @@ def of_folder(folder: pathlib.Path | str, robots: tuple[str, ...] = ()) -> list[
     try:
       if robots and config["env"] not in robots:
         continue
+      version = config.get("benchmark", 1)  # which the first runs did not write
+      require(
+        version == BENCHMARK,
+        f"{folder / name} is of version {version} of the benchmark, this release of {BENCHMARK}; "
+        "run it anew",
+      )
       setting = suite.apart(name)[0] or config["env"]
       out += _part(setting, config, tables.read_rows(folder / name / "runs.parquet"))
     except (KeyError, TypeError, AttributeError):

@@ -294,6 +294,12 @@ def _said_of(
       + ", ".join(f"{name} {blind[name]:,}" for name in most[:MANY])
       + rest
     )
+  if unused := charts.SPANS[charts.used(rows) :]:
+    notes.append(
+      f"{rows:,} nominal samples are few: averages over {' and '.join(map(str, unused))} samples "
+      "are not watched, so slow and small changes are not seen; "
+      f"{charts.LEAST_BLOCKS * unused[-1]:,} would do"
+    )
   if rows < arl0 * len(names):
     notes.append(
       f"thresholds lie above what {rows:,} nominal samples can show: they follow from the tail of "

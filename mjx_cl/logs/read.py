@@ -141,7 +141,7 @@ def _large(path: pathlib.Path | str) -> Log | None:
   try:
     if pathlib.Path(path).stat().st_size < LARGE:
       return None
-    with open(path, encoding="utf-8") as file:
+    with open(path, encoding="utf-8-sig") as file:
       head, first = file.readline().rstrip("\r\n"), file.readline()
     names = _header(path, head, [cell.strip() for cell in next(csv.reader([head]))])
     if "," not in head or ";" in first or _number(first.split(",")[0]) is None:

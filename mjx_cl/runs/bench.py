@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable, Collection, Iterable, Iterator
 from typing import Any, BinaryIO
 
+from mjx_cl.config import RunConfig
 from mjx_cl.errors import FileError, UserError, require
 from mjx_cl.io import folders as folder_lib
 from mjx_cl.io import tables
@@ -110,18 +111,24 @@ def take(out: pathlib.Path, parts: Iterable[Part], found: dict[str, list[pathlib
   for part in parts:
     if not (sources := found.get(part.name)):
       continue
-    tmp = out / (part.name + ".tmp")
-    shutil.rmtree(tmp, ignore_errors=True)
-    tmp.mkdir(parents=True)
-    if len(sources) == 1:
-      for name in MERGED:
-        if (sources[0] / name).exists():
-          shutil.copyfile(sources[0] / name, tmp / name)
-      merge.copy_agents(sources[0], tmp)
-    else:
-      merge.join(sources, tmp, part.config)
-    shutil.rmtree(out / part.name, ignore_errors=True)
-    os.replace(tmp, out / part.name)
+    with folder_lib.alone(out / part.name):
+      _take(out / part.name, part.config, sources)
+
+
+def _take(folder: pathlib.Path, config: RunConfig, sources: list[pathlib.Path]) -> None:
+  """A part's folder, of finished runs that have its seeds."""
+  tmp = folder.with_name(folder.name + ".tmp")
+  shutil.rmtree(tmp, ignore_errors=True)
+  tmp.mkdir(parents=True)
+  if len(sources) == 1:
+    for name in MERGED:
+      if (sources[0] / name).exists():
+        shutil.copyfile(sources[0] / name, tmp / name)
+    merge.copy_agents(sources[0], tmp)
+  else:
+    merge.join(sources, tmp, config)
+  shutil.rmtree(folder, ignore_errors=True)
+  os.replace(tmp, folder)
 
 
 def _together(

@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from mjx_cl import detectors, envs
+from mjx_cl import BENCHMARK, detectors, envs
 from mjx_cl.adapt import methods
 from mjx_cl.adapt.arms import ARMS
 from mjx_cl.config import AdaptConfig, RunConfig
@@ -95,8 +95,8 @@ def threshold_of(config: RunConfig) -> detectors.Threshold | None:
 def identity(config: RunConfig) -> dict:
   """What makes a run what it is, as config.json holds it: its settings, `changes`, what a preset's
   name stood for when it began, the `threshold` that its detector takes from the board,
-  `oracle_stops` that its arms are told, and the SHA-256 of the `files` that robot, fault,
-  detector or arm stand in.
+  `oracle_stops` that its arms are told, the SHA-256 of the `files` that robot, fault, detector or
+  arm stand in, and the version of the `benchmark`.
   """
   config = check(config)  # one that was built by hand may lack what follows from the others
   found, told = threshold_of(config), stop_rule.told(config)
@@ -122,6 +122,7 @@ def identity(config: RunConfig) -> dict:
         **({"threshold": found._asdict()} if found else {}),
         **({"oracle_stops": told} if told else {}),
         **({"files": files} if files else {}),
+        "benchmark": BENCHMARK,
       }
     )
   )
@@ -157,6 +158,21 @@ def departure(old: dict, changed: list[str]) -> str:
       "which --merge puts together with it"
     )
   return f"was begun with another {', '.join(changed)}" if changed else ""
+
+
+def check_told(config: RunConfig, values: dict) -> None:
+  """Refuses oracle stops of a run whose agent has other weights than that of `values`, the
+  config.json of this one.
+  """
+  if "oracle_stops" not in values:
+    return
+  card = tables.read_json(pathlib.Path(str(config.stops)) / "config.json").get("agent_card", {})
+  changed = folders.differing(values["agent_card"], card, deep=True)
+  require(
+    not changed,
+    f"stops: {config.stops} was run with another agent ({', '.join(changed)}); its oracle stops "
+    "are not those of this run",
+  )
 
 
 def check_same(out: pathlib.Path, values: dict) -> None:

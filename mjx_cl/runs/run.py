@@ -28,14 +28,15 @@ from mjx_cl import detectors, envs, faults
 from mjx_cl.adapt import decide as phase_lib
 from mjx_cl.adapt.loop import Programs
 from mjx_cl.config import RunConfig
-from mjx_cl.errors import FileError, UserError
+from mjx_cl.errors import FileError, UserError, require
 from mjx_cl.faults.presets import becomes, changes
 from mjx_cl.io import folders, tables
 from mjx_cl.io.interrupt import Interruptible
 from mjx_cl.render import figures
+from mjx_cl.runs import merge
 from mjx_cl.runs.doubts import notes
 from mjx_cl.runs.healthy import Healthy
-from mjx_cl.runs.identity import check_same, identity
+from mjx_cl.runs.identity import check_same, check_told, identity
 from mjx_cl.runs.records import Ledger
 from mjx_cl.runs.runner import Progress, Runner
 from mjx_cl.runs.settings import check
@@ -109,6 +110,8 @@ def _begun(
   if state == "done":
     # `auto` physics is resolved there
     check_same(out, {k: v for k, v in identity(config).items() if k != "physics"})
+    text = merge.differs(out, config)  # its agents' cards
+    require(not text, f"--resume: {out} {text}; --overwrite begins anew")
     return None
   try:
     # refuses wrong names and broken agents before anything of an earlier run is removed
@@ -118,13 +121,13 @@ def _begun(
       out.rmdir()
     raise
   values = runner.config_dict()
+  check_told(config, values)
   if state == "resume":
     check_same(out, values)
     runner.open()
     runner.resume()
   else:
-    if overwrite:
-      clear(out)
+    clear(out)  # what one that was cut off while it began, or was removed, has left too
     runner.open()
     tables.write_json(out / "config.json", values)
     runner.fork()
@@ -164,7 +167,7 @@ def live(
 
 def clear(out: pathlib.Path) -> None:
   """Removes an earlier run's own files, nothing else."""
-  for name in ("config.json", *folders.RESULTS):
+  for name in folders.RESULTS:
     (out / name).unlink(missing_ok=True)
   for name in ("work", "checkpoints"):
     shutil.rmtree(out / name, ignore_errors=True)
@@ -176,6 +179,7 @@ def clear(out: pathlib.Path) -> None:
     for folder in (card.parent, card.parent.parent):
       if not any(folder.iterdir()):
         folder.rmdir()
+  (out / "config.json").unlink(missing_ok=True)  # last: what is left without it is nobody's
 
 
 def finish(runner: Runner, tell: Callable[[str], Any] = lambda text: None) -> dict:

@@ -243,7 +243,9 @@ def _median(times: list[float]) -> _Aggregate:
   """Median of times [control steps], infinite ones censored."""
   value = intervals.finite(intervals.censored_median(times)) if times else None
   return _Aggregate(
-    value, lambda: intervals.interval(times, intervals.censored_median), undefined=np.inf
+    value,
+    lambda: intervals.interval(times, intervals.censored_median),
+    undefined=np.inf if times else np.nan,
   )
 
 

@@ -108,13 +108,13 @@ def board(lives: list[dict]) -> Board:
   ]
   for row in rows:
     draws = drawn[row["robot"]]
-    row["score_ci"] = draws.ends(draws.scores([row["setting"]], row["method"]), row["streams"])
-    row["beyond_ci"] = draws.ends(draws.beyond(row["setting"], row["method"]), row["streams"])
+    row["score_ci"] = ends(draws.scores([row["setting"]], row["method"]), row["known"])
+    row["beyond_ci"] = ends(draws.beyond(row["setting"], row["method"]), row["known"])
   overall = [_overall(name, rows, held, drawn) for name in names]
   rivals = [name for name in names if name != NOTHING]
   full = []
   for own in held.values():
-    alike = [u for u in own[NOTHING] if all(u in own.get(name, {}) for name in rivals)]
+    alike = [u for u in own[NOTHING] if all(_known(own, name, u) for name in rivals)]
     some = {name: {u: of[u] for u in alike} for name, of in own.items() if alike}
     scores = [of_setting(some[name], some[NOTHING])["score"] for name in rivals if some]
     if scores and None not in scores:
@@ -134,7 +134,8 @@ def of_setting(lives: dict[tuple, dict], nothing: dict[tuple, dict]) -> dict[str
   """What one method does in one setting, beside `none`; both by agent and seed.
 
   Returns:
-    streams: pairs; agents; score; lost, lost_none: mean shares; beyond: mean of the pairs'
+    streams: pairs; known: those of which both losses are known; agents; score; lost, lost_none:
+    mean shares; beyond: mean of the pairs'
     differences in lost, beyond_p (sign flips); harmed: agents that by themselves lose more than
     `none`, by the interval of their seeds; worse: pairs that lose more than `none` by a tenth;
     affected: those of which recovery is known; recovered: of these; recovery_steps: mean time to
@@ -158,6 +159,7 @@ def of_setting(lives: dict[tuple, dict], nothing: dict[tuple, dict]) -> dict[str
   before = lambda life: (life["reward_pre"] or 0.0) * life["onset"]
   return {
     "streams": len(shared),
+    "known": len(beyond),
     "agents": len(agents),
     "score": intervals.finite(score),
     "lost": mean(lost),
@@ -183,6 +185,12 @@ def of_setting(lives: dict[tuple, dict], nothing: dict[tuple, dict]) -> dict[str
   }
 
 
+def _known(own: dict[str, dict[tuple, dict]], method: str, unit: tuple) -> bool:
+  """Whether a setting has the loss of a method and of `none` for an agent and seed."""
+  both = unit in own.get(method, {}) and unit in own[NOTHING]
+  return both and bool(np.isfinite(share_lost(own[method][unit], own[NOTHING][unit])))
+
+
 def _above_0(x: np.ndarray) -> bool:
   """Whether a mean is above 0, by its interval."""
   ends = intervals.interval(x, np.mean)
@@ -190,11 +198,13 @@ def _above_0(x: np.ndarray) -> bool:
 
 
 def _time(hit: list[dict]) -> dict[str, Any]:
-  """Restricted mean time to recovery of affected streams, and its interval."""
-  if not hit:
+  """Restricted mean time to recovery of affected streams, and its interval; None where a life is
+  too short to show one.
+  """
+  if not hit or min(life["steps"] for life in hit) <= survival.recovery.HOLD:
     return {"recovery_steps": None, "recovery_steps_ci": None}
   seen = np.array([life["recovery_step"] is not None for life in hit])
-  last = max(1, min(life["steps"] for life in hit) - survival.recovery.HOLD)
+  last = min(life["steps"] for life in hit) - survival.recovery.HOLD
   time = np.array(
     [
       last if r is None else min(last, r - life["onset"])
@@ -294,14 +304,12 @@ class _Draws:
     with np.errstate(divide="ignore", invalid="ignore"):
       return held @ x[known] / held.sum(-1)
 
-  def ends(self, drawn: np.ndarray, pairs: int) -> list[float | None] | None:
-    """Interval of what was drawn, of so many pairs."""
-    return wider(drawn[:, np.isfinite(drawn).all(0)]) if pairs > 1 else None
 
-
-def wider(drawn: np.ndarray) -> list[float | None] | None:
-  """The ends of the wider of two bootstraps, (2, REPS)."""
-  found = intervals.ends(drawn) if drawn.size else [None, None]
+def ends(drawn: np.ndarray, pairs: int) -> list[float | None] | None:
+  """Interval of what was drawn of so many pairs, (2, REPS): the ends of the wider of both
+  bootstraps; None of fewer than two pairs.
+  """
+  found = intervals.ends(drawn) if pairs > 1 else [None, None]
   if found[0] is None or found[1] is None:
     return None
   low, high = zip(*found)
@@ -325,17 +333,15 @@ def _overall(name: str, rows: list[dict], held: dict, drawn: dict[str, _Draws]) 
   each = {robot: mean("score", of) for robot, of in robots.items()}
   out["score"] = float(np.mean(list(each.values()))) if each else None
   sampled = {r: drawn[r].scores([x["setting"] for x in of], name) for r, of in robots.items()}
-  fewest = min((r["streams"] for r in own), default=0)
-
-  def ends(of: list[np.ndarray]) -> list[float | None] | None:
-    values = np.mean(of, 0) if of else np.zeros((2, 0))
-    values = values[:, np.isfinite(values).all(0)]
-    return wider(values) if fewest > 1 and values.size else None
-
-  out["score_ci"] = ends(list(sampled.values()))
-  for robot in robots:
-    out |= {f"score_{robot}": each[robot], f"score_{robot}_ci": ends([sampled[robot]])}
-  out |= _gain(name, robots, held, drawn, ends)
+  fewest = lambda of: min((r["known"] for r in of), default=0)
+  scored = [r for of in robots.values() for r in of]
+  out["score_ci"] = _ends(list(sampled.values()), fewest(scored))
+  for robot, of in robots.items():
+    out |= {
+      f"score_{robot}": each[robot],
+      f"score_{robot}_ci": _ends([sampled[robot]], fewest(of)),
+    }
+  out |= _gain(name, robots, held, drawn)
   streams = sum(r["streams"] for r in own)
   hurt = holm([r["beyond_p"] for r in own])
   return out | {
@@ -357,19 +363,24 @@ def _overall(name: str, rows: list[dict], held: dict, drawn: dict[str, _Draws]) 
   }
 
 
-def _gain(name: str, robots: dict, held: dict, drawn: dict[str, _Draws], ends: Any) -> dict:
+def _ends(of: list[np.ndarray], pairs: int) -> list[float | None] | None:
+  """`ends` of a mean over robots."""
+  return ends(np.mean(of, 0), pairs) if of else None
+
+
+def _gain(name: str, robots: dict, held: dict, drawn: dict[str, _Draws]) -> dict:
   """Score less that of the paper's method, over the settings and units of both: gain, gain_ci, of
   all robots and of each.
   """
   out: dict[str, Any] = {"gain": None, "gain_ci": None}
   if name == PAPER:
     return out
-  means, sampled = [], []
+  means, sampled, fewest = [], [], []
   for robot, of in robots.items():
-    scores, settings = [], []
+    scores, settings, pairs = [], [], []
     for row in of:
       own = held[robot, row["setting"]]
-      both = own[name].keys() & own.get(PAPER, {}).keys() & own[NOTHING].keys()
+      both = [u for u in own[name] if _known(own, name, u) and _known(own, PAPER, u)]
       two: list[Any] = [
         of_setting({u: own[m][u] for u in both}, own[NOTHING])["score"] if both else None
         for m in (name, PAPER)
@@ -377,11 +388,14 @@ def _gain(name: str, robots: dict, held: dict, drawn: dict[str, _Draws], ends: A
       if None not in two:
         scores.append(two[0] - two[1])
         settings.append(row["setting"])
+        pairs.append(len(both))
     if settings:
+      fewest.append(min(pairs))
       means.append(float(np.mean(scores)))
       one, other = drawn[robot], (name, PAPER)
       sampled.append(one.scores(settings, *other) - one.scores(settings, *other[::-1]))
-      out |= {f"gain_{robot}": means[-1], f"gain_{robot}_ci": ends(sampled[-1:])}
+      own_ends = _ends(sampled[-1:], fewest[-1])
+      out |= {f"gain_{robot}": means[-1], f"gain_{robot}_ci": own_ends}
   if means:
-    out |= {"gain": float(np.mean(means)), "gain_ci": ends(sampled)}
+    out |= {"gain": float(np.mean(means)), "gain_ci": _ends(sampled, min(fewest))}
   return out

@@ -15,6 +15,7 @@ import pyarrow
 import pyarrow.parquet
 from numpy.typing import ArrayLike
 
+from mjx_cl import BENCHMARK
 from mjx_cl.adapt.arms import ARMS, stops
 from mjx_cl.config import RunConfig
 from mjx_cl.errors import FileError, UserError
@@ -308,7 +309,8 @@ def told(config: RunConfig) -> dict[int, int]:
     raise FileError(f"stops: {folder} holds no run: its config.json has no settings of adaptation")
   ours = {k: getattr(config, k) for k in SAME if k in theirs}
   ours["adapt"] = {k: getattr(config.adapt, k) for k in LEARNS if k in adapt}
-  differ = folders.differing(theirs, ours, deep=True)
+  ours["benchmark"] = BENCHMARK
+  differ = folders.differing(theirs, ours, defaults={"benchmark": 1}, deep=True)
   if differ:
     raise UserError(
       f"stops: {folder} was run with another {', '.join(differ)}; its oracle stops are not "

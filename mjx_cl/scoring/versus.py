@@ -11,7 +11,7 @@ import numpy as np
 from mjx_cl.config import own_agent
 from mjx_cl.errors import FileError, UserError, require
 from mjx_cl.io import tables
-from mjx_cl.scoring import intervals
+from mjx_cl.scoring import intervals, stop_rule
 
 # name -> (what it is, whether more is better)
 MEASURES: dict[str, tuple[str, bool]] = {
@@ -21,7 +21,7 @@ MEASURES: dict[str, tuple[str, bool]] = {
   "terminations": ("falls or crashes", False),
   "updates": ("gradient steps of the learner", False),
 }
-MUST_AGREE = ("env", "fault", "target", "severity", "schedule", "onset", "steps", "agent", "seeds")
+MUST_AGREE = (*stop_rule.SAME, "steps", "seeds", "first_seed")
 
 
 class Variant(NamedTuple):
@@ -64,9 +64,10 @@ def variants(words: list[str], change: int = 0) -> list[Variant]:
     for name in chosen:
       if name not in arms:
         raise UserError(f"{home} has no arm {name!r}; name one as FOLDER:ARM, of {', '.join(arms)}")
-      last = max(int(r["change"]) for r in rows)
+      of = lambda row: int(row.get("change", 0))  # which the first runs did not write
+      last = max(map(of, rows))
       require(0 <= change <= last, f"{home}: --change must lie in 0..{last}; got {change}")
-      own = {int(r["seed"]): r for r in rows if r["arm"] == name and r["change"] == change}
+      own = {int(r["seed"]): r for r in rows if r["arm"] == name and of(r) == change}
       label = name if len(words) == 1 else f"{home}:{name}"
       found.append(Variant(label, tables.read_json(home / "config.json"), own))
   if len(found) < 2:
