@@ -39,7 +39,7 @@ def do_run(args: Run) -> None:
   if args.quick:
     say(f"note: {quick.said(config)}")
   if any(len(values) > 1 for values in choices.values()):
-    several(args, of_each(config, choices))
+    several(args, config, choices)
     return
   track.check(args.track)
   with (
@@ -61,11 +61,12 @@ def do_run(args: Run) -> None:
     show_summary(summary, args.out)
 
 
-def several(args: Run, plan: Suite) -> None:
-  """Lives each run and prints what they say, of several agents together."""
+def several(args: Run, config: RunConfig, choices: Mapping[str, Sequence]) -> None:
+  """Lives a run with each combination of `of_each` and prints what they say, agents together."""
   for flag, given in (("track", args.track), ("stops", args.stops)):
     require(not given, f"--{flag} is of one run; give one --fault, --severity and --agent")
   require(not (args.resume and args.overwrite), "--resume and --overwrite exclude each other")
+  plan = of_each(config, choices)
   out = folders.usable(args.out)
   begun = [f for f in (out, *(out / p.name for p in plan.parts)) if (f / "config.json").exists()]
   require(

@@ -650,7 +650,7 @@ def test_a_stray_cell_is_a_missing_sample(logs, tmp_path):
     read(path)
 
 
-@pytest.mark.parametrize("change", ["none", "text", "missing", "short row"])
+@pytest.mark.parametrize("change", ["none", "text", "missing", "short row", "byte-order mark"])
 def test_a_large_file_is_read_as_a_small_one(tmp_path, monkeypatch, change):
   """By pyarrow's reader where it can be, with the same columns, or the same error."""
   save(tmp_path / "log.csv", gait(300, 5))
@@ -658,7 +658,8 @@ def test_a_large_file_is_read_as_a_small_one(tmp_path, monkeypatch, change):
   cells = lines[50].split(",")
   cells[2] = {"text": "walk", "missing": ""}.get(change, cells[2])
   lines[50] = ",".join(cells[: -1 if change == "short row" else None])
-  (tmp_path / "log.csv").write_text("\n".join(lines) + "\n\n")
+  mark = "\ufeff" * (change == "byte-order mark")
+  (tmp_path / "log.csv").write_text(mark + "\n".join(lines) + "\n\n")
   said = []
   for size in (10**9, 0):
     monkeypatch.setattr(reading, "LARGE", size)

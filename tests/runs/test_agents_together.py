@@ -80,6 +80,14 @@ def test_counts_are_drawn_as_shares_and_missing_times_as_infinite():
   assert arm["recovery_median_steps_ci"] == [4000.0, None]
 
 
+def test_an_agent_that_no_fault_affects_makes_no_time_infinite():
+  """In draws of the second agent alone nobody is there who could recover."""
+  back, well = rows(0.8), [row(k, affected=False, recovery_step=None) for k in range(10)]
+  arm = summary.over_agents({"a": back, "b": well}, WALKER, 0.025)["arms"]["detector"]
+  assert arm["recovery_median_steps"] == 4000.0
+  assert arm["recovery_median_steps_ci"] == [4000.0, 4000.0]
+
+
 def test_no_interval_is_narrower_than_that_of_one_agent():
   """A bootstrap of streams that all end alike has no width; Wilson's interval has."""
   arm = summary.over_agents({"a": rows(0.8), "b": rows(0.8)}, WALKER, 0.025)["arms"]["detector"]
@@ -171,6 +179,8 @@ def test_each_agent_lives_its_run_and_one_table_says_all(
   code, text, err = mjx(*SHORT, "--agent", *two, "--out", out, "--resume", "--json")
   assert code == 0 and "1 of 2 parts finished" in err
   assert json.loads(text)["agents"] == value["agents"]
+  wrong = refused(2, *SHORT[:-4], "ewmma", "--agent", *two, "--out", out, "--overwrite")
+  assert "ewmma" in wrong and (out / parts[1] / "summary.json").exists()
   left = []
   monkeypatch.setattr(runs, "live", lambda *_: left.extend(content(out)) or value)
   assert mjx(*SHORT, "--agent", *two, "--out", out, "--overwrite")[0] == 0
@@ -185,7 +195,7 @@ def test_one_target_is_of_all_faults(refused, tmp_path):  # noqa: F811
 
 
 def test_each_fault_and_severity_is_a_run_of_its_own(mjx, tmp_path):  # noqa: F811
-  """Bit for bit the run of that fault alone; what one fault has, its name does not say."""
+  """Bit for bit the run of that fault alone."""
   plain = [*SHORT[:2], *SHORT[6:]]
   both, alone = tmp_path / "both", tmp_path / "alone"
   given = ("--fault", "friction", "offset", "--severity", "0.4", "0.6")
@@ -194,8 +204,16 @@ def test_each_fault_and_severity_is_a_run_of_its_own(mjx, tmp_path):  # noqa: F8
   assert code == 0 and all(f"{name}: car, " in text for name in parts)
   assert list(json.loads((both / "bench.json").read_text())["entries"]) == parts
   assert mjx(*plain, "--fault", "offset", "--severity", "0.6", "--out", alone)[0] == 0
-  own = lambda folder: str(pyarrow.parquet.read_table(folder / "trace.parquet").to_pydict())
-  assert own(both / parts[-1]) == own(alone) != own(both / parts[-2])
+
+  def own(folder):
+    """The life; a thread more sums the losses of a chunk, which nothing acts on, in another order."""
+    table = pyarrow.parquet.read_table(folder / "trace.parquet").to_pydict()
+    losses = [table.pop(name) for name in ("dyn_loss", "adv_mag", "value_loss")]
+    return str(table), np.array(losses, float)
+
+  lived, losses = own(both / parts[-1])
+  assert lived == own(alone)[0] != own(both / parts[-2])[0]
+  np.testing.assert_allclose(losses, own(alone)[1], rtol=1e-4)
 
 
 def test_parts_are_named_after_what_differs():

@@ -6,6 +6,8 @@ import dataclasses
 import json
 import pathlib
 import shutil
+import subprocess
+import sys
 
 import numpy as np
 import pyarrow.compute
@@ -263,6 +265,32 @@ def test_pieces_that_do_not_fit_are_one_line(tmp_path):
   with pytest.raises(FileError, match="runs.parquet"):
     merge.join([a, b], tmp_path / "all", config)
   assert not (tmp_path / "all/summary.json").exists()  # no finished run
+
+
+def test_of_another_version_or_in_use_is_not_taken(tmp_path):
+  """A part that another process is living stays its own."""
+  part = part_of("stop", "damping")
+  folder = cut(RESULTS / "stop/damping", tmp_path / "a/damping", [0, 1])
+  config = dataclasses.replace(part.config, seeds=2)
+  assert merge.differs(folder, config) is None
+  own = json.loads((folder / "config.json").read_text())
+  tables.write_json(folder / "config.json", own | {"benchmark": 9})
+  assert "another benchmark" in merge.differs(folder, config)
+  busy = tmp_path / "out/damping"
+  busy.mkdir(parents=True)
+  (busy / "mine").write_text("x")
+  code = "import sys; from mjx_cl.io import folders\nwith folders.alone(sys.argv[1]):\n"
+  code += "  print('in', flush=True); sys.stdin.read()"
+  with subprocess.Popen(
+    [sys.executable, "-c", code, str(busy)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+  ) as other:
+    assert other.stdout.readline() == b"in\n"
+    with pytest.raises(UserError, match="is being written by another"):
+      bench.take(tmp_path / "out", [part._replace(name="damping")], {"damping": [folder]})
+    other.communicate(b"")
+  assert (busy / "mine").exists()
+  bench.take(tmp_path / "out", [part._replace(name="damping")], {"damping": [folder]})
+  assert (busy / "summary.json").exists() and not (busy / "mine").exists()
 
 
 def test_bench_joins_and_publishes(mjx, refused, tmp_path):  # noqa: F811

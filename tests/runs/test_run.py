@@ -714,6 +714,34 @@ def test_a_killed_and_interrupted_run_ends_in_the_same_files(whole, saved, tmp_p
     jax.tree.map(np.testing.assert_array_equal, a.train, b.train)
 
 
+def test_what_a_removed_run_has_left_is_not_gone_on_from(saved, tmp_path):
+  """Checkpoints of another run, whose config.json is gone."""
+
+  class Cut(Exception):
+    """A kill between two chunks."""
+
+  def lived(severity, chunks):
+    config = RunConfig(
+      "walker", severity=severity, onset=64, steps=640, seeds=1, arms=("none",),
+      agent=str(saved), adapt=AdaptConfig(warmup=32),
+    )  # fmt: skip
+    steps = []
+
+    def cut(progress):
+      steps.append(progress.step)
+      if len(steps) == chunks:
+        raise Cut
+
+    with contextlib.suppress(Cut):
+      run.execute(config, tmp_path / "out", resume=True, progress=cut, save_every_s=0.0)
+    return steps
+
+  assert lived(0.5, 6)[-1] == 384
+  (tmp_path / "out/config.json").unlink()
+  assert lived(1.0, 3) == [64, 128, 192]
+  assert lived(1.0, 2) == [192, 256]  # the third chunk was not saved
+
+
 def test_what_a_stream_has_learnt_is_an_agent(whole, saved):
   """Of those that took updates, with the count; it differs from what the run began with, and arm
   `none` keeps nothing.

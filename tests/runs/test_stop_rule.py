@@ -22,7 +22,7 @@ from mjx_cl.faults import presets
 from mjx_cl.io import tables
 from mjx_cl.keys import OfSeed
 from mjx_cl.rollout.scan import Rollout, nest, start
-from mjx_cl.runs import loops, run, scores, settings, snapshots
+from mjx_cl.runs import identity, loops, run, scores, settings, snapshots
 from mjx_cl.runs import runner as runner_lib
 from mjx_cl.runs.snapshots import Snapshots
 from mjx_cl.scoring import ablation, stop_rule
@@ -805,6 +805,16 @@ def test_told_is_the_oracle_stop_of_each_seed(tmp_path):
     with pytest.raises(UserError, match=text):
       told(**wrong)
   assert told(adapt=AdaptConfig(budget=77, patience=5)) == told()  # what ends adaptation may differ
+  other = tables.read_json(tmp_path / "config.json") | {"agent_card": {"updates": 7}}
+  tables.write_json(tmp_path / "config.json", other)
+  values = {"oracle_stops": {"4": 1000}, "agent_card": {"updates": 8}}
+  own = RunConfig("walker", arms=("oracle-stop",), stops=str(tmp_path))
+  with pytest.raises(UserError, match="another agent .updates."):
+    identity.check_told(own, values)
+  identity.check_told(own, values | {"agent_card": {"updates": 7, "new": 1}})
+  tables.write_json(tmp_path / "config.json", other | {"benchmark": 9})
+  with pytest.raises(UserError, match="another benchmark"):
+    told()
 
 
 def test_an_arm_that_is_told_needs_to_be(config):

@@ -170,6 +170,27 @@ def test_what_is_not_known_does_not_count():
   assert (row["affected"], row["recovered"]) == (0, 0)
 
 
+def test_one_known_pair_has_no_interval():
+  """Neither of a score, nor of harm, nor of a gain over the paper's method."""
+  some = lives({"none": [0.1, 0.1], "mine": [0.3, 0.3]})
+  some[3] |= {"reward_pre": None}
+  board = adaptation.board(some)
+  row = next(r for r in board.rows if r["method"] == "mine")
+  assert (row["streams"], row["known"]) == (2, 1)
+  assert row["score_ci"] is row["beyond_ci"] is None and of(board, "mine")["harm"] == 0
+  mine = of(adaptation.board(lives({"none": NONE, "mine": HALF, "detector": [0.3]})), "mine")
+  assert mine["gain"] == pytest.approx(25) and mine["gain_ci"] is mine["gain_walker_ci"] is None
+
+
+def test_a_gain_is_of_the_lives_that_both_are_known_of():
+  some = lives({"none": [0.4] * 4, "mine": [0.0, 0.1, 0.2, 0.3], "detector": [0.0, 0.1, 0.2, 0.9]})
+  some[-1] |= {"return_lost": None}
+  board = adaptation.board(some)
+  mine = of(board, "mine")
+  assert mine["gain"] == 0 and mine["gain_ci"] == [0, 0]
+  assert mine["mean_rank"] == of(board, "detector")["mean_rank"]
+
+
 def test_what_it_costs():
   lost = {"none": [0.3, 0.3, 0.0], "mine": [0.1, 0.1, 0.1]}
   own = lives(lost)
@@ -190,6 +211,9 @@ def test_time_to_recovery_is_a_restricted_mean():
   own += [life("mine", k, 0.1, steps=5_000, recovery_step=when[k]) for k in range(3)]
   row = next(r for r in adaptation.board(own).rows if r["method"] == "mine")
   assert row["recovery_steps"] == pytest.approx((500 + 1_500 + 3_000) / 3)
+  own[-1]["steps"] = 2_000  # in which nobody can have been back for as long as it takes
+  row = next(r for r in adaptation.board(own).rows if r["method"] == "mine")
+  assert row["recovery_steps"] is row["recovery_steps_ci"] is None
 
 
 @pytest.mark.parametrize("n", (5, 9))

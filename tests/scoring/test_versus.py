@@ -64,6 +64,21 @@ def test_versions_of_the_benchmark_are_not_mixed(tmp_path, mjx):
   assert code and "versions 1, 2 of the benchmark cannot be compared" in err
 
 
+def test_runs_that_share_nothing_are_told_apart(tmp_path, mjx):
+  """Rows of the first runs, which knew no change; no seed in common; another repair."""
+  one, two = (run_of(tmp_path / name, {"detector": [1.0, 1.2]}) for name in "ab")
+  rows = tables.read_rows(two / "runs.parquet")
+  for k, row in enumerate(rows):
+    del row["change"]
+    row["seed"] = 7 + k
+  tables.write_table(two / "runs.parquet", {k: [r[k] for r in rows] for k in rows[0]})
+  config = tables.read_json(two / "config.json")
+  tables.write_json(two / "config.json", config | {"duration": 3000, "first_seed": 7})
+  code, out, err = mjx(one, two, "--measure", "reward_final")
+  assert code == 0 and f"no pair of one seed with {two}:detector" in " ".join(out.split())
+  assert all(name in out + err for name in ("duration", "first_seed"))
+
+
 def test_a_robot_that_changes_twice_is_one_stream(tmp_path, mjx):
   """A fault and its repair are two rows of a seed, and no two robots."""
   run = run_of(tmp_path / "a", {"detector": [1.0, 1.2], "none": [0.5, 1.4]})
