@@ -285,7 +285,7 @@ class _Draws:
 
   def scores(self, settings: list[str], method: str, beside: str = NOTHING) -> np.ndarray:
     """Mean score over settings in every draw, (2, REPS), of the units that `beside` has too; nan
-    where a draw holds none.
+    where a draw holds none, inf where these lose nothing.
     """
     out = []
     for setting in settings:
@@ -293,7 +293,9 @@ class _Draws:
       known = np.isfinite(own) & np.isfinite(none) & np.isfinite(self._lost[setting, beside])
       sums = [self.counts[..., known] @ x[known] for x in (own, none)]
       with np.errstate(divide="ignore", invalid="ignore"):
-        out.append(np.where(sums[1] > 0, 100 * (1 - sums[0] / sums[1]), np.nan))
+        score = np.where(sums[1] > 0, 100 * (1 - sums[0] / sums[1]), np.inf)
+      score = np.where(sums[0] == sums[1], 0.0, score)
+      out.append(np.where(self.counts[..., known].any(-1), score, np.nan))
     return np.mean(out, 0)
 
   def beyond(self, setting: str, method: str) -> np.ndarray:
@@ -307,9 +309,10 @@ class _Draws:
 
 def ends(drawn: np.ndarray, pairs: int) -> list[float | None] | None:
   """Interval of what was drawn of so many pairs, (2, REPS): the ends of the wider of both
-  bootstraps; None of fewer than two pairs.
+  bootstraps, without draws of agents that have no such pair; None of fewer than two pairs.
   """
-  found = intervals.ends(drawn) if pairs > 1 else [None, None]
+  drawn = drawn[:, ~np.isnan(drawn).any(0)]
+  found = intervals.ends(drawn) if pairs > 1 and drawn.size else [None, None]
   if found[0] is None or found[1] is None:
     return None
   low, high = zip(*found)
@@ -393,7 +396,8 @@ def _gain(name: str, robots: dict, held: dict, drawn: dict[str, _Draws]) -> dict
       fewest.append(min(pairs))
       means.append(float(np.mean(scores)))
       one, other = drawn[robot], (name, PAPER)
-      sampled.append(one.scores(settings, *other) - one.scores(settings, *other[::-1]))
+      with np.errstate(invalid="ignore"):  # inf less inf
+        sampled.append(one.scores(settings, *other) - one.scores(settings, *other[::-1]))
       own_ends = _ends(sampled[-1:], fewest[-1])
       out |= {f"gain_{robot}": means[-1], f"gain_{robot}_ci": own_ends}
   if means:

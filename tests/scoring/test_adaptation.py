@@ -191,6 +191,25 @@ def test_a_gain_is_of_the_lives_that_both_are_known_of():
   assert mine["mean_rank"] == of(board, "detector")["mean_rank"]
 
 
+def test_draws_in_which_nothing_is_lost_leave_the_end_open():
+  """Of `none` 0.3, -0.1, -0.1, -0.05 four draws in ten have a mean of 0 or less."""
+  board = adaptation.board(lives({"none": [0.3, -0.1, -0.1, -0.05], "mine": [0.02] * 4}))
+  low, high = of(board, "mine")["score_ci"]
+  assert low <= of(board, "mine")["score"] and high is None
+  assert of(board, "none")["score_ci"] == [0, 0]
+
+
+def test_draws_of_agents_that_a_method_has_no_life_of_do_not_count():
+  """`mine` is lived by one agent of three: that agent's seeds alone make its interval."""
+  lost = {"none": NONE, "detector": HALF, "mine": [0.1] * 6}
+  some = [x for agent in "abc" for x in lives(lost, agent=agent)]
+  some = [x for x in some if x["method"] != "mine" or x["agent"] == "a"]
+  row = of(adaptation.board(some), "mine")
+  alone = of(adaptation.board(lives(lost, agent="a")), "mine")
+  assert row["gain"] == pytest.approx(alone["gain"])
+  assert row["gain_ci"] == pytest.approx(alone["gain_ci"], abs=6)  # other draws
+
+
 def test_what_it_costs():
   lost = {"none": [0.3, 0.3, 0.0], "mine": [0.1, 0.1, 0.1]}
   own = lives(lost)
