@@ -13,6 +13,7 @@ from mjx_cl.cli.output import command_line, emit, say
 from mjx_cl.config import (
   PRESETS,
   DreamerConfig,
+  RunConfig,
   TrainConfig,
   check_seeds,
   field_kinds,
@@ -20,8 +21,10 @@ from mjx_cl.config import (
   settings,
 )
 from mjx_cl.errors import FileError, choose, require
+from mjx_cl.faults.presets import becomes, changes
 from mjx_cl.io import folders
 from mjx_cl.runs import run
+from mjx_cl.runs.settings import check
 from mjx_cl.training import agents, evaluate, files, premises, trainer
 
 MOST_EPISODES = 10_000  # all at once in one program
@@ -144,7 +147,12 @@ def do_eval(args: Eval) -> None:
     f"episodes must lie in 1..{MOST_EPISODES:,}, which are lived side by side; got {args.episodes}",
   )
   check_seeds(args.seed, args.episodes)
-  env = envs.make(args.env, args.physics)
+  config = check(
+    RunConfig(
+      args.env, args.fault, args.target, args.severity, physics=args.physics, agent=args.agent
+    )
+  )
+  env = envs.make(becomes(config) or config.env, args.physics)
   trained = agents.of(env, args.agent)
   result: dict[str, Any] = evaluate.evaluate(
     env,
@@ -154,6 +162,7 @@ def do_eval(args: Eval) -> None:
     args.seed,
     trained.repeat,
     args.deterministic,
+    changes(config),
   )
   mean, interval = result["return_mean"], result["return_ci"]
   if not math.isfinite(mean):
@@ -161,19 +170,29 @@ def do_eval(args: Eval) -> None:
       f"agent {trained.path}: its return on {args.env} is {mean}; its weights or the robot give "
       "what is no number"
     )
-  result = {"env": args.env, "agent": pathlib.Path(trained.path).name, **result}
+  broken = {k: getattr(config, k) for k in ("fault", "target", "severity")}
+  result = {
+    "env": args.env,
+    "agent": pathlib.Path(trained.path).name,
+    **(broken if config.fault != "none" else {}),
+    **result,
+  }
   if args.json:
     emit(result)
     return
-  said = f"{args.env}: return {mean:.1f} in one episode"
+  who = args.env
+  if config.fault != "none":
+    who += f" under {config.fault}"
+    who += "" if config.severity is None else f" {config.severity:g}"
+  said = f"{who}: return {mean:.1f} in one episode"
   if interval:
     said = (
-      f"{args.env}: return {mean:.1f} (IQM {result['return_iqm']:.1f}, 95 % interval "
+      f"{who}: return {mean:.1f} (IQM {result['return_iqm']:.1f}, 95 % interval "
       f"{interval[0]:.1f} to {interval[1]:.1f}) over {args.episodes} episodes, "
       f"{result['terminations']} terminations"
     )
   print(said)
-  base = ("env", "agent", "episodes", "return_mean", "return_iqm", "terminations")
+  base = ("env", "agent", "severity", "episodes", "return_mean", "return_iqm", "terminations")
   figures = {k: v for k, v in result.items() if isinstance(v, (int, float)) and k not in base}
   if figures:
     print("  " + ", ".join(f"{k} {v:.3g}" for k, v in figures.items()))

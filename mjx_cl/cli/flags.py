@@ -93,16 +93,23 @@ class Train(GpuMachines):
 
 @dataclass(frozen=True)
 class Eval:
-  """Return of an agent on the healthy robot.
+  """Return of an agent that learns nothing, on the healthy robot or under a fault from the first
+  step on.
 
   Example: mjx-cl eval walker --episodes 20
 
   Attributes:
+    fault: Fault or preset, see `mjx-cl list faults` and `fault-presets`.
+    target: Joint or part that it hits; default: drawn from the seed.
+    severity: In [0, 1]; default: 0.5, or the preset's own.
     seed: Episodes use seeds seed, seed + 1, ...
   """
 
   env: Positional[str]
   episodes: int = 20
+  fault: str = "none"
+  target: str | None = None
+  severity: float | None = None
   agent: str | None = None
   seed: int = 0
   physics: str = "auto"

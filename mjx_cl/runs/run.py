@@ -82,8 +82,9 @@ def execute(
     news = [f"{out} holds no run to go on with: one begins"] if begins else []
     for text in news + notes(config):
       tell(f"note: {text}")
+    streams = len(config.arms) * config.seeds
     tell(
-      f"{len(config.arms) * config.seeds} streams of {config.steps:,} control steps; what is not "
+      f"{streams} stream{'s' * (streams > 1)} of {config.steps:,} control steps; what is not "
       "compiled yet is compiled first, a minute or two"
     )
     tell(str(runner.room))

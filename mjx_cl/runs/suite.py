@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 from mjx_cl.adapt.arms import ARMS
 from mjx_cl.config import AdaptConfig, RunConfig, field_kinds, replace
-from mjx_cl.errors import UserError, require
+from mjx_cl.errors import UserError, choose, require
 from mjx_cl.io import folders, tables
 from mjx_cl.runs import merge, settings
 
@@ -87,6 +87,7 @@ def suite(name: str, change: dict | None = None) -> Suite:
   require(
     isinstance(run, dict), f"{where}: run is a table of settings for every entry; got {run!r}"
   )
+  _check_names(f"{where}, [run]", run)
   require(
     entries
     and isinstance(entries, dict)
@@ -111,6 +112,22 @@ def suite(name: str, change: dict | None = None) -> Suite:
     require(name not in seen, f"{where}: part {name} is there twice")
     seen.add(name)
   return Suite(called, str(data.get("about", "")), tuple(parts))
+
+
+def _check_names(where: str, values: dict) -> None:
+  """Raises UserError for a setting that RunConfig or AdaptConfig does not have, or has of another
+  kind; lists are for `grid`.
+  """
+  adapt = values.get("adapt", {})
+  for kind, own, before in ((RunConfig, values, ""), (AdaptConfig, adapt, "adapt.")):
+    known = {before + field.name: True for field in dataclasses.fields(kind)}
+    own = own if isinstance(own, dict) else {}
+    field_kinds(where, kind, {k: v for k, v in own.items() if not isinstance(v, list)}, before)
+    for name in own:
+      try:
+        choose("setting", before + name, known)
+      except UserError as e:
+        raise UserError(f"{where}: {e}") from None
 
 
 def _check_name(what: str, name: Any) -> None:

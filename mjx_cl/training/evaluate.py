@@ -1,5 +1,6 @@
-"""Return of an agent on the healthy robot, and the task's own figures."""
+"""Return of an agent on a robot, healthy or not, and the task's own figures."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -7,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_cl import faults
+from mjx_cl.faults.presets import Change
 from mjx_cl.rollout.scan import Rollout, nest, start
 from mjx_cl.scoring import intervals
 from mjx_cl.training.episodes import Episodes
@@ -20,8 +22,10 @@ def evaluate(
   seed: int = 0,
   repeat: int = 1,
   deterministic: bool = False,
+  changes: Sequence[Change] = (),
 ) -> dict[str, Any]:
-  """Runs `episodes` episodes side by side, seeds seed, seed + 1, ...
+  """Runs `episodes` episodes side by side, seeds seed, seed + 1, ..., under the faults `changes`
+  from the first step on.
 
   Returns:
     episodes, return_mean, return_iqm, return_ci (95 % bootstrap of the IQM over episodes of this
@@ -31,9 +35,10 @@ def evaluate(
     a reference driver the same for it, from the same starts: reference_return,
     reference_velocity_error_m_s or reference_speed_m_s, reference_falls or reference_collisions.
   """
-  fault = faults.make("none", env)
+  fault, plan, target = faults.build(changes or (Change("none"),), env)
   rollout = Rollout(env, agent, fault, repeat, deterministic)
-  total, steps, sums, ended = live(env, rollout, agent, params, episodes, seed)
+  how: dict[str, Any] = {"plan": plan, "target": target}
+  total, steps, sums, ended = live(env, rollout, agent, params, episodes, seed, **how)
 
   def counted(name: str, hits: np.ndarray) -> dict[str, Any]:
     share = intervals.wilson(int(hits.sum()), episodes)
@@ -64,7 +69,8 @@ def evaluate(
     out |= {rate: float(ended.mean()), rate + "_ci": intervals.wilson(int(ended.sum()), episodes)}
   if hasattr(env, "reference"):
     driver = Rollout(env, agent, fault, repeat, expert=lambda stream: env.reference(stream.env))
-    reference, steps, sums, ended = live(env, driver, agent, params, episodes, seed, drive=True)
+    how |= {"drive": True}
+    reference, steps, sums, ended = live(env, driver, agent, params, episodes, seed, **how)
     out |= {
       "reference_return": float(reference.mean()),
       "reference_return_ci": intervals.interval(reference, np.mean),
@@ -83,15 +89,16 @@ def live(
   episodes: int,
   seed: int,
   drive: bool = False,
+  **fault: Any,
 ) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray], np.ndarray]:
   """One episode each: (return, measured steps, {figure: sum over the steps}, terminated), arrays
-  (episodes,).
+  (episodes,); `fault` as `start` takes it.
 
   A figure is read after a step, from the state; the step that ends an episode, after which a new
   one has begun, is left out.
   """
   keys = jnp.stack([jax.random.key(seed + i) for i in range(episodes)])[None]
-  streams = nest(lambda k: start(env, agent, rollout.fault, k), 0, 0)(keys)
+  streams = nest(lambda k: start(env, agent, rollout.fault, k, **fault), 0, 0)(keys)
   params = jax.tree.map(lambda x: x[None], params)
   measure = jax.jit(nest(env.measure, 0, 0)) if hasattr(env, "measure") else None
   lived, steps = Episodes((1, episodes)), np.zeros(episodes)

@@ -573,6 +573,8 @@ OTHER = {
   "eval: environment": (["eval", "wlker"], ["wlker", "walker"]),
   "eval: zero episodes": (["eval", "walker", "--episodes", "0"], ["episodes"]),
   "eval: agent": (["eval", "walker", "--agent", "wlaker"], ["wlaker"]),
+  "eval: fault": (["eval", "walker", "--fault", "gaer"], ["gaer", "gear"]),
+  "eval: target": (["eval", "walker", "--fault", "gear", "--target", "hip"], ["right_hip"]),
   "list": (["list", "robots"], ["robots", "envs"]),
   "plot": (["plot", "nowhere"], ["nowhere"]),
 }

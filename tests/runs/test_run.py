@@ -1053,7 +1053,8 @@ def test_what_is_cut_down_to_its_acting_cannot_learn(saved, tmp_path):
 # ---- eval ----------------------------------------------------------------------------------------
 
 
-def test_eval_sums_the_rewards_of_one_episode_each(saved, short_walker, monkeypatch, capsys):
+@pytest.mark.parametrize("fault", ["none", "gear"])
+def test_eval_sums_the_rewards_of_one_episode_each(saved, short_walker, monkeypatch, capsys, fault):
   """Episodes of 12 steps; the rollouts, lived again step by step in one chunk, give the sums."""
   import jax.numpy as jnp
 
@@ -1066,6 +1067,9 @@ def test_eval_sums_the_rewards_of_one_episode_each(saved, short_walker, monkeypa
     assert (
       app.main(
         ["eval", "walker", "--agent", str(saved), "--episodes", "3", "--seed", "5", "--json"]
+        + (
+          ["--fault", "gear", "--target", "left_hip", "--severity", "1"] if fault == "gear" else []
+        )
       )
       == 0
     )
@@ -1073,10 +1077,15 @@ def test_eval_sums_the_rewards_of_one_episode_each(saved, short_walker, monkeypa
     signal.signal(signal.SIGTERM, before)
   result = json.loads(capsys.readouterr().out)
   trained = agents.load(str(saved), "walker", 24, 6)
-  fault = faults.make("none", short_walker)
+  broken = {"severity": 1.0, "target": 3} if fault == "gear" else {}
+  said = {k: result[k] for k in ("fault", "target", "severity") if k in result}
+  assert said == ({"fault": "gear", "target": "left_hip", "severity": 1.0} if broken else {})
+  made = faults.make(fault, short_walker)
+  assert not broken or made.targets[3] == "left_hip"
   keys = jnp.stack([jax.random.key(s) for s in (5, 6, 7)])[None]
-  streams = nest(lambda k: start(short_walker, trained.agent, fault, k), 0, 0)(keys)
-  rows = Rollout(short_walker, trained.agent, fault).chunk(
+  begin = lambda k: start(short_walker, trained.agent, made, k, **broken)
+  streams = nest(begin, 0, 0)(keys)
+  rows = Rollout(short_walker, trained.agent, made).chunk(
     jax.tree.map(lambda x: x[None], trained.train.params), streams, 12
   )[1]
   returns = np.asarray(rows.reward)[:, 0].sum(0)
