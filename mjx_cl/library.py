@@ -7,11 +7,11 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from mjx_cl import envs, faults
-from mjx_cl.config import AdaptConfig, RunConfig, replace
+from mjx_cl.config import AdaptConfig, RunConfig, field_kinds, replace
 from mjx_cl.detectors import make as make_detector
 from mjx_cl.detectors.python_class import HostDetector
 from mjx_cl.envs import make as make_env
-from mjx_cl.errors import UserError
+from mjx_cl.errors import UserError, require
 from mjx_cl.leaderboard import score as board
 from mjx_cl.leaderboard import submissions
 from mjx_cl.leaderboard.streams import StreamSet
@@ -32,7 +32,7 @@ def load_agent(env: str, path: str | None = None) -> agents.Trained:
     UserError: for an unknown robot or agent.
     FileError: for a broken file.
   """
-  if env not in envs.ENVS and env in agents.shipped():
+  if env not in envs.ENVS and (env in agents.shipped() or pathlib.Path(env, "card.json").exists()):
     raise UserError(f"{env!r} is an agent: load_agent(robot, {env!r})")
   return agents.of(envs.make(env), path)
 
@@ -78,7 +78,23 @@ def run(
     UserError: for a wrong name or range.
     FileError: where files cannot be read or written.
   """
-  config = replace(RunConfig(env), **settings, adapt=replace(AdaptConfig(), **(adapt or {})))
+  adapt, names = adapt or {}, {"env": env, **settings}
+  for name in ("env", "fault", "detector", "agent"):
+    given = names.get(name)
+    require(
+      given is None or isinstance(given, str),
+      f"{name} takes a name, a string; got {type(given).__name__}",
+    )
+  arms = settings.get("arms", ())
+  require(
+    isinstance(arms, (list, tuple)) and all(isinstance(arm, str) for arm in arms),
+    f"arms takes a list of names; got {arms!r}",
+  )
+  field_kinds("run", RunConfig, settings)
+  field_kinds("run", AdaptConfig, adapt, "adapt.")
+  table = settings.get("settings", {})
+  require(isinstance(table, dict), f"settings takes a dict of the detector's; got {table!r}")
+  config = replace(RunConfig(env), **settings, adapt=replace(AdaptConfig(), **adapt))
   return execute(config, out, resume, overwrite)
 
 
@@ -114,4 +130,5 @@ def score(
     entries, extra = [], [(name, submissions.from_host(host, None))]
   else:
     raise UserError(f"detector is a name or a class with update(x); got {type(detector).__name__}")
-  return list(board.score(held, entries, chosen, extra).rows)
+  rows = board.score(held, entries, chosen, extra).rows
+  return [row for row in rows if not row["reference"]] or list(rows)

@@ -42,6 +42,17 @@ def test_run_refuses_as_the_command_line_does(tmp_path):
     mjx_cl.run("walker", tmp_path / "out", adapt={"ration": 3})
   with pytest.raises(UserError, match="unknown fault 'gears'"):
     mjx_cl.run("walker", tmp_path / "out", fault="gears")
+  for wrong, said in (
+    ({"severity": "half"}, "severity takes float"),
+    ({"seeds": "2"}, "seeds takes int"),
+    ({"adapt": {"ratio": "4"}}, "adapt.ratio takes float"),
+    ({"arms": "none"}, "arms takes a list of names"),
+    ({"detector": mjx_cl.make_detector("cusum")}, "detector takes a name"),
+    ({"agent": mjx_cl.load_agent("walker")}, "agent takes a name"),
+    ({"settings": "threshold=5"}, "settings takes a dict"),
+  ):
+    with pytest.raises(UserError, match=said):
+      mjx_cl.run("walker", tmp_path / "out", **wrong)
   assert not (tmp_path / "out").exists()
 
 
@@ -57,8 +68,8 @@ class Late:
 
 
 def test_a_score_is_a_row_for_each_fault_and_severity():
-  rows = mjx_cl.score(Late, robots=("car",))
-  own = [row for row in rows if row["detector"] == "Late"]
+  own = mjx_cl.score(Late, robots=("car",))  # the board's references are left out
+  assert {row["detector"] for row in own} == {"Late"}
   assert {row["robot"] for row in own} == {"car"} and len(own) > 5
   assert len({(row["fault"], row["severity"]) for row in own}) == len(own)
   for robots in (("cart",), "cart"):

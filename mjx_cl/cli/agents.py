@@ -184,6 +184,8 @@ def do_eval(args: Eval) -> None:
   if config.fault != "none":
     who += f" under {config.fault}"
     who += "" if config.severity is None else f" {config.severity:g}"
+    drawn = any(c.target is None and c.fault != "none" for c in changes(config))
+    who += ", target drawn in each episode" * drawn
   said = f"{who}: return {mean:.1f} in one episode"
   if interval:
     said = (

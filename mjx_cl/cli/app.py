@@ -10,6 +10,7 @@ What each command takes stands in flags.py, what does it in the module that COMM
 import atexit
 import contextlib
 import dataclasses
+import difflib
 import importlib
 import io
 import os
@@ -192,7 +193,8 @@ def _mistake(said: str, argv: list[str]) -> str:
     words = [word.strip() for word in words if word.strip()]
     flags = [word for word in words if word.startswith("-")] or words
     meant = f"; did you mean {found[2]}?" if found[2] and len(flags) == 1 else ""
-    if homes := _commands_with(flags[0]) if len(flags) == 1 else ():
+    close = meant and difflib.SequenceMatcher(None, flags[0], found[2]).ratio() > 0.8
+    if not close and (homes := _commands_with(flags[0]) if len(flags) == 1 else ()):
       meant = f"; it is a flag of {', '.join(homes)}"
     return f"unknown argument of {command}: {', '.join(flags)}{meant}; see {command} --help"
   if re.match(r"Missing from ", said) and (

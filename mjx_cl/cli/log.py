@@ -52,5 +52,7 @@ def do_detect(args: Detect) -> None:
     if columns:
       say(f"note: {text}")
     raise ChangeError("the log has changed")
+  if args.fail_on_change and (gone := result.summary["ended"]):
+    raise ChangeError(f"the log ends without samples of {', '.join(gone)}")
   if columns:
     raise FileError(text)

@@ -9,7 +9,7 @@ from mjx_cl.cli.flags import Certify, Render
 from mjx_cl.cli.output import emit, say
 from mjx_cl.config import FaultConfig, own_agent
 from mjx_cl.envs import adapters
-from mjx_cl.errors import UserError, require
+from mjx_cl.errors import FileError, UserError, require
 from mjx_cl.faults import presets
 from mjx_cl.faults.certificate import faulty
 from mjx_cl.render import compare, pictures
@@ -43,6 +43,8 @@ def do_certify(args: Certify) -> None:
     print(f"files in {args.out}")
   for text in wrong:
     say(f"mjx-cl: {text}")
+  if wrong:
+    raise FileError(f"{len(wrong)} certificates fail")
 
 
 def do_render(args: Render) -> None:

@@ -260,10 +260,15 @@ def show_verdict(summary: dict) -> None:
       f"  {len(event['charts'])} of {verdict['of']} charts agree; in a healthy log of this length "
       f"{chance} such events are expected"
     )
-  names = [name for name in summary["columns"] if name not in summary["unjudged"]]
+  ended = [name for name in summary["ended"] if name not in summary["unjudged"]]
+  gone = {name: summary["silent"][name] for name in ended}
+  apart = {*gone, *summary["unjudged"]}
+  names = [name for name in summary["columns"] if name not in apart]
   if not believed and names:
     which = ", ".join(names) if len(names) <= 8 else f"{len(names)} columns"
     print(f"no change in {which} that a healthy log of this length would not show as well")
+  for name, why in gone.items():
+    print(f"{name}: {why}")
   if doubted:
     print(f"{doubted} more event{'s' * (doubted > 1)} of a kind that a healthy log shows as well")
   alarms = summary["false_alarms"]

@@ -161,6 +161,12 @@ def fault(
   if not targets:
     raise UserError(f"fault {name!r} finds nothing to act on in robot {env.spec.name!r}")
   count = drawn or len(targets)
+  if count > len(targets):
+    raise PluginError(f"fault {name!r} draws from {count} targets; it has {len(targets)}")
+  if rows is not None and np.shape(rows)[:1] != (len(targets),):
+    raise PluginError(
+      f"fault {name!r} has rows of shape {np.shape(rows)} for {len(targets)} targets"
+    )
 
   def init(key: PRNGKeyArray, target: ArrayLike = -1) -> State:
     target = jnp.asarray(target)

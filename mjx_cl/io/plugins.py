@@ -193,9 +193,12 @@ def _file(path: pathlib.Path, changed: int) -> types.ModuleType:
   spec: Any = importlib.util.spec_from_file_location(inner, path)
   module = importlib.util.module_from_spec(spec)
   sys.modules[inner] = module  # dataclasses look their module up there
+  sys.path.append(str(path.parent))  # what lies beside it can be imported
   try:
     spec.loader.exec_module(module)
   except BaseException:
     del sys.modules[inner]
     raise
+  finally:
+    sys.path.remove(str(path.parent))
   return module

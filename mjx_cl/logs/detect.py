@@ -239,7 +239,8 @@ def _judged(
   said = verdict.summary(own, events, names, times, arl0)
   silent = gaps.told(lost, names, times.seconds, times.places, len(even))
   unjudged = gaps.unjudged(found.known, names, silent)
-  said |= {"silent": silent, "unjudged": unjudged, "refractory": pause}
+  said |= {"silent": silent, "ended": gaps.ended(lost, names, len(even))}
+  said |= {"unjudged": unjudged, "refractory": pause}
   said |= {"arl0": arl0, "rate_hz": times.rate, "detectors": rows}
   notes = _said_of(own, names, found.known, len(used), arl0, silent, unjudged)
   said |= {**_sizes(xs, past, 0), "notes": notes}

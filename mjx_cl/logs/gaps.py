@@ -159,7 +159,7 @@ def told(
     k = row if at_rows is None else int(np.searchsorted(at_rows, row))
     return f"sample {k:,}" if seconds is None else f"{seconds[k]:,.2f} s"
 
-  said = {}
+  said: dict[str, str] = {}
   for name, own in zip(names, lost.stretches):
     if not own:
       continue
@@ -175,6 +175,11 @@ def told(
     if len(own) > 1:
       said[name] += f", and {len(own) - 1} more such stretch{'es' * (len(own) > 2)}"
   return said
+
+
+def ended(lost: Silent, names: list[str], total: int) -> list[str]:
+  """Columns that have no samples any more at the end of `total` rows, as of a sensor that died."""
+  return [name for name, own in zip(names, lost.stretches) if own and own[-1][1] >= total]
 
 
 def unjudged(known: np.ndarray, names: list[str], why: dict[str, str]) -> dict[str, Any]:

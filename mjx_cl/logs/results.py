@@ -25,8 +25,8 @@ class Detection(NamedTuple):
 
   Attributes:
     summary: what detect.json holds; of the charts also verdict, events, false_alarms, model,
-      silent (column: when it has no samples), unjudged (column: why nothing is said of it) and,
-      where faults were put into the nominal log, inject.
+      silent (column: when it has no samples), ended (columns without samples at the end), unjudged
+      (column: why nothing is said of it) and, where faults were put into the nominal log, inject.
     xs: float (T, C), the log as read.
     past: float (N, C), the nominal log as read.
     fired: detector -> bool (T, C).

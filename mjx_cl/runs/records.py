@@ -303,6 +303,8 @@ class Ledger(NamedTuple):
     healthy = None if change else recovery.return_lost_healthy(reward, onset, before, life.begun)
     score = alarms.score(trace["alarm"][begin:end, g], onset - begin)
     latency, affected = score.latency_steps, None if lost is None else bool(lost >= 0.1)
+    # what came before the change says nothing of how it ended
+    last = recovery.FINAL if never else min(recovery.FINAL, max(1, end - onset))
     fallen = trace["terminated"][:end, g]
     updates = self.updates[g] if end == self.config.steps else trace["updates"][end, g]
     return {
@@ -323,7 +325,7 @@ class Ledger(NamedTuple):
       "stable_step": None if never else recovery.stable_step(reward, fallen, onset, before),
       "reward_pre": before,
       "reward_drop": lost,
-      "reward_final": float(np.mean(reward[-recovery.FINAL :])),
+      "reward_final": float(np.mean(reward[-last:])),
       "return_lost": None if never else recovery.return_lost(reward, onset, before),
       "return_lost_healthy": healthy,
       "terminations": int(fallen[begin:].sum()),

@@ -69,7 +69,8 @@ def board(lives: list[dict]) -> Board:
       runs.parquet; of arm `none` each setting must have some.
 
   Returns:
-    Board. Rows of `overall`: method, score, score_ci, and for each robot score_ROBOT,
+    Board. Rows of `overall`: method, score, score_ci (None where it lacks a robot), and for each
+    robot score_ROBOT,
     score_ROBOT_ci; gain, gain_ci, gain_ROBOT, gain_ROBOT_ci: its score less that of the paper's
     method, over the settings, agents and seeds of both; settings; harm: settings in which it loses
     more than `none`, by the paired interval; harm_holm: the same by a sign-flip test at 5 %, lives
@@ -334,11 +335,13 @@ def _overall(name: str, rows: list[dict], held: dict, drawn: dict[str, _Draws]) 
 
   out: dict[str, Any] = {"method": name}
   each = {robot: mean("score", of) for robot, of in robots.items()}
-  out["score"] = float(np.mean(list(each.values()))) if each else None
+  # of fewer robots than the board has no mean compares
+  whole = set(each) == {robot for robot, _ in held}
+  out["score"] = float(np.mean(list(each.values()))) if whole else None
   sampled = {r: drawn[r].scores([x["setting"] for x in of], name) for r, of in robots.items()}
   fewest = lambda of: min((r["known"] for r in of), default=0)
   scored = [r for of in robots.values() for r in of]
-  out["score_ci"] = _ends(list(sampled.values()), fewest(scored))
+  out["score_ci"] = _ends(list(sampled.values()), fewest(scored)) if whole else None
   for robot, of in robots.items():
     out |= {
       f"score_{robot}": each[robot],

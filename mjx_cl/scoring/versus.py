@@ -49,7 +49,8 @@ def variants(words: list[str], change: int = 0) -> list[Variant]:
   Raises:
     UserError: no run there, no such arm or change, other robots, fewer than two variants.
   """
-  found = []
+  found: list[Variant] = []
+  seen: set[tuple[pathlib.Path, str]] = set()
   for word in words:
     # an arm may have colons of its own, FILE.py:make
     folders = [word[:i] for i, x in enumerate(word) if x == ":" and pathlib.Path(word[:i]).is_dir()]
@@ -69,6 +70,9 @@ def variants(words: list[str], change: int = 0) -> list[Variant]:
       require(0 <= change <= last, f"{home}: --change must lie in 0..{last}; got {change}")
       own = {int(r["seed"]): r for r in rows if r["arm"] == name and of(r) == change}
       label = name if len(words) == 1 else f"{home}:{name}"
+      same = (home.resolve(), name)
+      require(same not in seen, f"{label} is there twice; name another run or arm")
+      seen.add(same)
       found.append(Variant(label, tables.read_json(home / "config.json"), own))
   if len(found) < 2:
     raise UserError(f"{words[0]} has one arm; name another run to compare it with")

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_cl import faults
+from mjx_cl.errors import UserError
 from mjx_cl.faults.presets import Change
 from mjx_cl.rollout.scan import Rollout, nest, start
 from mjx_cl.scoring import intervals
@@ -103,10 +104,15 @@ def live(
   measure = jax.jit(nest(env.measure, 0, 0)) if hasattr(env, "measure") else None
   lived, steps = Episodes((1, episodes)), np.zeros(episodes)
   sums: dict[str, np.ndarray] = {}
+  chunk, decisions = 50 if measure is None else 1, 0
   while lived.alive.any():
-    streams, rows = rollout.chunk(
-      params, streams, 50 if measure is None else 1, jnp.full((1, episodes), drive)
-    )
+    if decisions * rollout.repeat > env.spec.episode_steps:
+      raise UserError(
+        f"robot {env.spec.name!r} ends no episode in its episode_steps={env.spec.episode_steps}; "
+        "its step has to set `truncated` by then"
+      )
+    decisions += chunk
+    streams, rows = rollout.chunk(params, streams, chunk, jnp.full((1, episodes), drive))
     lived.add(rows)
     if measure is not None:
       alive = lived.alive[0]

@@ -659,6 +659,38 @@ def test_a_file_robot_that_is_a_shipped_one_by_another_path(tmp_path, capsys):
     record.prepare(types.SimpleNamespace(name="s", robots={name: {}}), (), "auto", None)
 
 
+def test_a_file_imports_what_lies_beside_it(tmp_path):
+  (tmp_path / "lies_beside.py").write_text("def level(): return 7\n")
+  (tmp_path / "own.py").write_text("from lies_beside import level\n")
+  before = list(sys.path)
+  assert plugins.find(f"{tmp_path}/own.py:level", "detector")() == 7
+  assert sys.path == before
+
+
+def test_a_fault_that_fails_its_certificate_fails_the_command(tmp_path, capsys):
+  (tmp_path / "noop.py").write_text(
+    "from mjx_cl.faults.base import fault\n"
+    "def noop(env):\n"
+    "  act = lambda row, memory, severity, key, ports: (memory, {'ctrl': ports.ctrl})\n"
+    "  return fault('noop', env, ('ctrl',), ('all',), act)\n"
+  )
+  argv = ["certify", "walker", "--fault", f"{tmp_path}/noop.py:noop", "--episodes", "0"]
+  assert app.main([*argv, "--out", str(tmp_path / "out")]) == 1
+  assert "certificates fail" in capsys.readouterr().err
+
+
+def test_rows_of_a_fault_are_of_its_targets():
+  env = envs.make("walker")
+  make = lambda **how: faults.base.fault(
+    "mine", env, ("ctrl",), ("a", "b", "c"), lambda *_: ((), {}), **how
+  )
+  assert make(rows=np.zeros((3, 6)), drawn=2).drawn == 2
+  with pytest.raises(PluginError, match="rows of shape .2, 6. for 3 targets"):
+    make(rows=np.zeros((2, 6)))
+  with pytest.raises(PluginError, match="draws from 4 targets; it has 3"):
+    make(drawn=4)
+
+
 def test_the_fault_of_the_docs(tmp_path):
   """The example of docs/faults.md as a file of one's own, against a loop by hand: target hit alone,
   band, an episode's start, severity 0.

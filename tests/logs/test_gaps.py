@@ -189,7 +189,20 @@ def test_a_silent_column_is_named_and_the_others_are_judged_without_it(tmp_path,
   x[1400:1600, 0] = np.nan
   code, out, err = mjx(save(tmp_path / "while.csv", x, NAMES), "--nominal", nominal)
   assert code == 0 and out.startswith("no change in hip, knee, current")
+  assert mjx(tmp_path / "while.csv", "--nominal", nominal, "--fail-on-change")[0] == 0
   assert "hip has no samples from 28.00 s to 32.00 s; there the other columns" in err
+
+
+def test_a_sensor_that_dies_late_is_no_unchanged_one(tmp_path, nominal, mjx):  # noqa: F811
+  """Judged for the most part, so it is no failure to judge, but a script is told."""
+  x = leg(3000, 1001)
+  x[2400:, 0] = np.nan
+  path = save(tmp_path / "dies.csv", x, NAMES)
+  code, out, err = mjx(path, "--nominal", nominal)
+  assert code == 0 and out.startswith("no change in knee, current that")
+  assert "\nhip: no samples from 48.00 s on\n" in out
+  code, _, err = mjx(path, "--nominal", nominal, "--fail-on-change")
+  assert code == 3 and "ends without samples of hip" in err
 
 
 def test_what_is_not_judged_is_not_called_unchanged(tmp_path, nominal, mjx):  # noqa: F811

@@ -34,7 +34,7 @@ from mjx_cl.runs import identity, run, runner, workers
 from mjx_cl.runs.run import ledger_of
 from mjx_cl.runs.runner import KINDS
 from mjx_cl.scoring import events, intervals
-from mjx_cl.training import agents
+from mjx_cl.training import agents, evaluate
 
 STEPS, ONSET, EPISODE, SEEDS = 700, 300, 150, (3, 4)
 ENDS = [
@@ -462,7 +462,7 @@ def test_runs_are_sums_of_the_trace(whole):
     pre = reward[100:end].mean() if end > 100 else None
     assert row["reward_pre"] == pytest.approx(pre)
     assert (
-      row["reward_final"] == pytest.approx(reward.mean()) and row["terminations"] == 0
+      row["reward_final"] == pytest.approx(reward[ONSET:].mean()) and row["terminations"] == 0
     )  # the run is shorter than 2,000 steps
     if pre is not None:
       assert row["return_lost"] == pytest.approx((pre - reward[ONSET:]).sum())
@@ -1105,6 +1105,18 @@ def test_eval_sums_the_rewards_of_one_episode_each(saved, short_walker, monkeypa
     result["return_ci"][0] <= result["return_iqm"] <= result["return_ci"][1]
     and result["terminations"] == 0
   )
+
+
+def test_a_robot_that_ends_no_episode_is_not_waited_for(saved, short_walker, monkeypatch, capsys):
+  class Endless(evaluate.Episodes):
+    """Episodes of a robot whose step never sets truncated."""
+
+    alive = property(lambda _: np.ones((1, 2), bool), lambda *_: None)
+
+  monkeypatch.setattr(evaluate, "Episodes", Endless)
+  monkeypatch.setitem(envs.ENVS, "walker", lambda physics: short_walker)
+  assert app.main(["eval", "walker", "--agent", str(saved), "--episodes", "2"]) == 2
+  assert "ends no episode in its episode_steps=" in capsys.readouterr().err
 
 
 # ---- time left -----------------------------------------------------------------------------------

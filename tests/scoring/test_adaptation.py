@@ -210,6 +210,14 @@ def test_draws_of_agents_that_a_method_has_no_life_of_do_not_count():
   assert row["gain_ci"] == pytest.approx(alone["gain_ci"], abs=6)  # other draws
 
 
+def test_a_method_of_one_robot_has_no_score_over_all():
+  some = lives({"none": NONE, "detector": HALF, "mine": [0.0] * 6})
+  some += lives({"none": NONE, "detector": HALF}, robot="car")
+  mine = of(adaptation.board(some), "mine")
+  assert mine["score"] is mine["score_ci"] is None
+  assert (mine["score_walker"], mine["gain"]) == (100, pytest.approx(50))
+
+
 def test_what_it_costs():
   lost = {"none": [0.3, 0.3, 0.0], "mine": [0.1, 0.1, 0.1]}
   own = lives(lost)

@@ -79,6 +79,12 @@ def test_runs_that_share_nothing_are_told_apart(tmp_path, mjx):
   assert all(name in out + err for name in ("duration", "first_seed"))
 
 
+def test_one_run_is_not_compared_with_itself(tmp_path, mjx):
+  run = run_of(tmp_path / "a", {"detector": [1.0, 1.2]})
+  code, _, err = mjx(run, f"{tmp_path}/../{tmp_path.name}/a")
+  assert code == 2 and "is there twice" in err
+
+
 def test_a_robot_that_changes_twice_is_one_stream(tmp_path, mjx):
   """A fault and its repair are two rows of a seed, and no two robots."""
   run = run_of(tmp_path / "a", {"detector": [1.0, 1.2], "none": [0.5, 1.4]})

@@ -36,7 +36,8 @@ def test_a_seed_on_a_cluster_is_the_training_of_that_seed(mjx, refused, machines
   }
   # the same command finds all finished; another's settings are refused
   assert mjx(*spread)[0] == 0
-  said = refused(2, *spread, "--set", *SET, "lr=1e-4")
+  at = spread.index(SET[-1]) + 1
+  said = refused(2, *spread[:at], "lr=1e-4", *spread[at:])
   assert "begun with another lr" in said
   assert "beside trainings of seeds" in refused(2, *HOW, "--out", tmp_path, *where)
   assert "leave out --overwrite" in refused(2, *spread, "--overwrite")
