@@ -288,10 +288,17 @@ def check_filled(command: Any) -> None:
       raise UserError(f"--{field.name.replace('_', '-')} got an empty name or text")
 
 
+def own_code(command: Any) -> list[str]:
+  """What of a command is code in the user's files, FILE.py:NAME each."""
+  given = [getattr(command, f.name) for f in dataclasses.fields(command)]
+  words = [x for value in given for x in (value if isinstance(value, tuple) else (value,))]
+  return [x for x in words if isinstance(x, str) and plugins.file_of(x)]
+
+
 @contextlib.contextmanager
-def ours() -> Iterator[None]:
+def ours(command: Any) -> Iterator[None]:
   """What a plug-in raises, and whoever wants to end the program but the user, is named, and so is
-  the place.
+  the place; where what a user's code gave fails later, in ours, that code.
   """
   try:
     yield
@@ -299,6 +306,8 @@ def ours() -> Iterator[None]:
     raise
   except Exception as e:
     where = None if plugins.of_user(e) else plugins.place(e)
+    if where is None and isinstance(e, (TypeError, ValueError)) and not plugins.of_user(e):
+      where = ", ".join(own_code(command)) or None
     if where is None:
       raise
     raise PluginError(f"{where}: {plugins.line(e)}") from None
@@ -323,7 +332,7 @@ def main(argv: list[str] | None = None) -> int:
     # a run locks its own folder, and so does each part of a suite
     whole = isinstance(command, (Train, Certify, Record, Leaderboard, Detect))
     out = command.out if whole else None
-    with apart(command), ours(), folders.alone(out) if out else contextlib.nullcontext():
+    with apart(command), ours(command), folders.alone(out) if out else contextlib.nullcontext():
       DO[type(command)](command)
 
   def again() -> str:

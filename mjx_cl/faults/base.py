@@ -179,12 +179,20 @@ def fault(
     state: State, severity: Severity, key: PRNGKeyArray, ports: Ports
   ) -> tuple[State, Ports]:
     kept, values = _answer(name, owns, act(state.row, state.memory, severity, key, ports))
+    before, after = _form(state.memory), _form(kept)
+    if before != after:
+      raise PluginError(f"fault {name!r} makes a memory of form {after} of one of form {before}")
     for leaf, value in values.items():
       old = read(ports, leaf)
       ports = write(ports, leaf, jnp.where(severity > 0, _fitting(name, leaf, value, old), old))
     return state._replace(memory=kept), ports
 
   return Fault(name, tuple(owns), targets, count, init, apply, "obs" in owns, not_monotone)
+
+
+def _form(memory: Any) -> str:
+  """Structure, shapes and types of a memory, in one line."""
+  return str(jax.tree.map(lambda x: str(jax.typeof(jnp.asarray(x))), memory))
 
 
 def _answer(name: str, owns: tuple[str, ...], answer: Any) -> tuple[Any, dict[str, Any]]:

@@ -18,6 +18,7 @@ import pytest
 
 from mjx_cl import detectors, envs, faults
 from mjx_cl.cli import app
+from mjx_cl.cli.flags import List, Run
 from mjx_cl.errors import PluginError, UserError
 from mjx_cl.io import plugins
 from mjx_cl.io.plugins import Registry
@@ -679,6 +680,23 @@ def test_a_fault_that_fails_its_certificate_fails_the_command(tmp_path, capsys):
   assert "certificates fail" in capsys.readouterr().err
 
 
+def test_what_a_users_code_gave_and_ours_cannot_use_names_that_code():
+  own = Run("walker", detector="mine/bad.py:d", arms=("none",))
+  with pytest.raises(PluginError, match="^mine/bad.py:d: TypeError: no such form"), app.ours(own):
+    raise TypeError("no such\n form")
+  with pytest.raises(TypeError), app.ours(Run("walker")):  # of this package: a bug
+    raise TypeError("no such form")
+
+
+def test_a_memory_keeps_its_form():
+  env = envs.make("walker")
+  act = lambda row, memory, severity, key, ports: (jnp.zeros(2), {"ctrl": ports.ctrl})
+  made = faults.base.fault("mine", env, ("ctrl",), ("all",), act, memory=jnp.zeros(6))
+  ports = faults.base.Ports(env.model, ctrl=jnp.zeros(6))
+  with pytest.raises(PluginError, match=r"form float32\[2\] of one of form float32\[6\]"):
+    made.apply(made.init(jax.random.key(0)), jnp.float32(0.5), jax.random.key(1), ports)
+
+
 def test_rows_of_a_fault_are_of_its_targets():
   env = envs.make("walker")
   make = lambda **how: faults.base.fault(
@@ -794,9 +812,12 @@ def test_what_a_users_file_raises_later_names_file_and_line(tmp_path):
   file = tmp_path / "mine.py"
   file.write_text("def late():\n  return [].pop()\n\n\ndef deep():\n  return deep()\n")
   late, deep = (plugins.find(f"{file}:{name}", "fault") for name in ("late", "deep"))
-  with pytest.raises(PluginError, match=r"mine.py, line 2: IndexError: pop from empty"), app.ours():
+  with (
+    pytest.raises(PluginError, match=r"mine.py, line 2: IndexError: pop from empty"),
+    app.ours(List()),
+  ):
     late()
-  with pytest.raises(PluginError, match=r"mine.py, line 6: RecursionError"), app.ours():
+  with pytest.raises(PluginError, match=r"mine.py, line 6: RecursionError"), app.ours(List()):
     deep()
-  with pytest.raises(IndexError), app.ours():  # of this package: a bug
+  with pytest.raises(IndexError), app.ours(List()):  # of this package: a bug
     [].pop()
