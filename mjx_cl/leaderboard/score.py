@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from mjx_cl.errors import PluginError
 from mjx_cl.io import tables
 from mjx_cl.io.interrupt import threads
 from mjx_cl.leaderboard import calibration, page, sweep
@@ -134,7 +135,12 @@ def examine(
     data: streams of the robot.
   """
   runner = sweep.Runner(one.own(data.robot), room, one.signed) if one.own else runners[one.name]
-  return one_line(one.name, lambda: calibration.examine(one, data, runner, samples))
+  found = one_line(one.name, lambda: calibration.examine(one, data, runner, samples))
+  if not one.reference and not np.isfinite(found.nominal_score).any():
+    raise PluginError(
+      f"detector {one.name!r} knows no score on the healthy streams of {data.robot}: nan throughout"
+    )
+  return found
 
 
 def _run(

@@ -1041,11 +1041,17 @@ def test_detectors_by_channel_and_from_files_stand_beside_the_others(late, tmp_p
   assert one.calibrated and not one.reference
 
 
-def test_what_is_no_detector_gets_one_line(refused, late, tmp_path, monkeypatch):  # noqa: F811
+def test_what_is_no_detector_gets_one_line(mjx, refused, late, tmp_path, monkeypatch):  # noqa: F811
   monkeypatch.chdir(tmp_path)
   pathlib.Path("odd.py").write_text(
     "class Plain:\n  def update(self, x):\n    return False\ndef broken(threshold=1.0):\n  "
     "return {}['x']\n"
+    "import jax.numpy as jnp\n"
+    "from mjx_cl.detectors import Alarm, Detector, scalar\n"
+    "@scalar\n"
+    "def blind(threshold=1.0):\n"
+    "  update = lambda state, x: (state, Alarm(x > threshold, x * jnp.nan))\n"
+    "  return Detector(lambda: jnp.float32(0), update)\n"
   )
   say = lambda code, *names: refused(
     code, "leaderboard", late, "--out", "board", "--detector", *names
@@ -1057,6 +1063,8 @@ def test_what_is_no_detector_gets_one_line(refused, late, tmp_path, monkeypatch)
   assert "unknown detector 'cusm'" in say(2, "cusm@opr") and "unknown detector 'x'" in say(2, "x")
   assert "'nothing'" in say(2, "cusum@nothing") and "channels of its own" in say(2, "hotelling@opr")
   assert not pathlib.Path("board").exists()
+  code, _, err = mjx("leaderboard", late, "--out", "board", "--detector", "odd.py:blind@opr")
+  assert code == 1 and "odd.py:blind@opr' knows no score on the healthy streams of walker" in err
 
 
 @pytest.mark.parametrize(
