@@ -49,12 +49,13 @@ SET = (
   "set/walker_latents.parquet",
   "set",
 )
+TOLD = ["oracle-stop" if word == "none" else word for word in room.RUN]
 BASES = {
   "list": Base(["list"], share=0.7),
   "run": Base([*room.RUN, "--out", "out"], ("out",), AGENT, 4),
   "run again": Base([*room.RUN, "--out", "run", "--resume"], ("run",), RESULT, 1, False),
   "run over": Base([*room.RUN, "--out", "run", "--overwrite"], ("run",), AGENT, 1),
-  "run stops": Base([*room.RUN, "--arm", "oracle-stop", "--stops", "run", "--out", "out"], ("out",), RESULT, 0.5, False),
+  "run stops": Base([*TOLD, "--stops", "run", "--out", "out"], ("out",), RESULT, 0.5, False),
   "run own": Base([*room.RUN, "--detector", "own.py:Own", "--out", "out"], ("out",), ("own.py",), 0.3, False),
   "train": Base(["train", "walker", "--preset", "tiny", "--set", "updates=32", "--out", "out"], ("out",), (), 2),
   "train on": Base(["train", "walker", "--preset", "tiny", "--set", "updates=32", "--agent", "agent", "--out", "out"],
