@@ -206,7 +206,7 @@ def test_each_fault_and_severity_is_a_run_of_its_own(mjx, tmp_path):  # noqa: F8
   assert mjx(*plain, "--fault", "offset", "--severity", "0.6", "--out", alone)[0] == 0
 
   def own(folder):
-    """The life; a thread more sums the losses of a chunk, which nothing acts on, in another order."""
+    """The life, and losses that nothing acts on: another number of threads sums them otherwise."""
     table = pyarrow.parquet.read_table(folder / "trace.parquet").to_pydict()
     losses = [table.pop(name) for name in ("dyn_loss", "adv_mag", "value_loss")]
     return str(table), np.array(losses, float)
