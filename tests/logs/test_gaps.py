@@ -173,7 +173,7 @@ def test_what_is_no_missing_row():
 # ---- a column that is silent ---------------------------------------------------------------------
 
 
-def test_a_silent_column_is_named_and_others_judged_without_it(tmp_path, nominal, mjx):  # noqa: F811
+def test_a_silent_column_is_named_and_left_out(tmp_path, nominal, mjx):  # noqa: F811
   x = leg(3000, 1001)
   x[1400:, 0] = np.nan
   code, out, err = mjx(save(tmp_path / "ends.csv", x, NAMES), "--nominal", nominal)
