@@ -24,9 +24,10 @@ class Run(RunConfig):
   Example: mjx-cl run walker --fault gear --severity 0.5 --seeds 2 --out runs/gear
 
   Attributes:
-    fault: Faults, see `mjx-cl list faults`, or presets, see `mjx-cl list fault-presets`; `none`
-      for the healthy robot. Of several faults, severities or agents each combination is a run of
-      its own, in OUT/fault=NAME,severity=X,agent=NAME; OUT/bench.json says what they say together.
+    fault: Faults, see `mjx-cl list faults`, several at once by `gear+noise`, or presets, see
+      `mjx-cl list fault-presets`; `none` for the healthy robot. Of several faults, severities or
+      agents each combination is a run of its own, in OUT/fault=NAME,severity=X,agent=NAME;
+      OUT/bench.json says what they say together.
     severity: In [0, 1]; 0 is nominal. Default: 0.5, or the preset's own.
     agent: Trained agents: shipped names or folders; default: the robot's own (walker, car,
       quadruped-trot-2); `all`: it and its like of other training seeds.

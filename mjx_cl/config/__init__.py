@@ -209,8 +209,8 @@ class FaultConfig:
 
   Attributes:
     env: Robot, see `mjx-cl list envs`.
-    fault: Fault, see `mjx-cl list faults`, or preset, see `mjx-cl list fault-presets`; `none` for
-      the healthy robot.
+    fault: Fault, see `mjx-cl list faults`, several at once by `gear+noise`, or preset, see
+      `mjx-cl list fault-presets`; `none` for the healthy robot.
     target: Joint or part that the fault hits; `random` or None: drawn from the seed.
     severity: In [0, 1]; 0 is nominal. None: 0.5, or the preset's own.
     onset: First control step that the fault acts in. A preset that turns the robot into another one

@@ -5,6 +5,7 @@ A preset is a tuple of changes to one robot. Onsets are counted from the run's o
 one makes a sequence; equal ones act at once.
 """
 
+import pathlib
 from dataclasses import dataclass, replace
 
 from mjx_cl.config import FOREVER, RunConfig, fraction, named
@@ -206,6 +207,8 @@ def find(name: str, env_name: str) -> Preset:
   """
   shipped = env_name in {preset.robot for preset in PRESETS.values()}
   fits = lambda preset: preset.robot in (env_name, "*") or not (shipped or preset.becomes)
+  if "+" in name:
+    raise UserError(f"{name!r}: + joins faults, such as gear+noise; a preset stands alone")
   if name not in PRESETS:
     raise UserError(
       f"unknown preset {name!r}; choose from: {', '.join(n for n, p in PRESETS.items() if fits(p))}"
@@ -214,6 +217,19 @@ def find(name: str, env_name: str) -> Preset:
   if not fits(preset):
     raise UserError(f"preset {name!r} is of robot {preset.robot!r}, not of {env_name!r}")
   return preset
+
+
+def joined(fault: str) -> tuple[str, ...]:
+  """Names of the faults that `fault` joins by `+`; one name, or a file with a + in its path, is
+  itself. UserError for an empty or repeated one.
+  """
+  path, file, _ = fault.rpartition(".py:")
+  if "+" not in fault or (file and pathlib.Path(path + ".py").exists()):
+    return (fault,)
+  names = tuple(fault.split("+"))
+  if "" in names or len(set(names)) < len(names):
+    raise UserError(f"fault {fault!r} joins an empty name, or a name twice; e.g. gear+noise")
+  return names
 
 
 def resolve(
@@ -230,9 +246,10 @@ def resolve(
 
   Args:
     env_name: robot.
-    fault: name of a fault, or of a preset, which brings its own targets, severities and schedules.
-    target: see `Change`.
-    severity: in [0, 1]; None: 0.5, or the preset's.
+    fault: name of a fault; names joined by `+`, at once; or of a preset, which brings its own
+      targets, severities and schedules.
+    target: see `Change`; of one fault alone.
+    severity: in [0, 1], of each; None: 0.5, or the preset's.
     duration: control steps, where the preset leaves it open; None: never repaired.
     schedule: see `Change`.
     period: see `Change`.
@@ -242,13 +259,16 @@ def resolve(
     Changes; of a robot that becomes another one, those of that other one.
 
   Raises:
-    UserError: an unknown preset or schedule, one of another robot, a number out of range, or
-      settings that the preset brings itself.
+    UserError: an unknown preset or schedule, one of another robot, a number out of range, a fault
+      that is joined with itself, or settings that the preset brings itself.
   """
   level = Change.severity if severity is None else severity
   own = Change(fault, target, level, 0, duration, schedule, period, share)
   if not named(fault):
-    return (own,)
+    names = joined(fault)
+    if len(names) > 1 and target not in (None, "random"):
+      raise UserError(f"target {target!r} is of one fault; each of {fault!r} draws its own")
+    return tuple(replace(own, fault=name) for name in names)
   preset = find(fault, env_name)
   if severity is not None or target is not None:
     raise UserError(

@@ -82,7 +82,8 @@ def faults_of(
     UserError: what is unknown, belongs to another robot, or turns the robot into another one.
   """
   if config.fault is None or not presets.named(config.fault):
-    return faults.make(config.fault or "none", env), None, -1
+    names = presets.joined(config.fault or "none")
+    return tuple(faults.make(name, env) for name in names), None, -1
   if config.severity != 1.0:
     raise UserError(f"preset {config.fault!r} brings its own severity; leave severity out")
   changes = presets.resolve(env.spec.name, config.fault)

@@ -208,3 +208,38 @@ def test_lost_and_stuck_readings_are_those_of_realworldrl_suite(kind, fault, lev
     np.testing.assert_array_equal(got[t], want)
     held, left = want, np.maximum(left - 1, 0)
   assert begun > 50  # it was put to the test
+
+
+def test_faults_joined_by_plus_act_at_once(robots, tmp_path):
+  """One change of each name in order, all at the run's severity and clock; each acts as alone."""
+  config = RunConfig("walker", fault="gear+bias", severity=0.25, duration=50, schedule="ramp")
+  assert presets.changes(config) == tuple(
+    Change(name, None, 0.25, duration=50, schedule="ramp") for name in ("gear", "bias")
+  )
+  env = robots["walker"]
+  made, plan, _ = faults.build(presets.resolve("walker", "gear+bias", severity=0.25), env)
+  key, obs = jax.random.key(3), np.ones(len(env.spec.obs), np.float32)
+  ports = faults.Ports(env.model, ctrl=np.zeros(len(env.spec.act), np.float32))
+  both = faults.begin(made, key, plan, np.array([2, 0]))
+  both, driven, _ = faults.drive(made, both, 5, key, ports)
+  alone = [faults.begin(f, key, faults.plan(0.25), t) for f, t in zip(made, (2, 0))]
+  np.testing.assert_array_equal(
+    driven.model.mj["actuator_gear"],
+    faults.drive(made[0], alone[0], 5, key, ports)[1].model.mj["actuator_gear"],
+  )
+  seen = faults.sense(made, both, 5, key, env.model, obs)[1]
+  assert (seen != obs).any()
+  np.testing.assert_array_equal(seen, faults.sense(made[1], alone[1], 5, key, env.model, obs)[1])
+
+  own = tmp_path / "c++" / "mine.py"  # a + of a path joins nothing
+  own.parent.mkdir()
+  own.touch()
+  assert presets.joined(f"{own}:mine") == (f"{own}:mine",)
+  for fault, target, said in (
+    ("gear+gear", None, "joins an empty name, or a name twice"),
+    ("gear+", None, "joins an empty name, or a name twice"),
+    ("gear+any/all-easy", None, "a preset stands alone"),
+    ("gear+bias", "left_hip", "each of 'gear\\+bias' draws its own"),
+  ):
+    with pytest.raises(UserError, match=said):
+      presets.resolve("walker", fault, target)
