@@ -3,6 +3,7 @@
 import os
 import pathlib
 import sys
+from collections.abc import Sequence
 
 from rich import box
 
@@ -25,6 +26,9 @@ def do_compare(args: Compare) -> None:
     require(out.suffix == ".png", f"--out is a picture, .png; got {args.out}")
     require(not out.is_dir(), f"--out {out} is a folder")
     require(args.overwrite or not out.exists(), f"{out} is there; --overwrite replaces it")
+  if suite := versus.parts(list(args.runs), args.change):
+    require(out is None, "--out is a picture of one run's variants; name one part's folder")
+    return _compare_parts(args, suite)
   found = versus.variants(list(args.runs), args.change)
   if other := versus.unlike(found):
     say(f"note: these runs differ in {', '.join(other)}")
@@ -39,6 +43,58 @@ def do_compare(args: Compare) -> None:
     print(figures.versus(found, out), file=sys.stderr if args.json else sys.stdout)
 
 
+def _compare_parts(args: Compare, suite: list[versus.Part]) -> None:
+  """A line for each part and variant, and over the parts how often a difference is told from 0."""
+  measures = args.measure or ("reward_final", "return_lost", "terminations")
+  rows, lines = [], {}
+  for part in suite:
+    if other := versus.unlike(part.found):
+      say(f"note: {part.name}: the runs differ in {', '.join(other)}")
+    first, *others = part.found
+    for one in others:
+      line = lines[part.name, one.name] = [versus.against(one, first, m) for m in measures]
+      rows += [{"part": part.name, "against": first.name} | row for row in line]
+  if args.json:
+    emit(rows)
+    return
+  cells = [
+    (part, variant, line[0]["pairs"], *(_difference(row) for row in line))
+    for (part, variant), line in lines.items()
+  ]
+  for variant in dict.fromkeys(variant for _, variant in lines):
+    mine = [line for (_, name), line in lines.items() if name == variant]
+    cells.append((f"{len(mine)} parts", variant, "", *map(_told, zip(*mine))))
+  heads = ("part", "variant", "pairs", *measures)
+  console().print(table(heads, cells, left=heads[:2], box=box.SIMPLE, pad_edge=False))
+  firsts = ", ".join(dict.fromkeys(part.found[0].name for part in suite))
+  print(
+    f"difference from {firsts}, mean over pairs of one seed [95 % interval of each part by itself: "
+    "one in twenty leaves out 0 by chance]; last: parts whose interval leaves out 0"
+  )
+  for what, more in (versus.MEASURES[m] for m in measures):
+    print(f"{what}: {'more' if more else 'less'} is better")
+  if any(0 < line[0]["pairs"] < FEW for line in lines.values()):
+    print(f"fewer than {FEW} pairs: such intervals are too narrow; take more seeds")
+
+
+def _number(x: float | None) -> str:
+  return "-" if x is None else f"{x:.3g}" if abs(x) < 1e3 else f"{x:.0f}"
+
+
+def _difference(row: dict) -> str:
+  """A difference and its interval."""
+  ci = row["difference_ci"]
+  return _number(row["difference"]) + (f" [{_number(ci[0])}, {_number(ci[1])}]" if ci else "")
+
+
+def _told(rows: Sequence[dict]) -> str:
+  """Of parts, in how many a measure is better and in how many worse, told from 0."""
+  sign = 1 if versus.MEASURES[rows[0]["measure"]][1] else -1
+  ends = [sorted(sign * x for x in row["difference_ci"]) for row in rows if row["difference_ci"]]
+  better, worse = sum(low > 0 for low, _ in ends), sum(high < 0 for _, high in ends)
+  return f"{better} better, {worse} worse"
+
+
 def _better(row: dict) -> str:
   """Share of pairs in which a variant is better; where none differs, that."""
   if row["better"] is None:
@@ -49,7 +105,7 @@ def _better(row: dict) -> str:
 
 def _show_comparison(rows: list[dict], first: str) -> None:
   """A table for each measure: a line for each variant, intervals beneath the numbers."""
-  number = lambda x: "-" if x is None else f"{x:.3g}" if abs(x) < 1e3 else f"{x:.0f}"
+  number = _number
   between = lambda x: "" if x is None else f"\n[{number(x[0])}, {number(x[1])}]"
   shared = os.path.commonprefix([row["variant"] for row in rows]).rfind("/") + 1
   heads = ("variant", "n", "IQM", "pairs", "difference", "better")

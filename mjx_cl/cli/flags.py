@@ -287,14 +287,16 @@ class Plot:
 @dataclass(frozen=True)
 class Compare:
   """Finished runs of one robot against each other, or the arms of one: interquartile means, and
-  differences of the streams of a seed from the first one's, with 95 % bootstrap intervals.
+  differences of the streams of a seed from the first one's, with 95 % bootstrap intervals. Of
+  folders of `bench`, or of `run` with several faults, a line for each part.
 
   Example: mjx-cl compare runs/mine runs/theirs:rollback --out compare.png
 
   Attributes:
     runs: FOLDER or FOLDER:ARM; of one folder alone all of its arms, of several the arm `detector`.
       The first is what the others are compared with.
-    measure: reward_final, reward_kept, return_lost, terminations, updates; default: all.
+    measure: reward_final, reward_kept, return_lost, terminations, updates; default: all, of
+      parts the first, third and fourth.
     out: Picture (.png): shares of streams that keep so much of their reward.
     change: Of the robot: 0 the first, its fault; 1 what came next, as a repair.
     overwrite: Replace --out.

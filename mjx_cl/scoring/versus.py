@@ -38,6 +38,63 @@ class Variant(NamedTuple):
   rows: dict[int, dict[str, Any]]
 
 
+class Part(NamedTuple):
+  """A run that several folders hold, or one with several arms.
+
+  Attributes:
+    name: folder of the run below that of the suite.
+    found: its variants, the first the one that the others are compared with.
+  """
+
+  name: str
+  found: list[Variant]
+
+
+def _split(word: str) -> tuple[pathlib.Path, str]:
+  """FOLDER or FOLDER:ARM -> folder, arm ("" where none is named); an arm may have colons of its
+  own, FILE.py:make.
+  """
+  folders = [word[:i] for i, x in enumerate(word) if x == ":" and pathlib.Path(word[:i]).is_dir()]
+  folder = word if pathlib.Path(word).is_dir() else (folders or [word.rpartition(":")[0]])[-1]
+  return pathlib.Path(folder or word), word[len(folder) + 1 :] if folder else ""
+
+
+def _runs(folder: pathlib.Path) -> dict[str, pathlib.Path]:
+  """Finished runs below a folder that is none itself, by name; none of a run."""
+  if (folder / "runs.parquet").is_file():
+    return {}
+  files = sorted(folder.glob("*/runs.parquet")) + sorted(folder.glob("*/*/runs.parquet"))
+  return {file.parent.relative_to(folder).as_posix(): file.parent for file in files}
+
+
+def parts(words: list[str], change: int = 0) -> list[Part]:
+  """The runs that all of these folders of suites hold, each as `variants` reads it; [] where none
+  of the words is such a folder.
+
+  Raises:
+    UserError: a run beside a folder of runs, no run that all of them hold, and as `variants`.
+  """
+  below = [_runs(home) for home, _ in map(_split, words)]
+  if not any(below):
+    return []
+  if not all(below):
+    lone = words[[bool(x) for x in below].index(False)]
+    raise UserError(f"{lone} holds no runs of a suite, the others do; compare like with like")
+  names = [name for name in below[0] if all(name in there for there in below)]
+  if not names:
+    raise UserError("these folders have no finished run of one name: " + ", ".join(words))
+  arms = [arm for _, arm in map(_split, words)]
+  label = lambda word, one: word if _split(word)[1] else f"{word}:{one.name.rpartition(':')[2]}"
+  out = []
+  for name in names:
+    own = [f"{there[name]}:{arm}" if arm else str(there[name]) for there, arm in zip(below, arms)]
+    found = variants(own, change)
+    if len(words) > 1:
+      found = [one._replace(name=label(word, one)) for word, one in zip(words, found)]
+    out.append(Part(name, found))
+  return out
+
+
 def variants(words: list[str], change: int = 0) -> list[Variant]:
   """Reads FOLDER or FOLDER:ARM each; of one folder alone all of its arms, of several the arm that
   is their only one, or `detector`.
@@ -51,12 +108,7 @@ def variants(words: list[str], change: int = 0) -> list[Variant]:
   """
   found: list[Variant] = []
   seen: set[tuple[pathlib.Path, str]] = set()
-  for word in words:
-    # an arm may have colons of its own, FILE.py:make
-    folders = [word[:i] for i, x in enumerate(word) if x == ":" and pathlib.Path(word[:i]).is_dir()]
-    folder = word if pathlib.Path(word).is_dir() else (folders or [word.rpartition(":")[0]])[-1]
-    arm = word[len(folder) + 1 :] if folder else ""
-    home = pathlib.Path(folder or word)
+  for home, arm in map(_split, words):
     if not (home / "runs.parquet").is_file() or not (home / "config.json").is_file():
       raise FileError(f"{home} holds no finished run (no runs.parquet)")
     rows = tables.read_rows(home / "runs.parquet")

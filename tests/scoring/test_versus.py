@@ -153,6 +153,37 @@ def test_the_command(mjx, tmp_path):
   assert mjx(a, "--out", out, "--overwrite")[0] == 0
 
 
+def test_the_parts_of_a_suite_are_compared_one_by_one(tmp_path, mjx):
+  """A line for each part that all have, and how often a difference is told from 0."""
+  for name, parts in {"one": "ab", "two": "abc"}.items():
+    for k, part in enumerate(parts):
+      low = [0.5, 0.6, 0.7] if name == "one" else [0.9, 1.0, 1.3 - k]
+      arms = {"detector": low, "none": [x - 0.1 for x in low]}
+      run_of(tmp_path / name / "walker" / f"fault={part}", arms)
+  one, two = tmp_path / "one", tmp_path / "two"
+  code, text, _ = mjx(one, two, "--json", "--measure", "reward_final")
+  assert code == 0
+  rows = {row["part"]: row for row in json.loads(text)}
+  assert set(rows) == {"walker/fault=a", "walker/fault=b"}
+  assert rows["walker/fault=a"]["difference"] == pytest.approx((0.4 + 0.4 + 0.6) / 3)
+  assert rows["walker/fault=b"]["difference"] == pytest.approx((0.4 + 0.4 - 0.4) / 3)
+  assert {(r["against"], r["variant"]) for r in rows.values()} == {
+    (f"{one}:detector", f"{two}:detector")
+  }
+  text = mjx(one, two, "--measure", "reward_final")[1]
+  assert "2 parts" in text and "1 better, 0 worse" in text
+  text = mjx(two, "--measure", "reward_final", "return_lost")[1]  # its arms
+  assert "3 parts" in text and "0 better, 3 worse" in text and "0 better, 0 worse" in text
+  for argv, words in (
+    ((one, two / "walker" / "fault=a"), "holds no runs of a suite"),
+    ((one / "walker", two), "no finished run of one name"),
+    ((one, one), "is there twice"),
+    ((one, two, "--out", tmp_path / "x.png"), "one run's variants"),
+  ):
+    code, _, err = mjx(*argv)
+    assert code == 2 and words in err and err.count("\n") == 1
+
+
 @pytest.mark.parametrize(
   "argv, code, words",
   [
