@@ -10,6 +10,7 @@ import jax.numpy as jnp
 
 from mjx_cl.envs.car import Car
 from mjx_cl.envs.car_real import CarReal
+from mjx_cl.envs.external import LIBRARIES
 from mjx_cl.envs.quadruped import Quadruped
 from mjx_cl.envs.walker import Walker
 from mjx_cl.errors import PluginError, UserError, choose
@@ -21,6 +22,7 @@ ENVS = Registry(
   "mjx_cl.envs",
   "environment",
   {"walker": Walker, "quadruped": Quadruped, "car": Car, "car_real": CarReal},
+  LIBRARIES,
 )
 
 

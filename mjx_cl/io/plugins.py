@@ -14,7 +14,7 @@ import pathlib
 import sys
 import traceback
 import types
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from mjx_cl.errors import FileError, PluginError, UserError
@@ -30,6 +30,7 @@ class Registry(collections.UserDict):
     group: of entry points, such as `mjx_cl.faults`.
     kind: what a message calls a member.
     own: the members that are there already.
+    libraries: what makes a member of another library by its name there, "library:name".
 
   Raises:
     PluginError: at each use, one line: a name that is taken, a module that cannot be loaded, a
@@ -37,7 +38,14 @@ class Registry(collections.UserDict):
     UserError: a name with a colon where nothing of that name is.
   """
 
-  def __init__(self, group: str, kind: str, own: dict[str, Any]) -> None:
+  def __init__(
+    self,
+    group: str,
+    kind: str,
+    own: dict[str, Any],
+    libraries: Mapping[str, Callable[[str], Any]] = types.MappingProxyType({}),
+  ) -> None:
+    self.libraries = libraries
     self.group, self.kind, self.own, self.filled, self.members = (
       group,
       kind,
@@ -90,8 +98,17 @@ class Registry(collections.UserDict):
 
   def __missing__(self, name: object) -> Any:
     if isinstance(name, str) and ":" in name:
+      library, _, its = name.partition(":")
+      if library in self.libraries:
+        return _of_library(self.libraries[library], its)
       return find(name, self.kind)
     raise KeyError(name)
+
+
+@functools.cache
+def _of_library(make: Callable[[str], Any], name: str) -> Callable[[], Any]:
+  """The same object for the same name, by which programs are shared."""
+  return functools.partial(make, name)
 
 
 def line(e: BaseException, lines: int | None = None) -> str:

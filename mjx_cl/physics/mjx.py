@@ -20,7 +20,7 @@ with contextlib.redirect_stdout(io.StringIO()):
 
 class Mjx:
   """MuJoCo XLA. Arguments and methods as `native.Native`; float32 throughout; state is an
-  `mjx.Data`.
+  `mjx.Data`. `model`: the mjx.Model of `mj_model`, where there is one already.
   """
 
   name = "mjx"
@@ -31,12 +31,13 @@ class Mjx:
     substeps: int,
     outputs: tuple[str, ...] = ("qpos", "qvel"),
     law: Callable[..., Any] | None = None,
+    model: mjx.Model | None = None,
   ) -> None:
     self.mj_model, self.substeps, self.outputs, self.law = mj_model, substeps, tuple(outputs), law
     # MJX decides at compile time which constraints exist
     self.inert = () if (mj_model.dof_frictionloss > 0).any() else ("dof_frictionloss",)
     self._forward = any(o not in ("qpos", "qvel") for o in outputs)
-    self._model = _anywhere(mjx.put_model(mj_model, impl="jax"))
+    self._model = _anywhere(mjx.put_model(mj_model, impl="jax") if model is None else model)
     self._data = _anywhere(mjx.make_data(mj_model, impl="jax"))
 
   def init(self, qpos: jax.Array, qvel: jax.Array) -> mjx.Data:
