@@ -14,22 +14,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import mujoco
-import numpy as np
 
+from mjx_cl.envs.mjcf import FIELDS, describe
 from mjx_cl.errors import UserError, choose
-from mjx_cl.types import EnvState, Model, Spec, Step, Var
-
-FIELDS = (
-  "actuator_gear",
-  "geom_friction",
-  "body_mass",
-  "body_inertia",
-  "body_ipos",
-  "dof_armature",
-  "dof_damping",
-  "dof_frictionloss",
-  "jnt_range",
-)  # that faults own; gravity is an option
+from mjx_cl.types import EnvState, Model, Step
 
 
 class Held(NamedTuple):
@@ -67,7 +55,7 @@ class External:
   An episode terminates where `done` is set and is truncated after `episode_steps`. What a fault
   owns replaces the fields of the environment's mjx.Model for that step, with the constants that
   follow from masses (physics.mjx); forces go to qfrc_applied. The reward and its weights are the
-  environment's own. Feet are the geoms that may touch something of bodies without children.
+  environment's own.
 
   Raises:
     UserError: an observation that is not one vector.
@@ -88,14 +76,20 @@ class External:
     self.env, self.access, self.mj_model = env, access, mj_model
     own = getattr(env, access.model)
     self.physics = Mjx(mj_model, 1, model=own)
-    fields = [field for field in FIELDS if field not in self.physics.inert]
+    fields = [field for field in FIELDS if field not in ("gravity", *self.physics.inert)]
     self.model = Model(
       {field: jnp.asarray(getattr(own, field), jnp.float32) for field in fields}
       | {"gravity": jnp.asarray(own.opt.gravity, jnp.float32)},
       {},
       jnp.zeros(mj_model.nv),
     )
-    self.spec = self._spec(name, episode_steps, acceptance, scale)
+    obs = vector(jax.eval_shape(env.reset, jax.random.key(0)).obs)
+    if len(obs.shape) != 1:
+      raise UserError(f"robot {name!r} observes arrays of shape {obs.shape}; one vector is needed")
+    names = tuple(f"obs_{i}" for i in range(obs.shape[0]))
+    self.spec = describe(
+      mj_model, name, names, float(env.dt), episode_steps, acceptance, scale=scale
+    )
 
   def init(self, model: Model, key: jax.Array) -> tuple[EnvState, jax.Array]:
     """A fresh episode drawn from `key`: state and observation."""
@@ -125,54 +119,12 @@ class External:
   def _held(self, state: Any) -> Held:
     return Held(getattr(state, self.access.data), state.replace(**{self.access.data: None}))
 
-  def _spec(
-    self, name: str, episode_steps: int, acceptance: float, scale: float | Sequence[float]
-  ) -> Spec:
-    host = self.mj_model
-    state = jax.eval_shape(self.env.reset, jax.random.key(0))
-    obs = vector(state.obs)
-    if obs.ndim != 1:
-      raise UserError(f"robot {name!r} observes arrays of shape {obs.shape}; one vector is needed")
-    scales = np.broadcast_to(np.asarray(scale, np.float32), obs.shape)
-    motors = tuple(_motor(host, i) for i in range(host.nu))
-    bodies = [b for b in range(1, host.nbody) if host.body_mass[b] > 0]
-    parents = set(host.body_parentid.tolist())
-    feet: dict[str, tuple[int, ...]] = {}
-    for geom in range(host.ngeom):
-      body = host.geom_bodyid[geom]
-      touches = host.geom_contype[geom] or host.geom_conaffinity[geom]
-      if body > 0 and int(body) not in parents and touches:
-        feet[_body(host, body)] = (*feet.get(_body(host, body), ()), geom)
-    return Spec(
-      name=name,
-      obs=tuple(Var(f"obs_{i}", "1", scale=float(x)) for i, x in enumerate(scales)),
-      act=tuple(Var(motor, "1", -1, 1) for motor in motors),
-      control_s=float(self.env.dt),
-      episode_steps=episode_steps,
-      acceptance=acceptance,
-      posture=None,
-      targets=motors,
-      feet=tuple(feet.items()),
-      bodies=tuple((_body(host, b), (b,)) for b in bodies),
-    )
-
 
 def vector(obs: Any) -> Any:
   """The observation; of a dict what the policy sees, `state`."""
   if isinstance(obs, dict):
     return choose("observation", "state", obs)
   return obs
-
-
-def _motor(host: mujoco.MjModel, i: int) -> str:
-  """Name of an actuator, else of the joint that it drives."""
-  joint = host.actuator_trnid[i, 0]
-  drives = host.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT
-  return host.actuator(i).name or (host.joint(joint).name if drives else "") or f"actuator_{i}"
-
-
-def _body(host: mujoco.MjModel, i: int) -> str:
-  return host.body(i).name or f"body_{i}"
 
 
 def from_brax(

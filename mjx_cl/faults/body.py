@@ -175,9 +175,13 @@ DIRECTIONS = {
 
 
 def heading_targets(env: Any, names: Iterable[str]) -> tuple[tuple[str, ...], Float[Array, "..."]]:
-  """Names and unit vectors of the directions in which the robot's trunk is free to move."""
+  """Names and unit vectors of the directions in which the robot's trunk is free to move; UserError
+  where it is in none.
+  """
   free = np.abs(force_map(env)).sum(1) > 0
   kept = [n for n in names if free[np.flatnonzero(DIRECTIONS[n])[0]]]
+  if not kept:
+    raise UserError(f"robot {env.spec.name!r} has no trunk that is free to move")
   return tuple(kept), jnp.asarray([DIRECTIONS[n] for n in kept], jnp.float32)
 
 
