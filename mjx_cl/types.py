@@ -12,6 +12,8 @@ if TYPE_CHECKING:
 else:  # of annotations whose shapes tests check: NumPy's arrays are taken as JAX's
   Array = jax.Array | np.ndarray
 
+GROUPS = 8  # parts of an observation with a residual of their own
+
 
 class Model(NamedTuple):
   """What a fault may change.

@@ -3,6 +3,7 @@
 """
 
 import inspect
+from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -16,7 +17,7 @@ from mjx_cl.envs.walker import Walker
 from mjx_cl.errors import PluginError, UserError, choose
 from mjx_cl.io.plugins import Registry, line, of_user
 from mjx_cl.physics import PURE_JAX
-from mjx_cl.types import Spec, Step
+from mjx_cl.types import GROUPS, Spec, Step
 
 ENVS = Registry(
   "mjx_cl.envs",
@@ -69,21 +70,63 @@ def make(name: str, physics: str = "auto") -> Any:
 
 
 def _try(name: str, robot: Any) -> None:
-  """Traces a step of a robot of another package; PluginError where that gives something else than
-  its spec says.
+  """Traces two steps of a robot of another package; PluginError where that gives something else
+  than the contract and the robot's spec say.
   """
+  complain = lambda text: PluginError(f"environment {name!r}: {text}")
+  size = len(robot.spec.obs)
+  if wrong := next(_misfits(robot), None):
+    raise complain(wrong)
+  first = jax.eval_shape(lambda: robot.init(robot.model, jax.random.key(0)))
+  if not (isinstance(first, tuple) and len(first) == 2 and hasattr(first[0], "step")):
+    raise complain("init gives no (EnvState, observation)")
+  state, obs = first
+  if getattr(obs, "shape", None) != (size,):
+    raise complain(f"init gives an observation that is not of its spec's {size} variables")
+  act = jax.ShapeDtypeStruct((len(robot.spec.act),), jnp.float32)
 
-  def one() -> tuple[Any, Any]:
-    state, obs = robot.init(robot.model, jax.random.key(0))
-    state, out = robot.step(robot.model, state, jnp.zeros(len(robot.spec.act)))
+  def one(state: Any, action: jax.Array) -> tuple[Any, Step]:
+    given = robot.step(robot.model, state, action)
+    out = given[1] if isinstance(given, tuple) and len(given) == 2 else given
     if not isinstance(out, Step):
-      gave = type(out).__name__
-      raise PluginError(f"environment {name!r}: step gives {gave} in place of a Step")
-    return obs, out.obs
+      raise complain(f"step gives {type(out).__name__} in place of a Step")
+    return given
 
-  for what, value in zip(("init", "step"), jax.eval_shape(one)):
-    if getattr(value, "shape", None) != (len(robot.spec.obs),):
-      raise PluginError(
-        f"environment {name!r}: {what} gives an observation that is not of its spec's "
-        f"{len(robot.spec.obs)} variables"
-      )
+  after, out = jax.eval_shape(one, state, act)
+  for field, value in out._asdict().items():
+    want = (size,) if "obs" in field else ()
+    if value.shape != want:
+      held = f"its spec's {size} variables" if want else "one number"
+      raise complain(f"step gives {field} of shape {value.shape}, which is not {held}")
+    if (value.dtype == jnp.bool_) != (field in ("terminated", "truncated")):
+      raise complain(f"step gives {field} of type {value.dtype}")
+  was, now = (_forms(x) for x in (state, after))
+  if was != now:
+    at = next((k for k in was.keys() | now.keys() if was.get(k) != now.get(k)), "its structure")
+    raise complain(
+      f"step gives a state whose {at} is {now.get(at, 'missing')}; init gave {was.get(at, 'none')}"
+    )
+
+
+def _forms(tree: Any) -> dict[str, str]:
+  """Type and shape of every leaf, by its place."""
+  leaves = jax.tree_util.tree_leaves_with_path(tree)
+  return {jax.tree_util.keystr(path).strip("."): f"{x.dtype}{list(x.shape)}" for path, x in leaves}
+
+
+def _misfits(robot: Any) -> Iterator[str]:
+  """What of a spec does not fit itself or the robot's MuJoCo model."""
+  spec, host = robot.spec, getattr(robot, "mj_model", None)
+  sizes = {"act_groups": len(spec.act), "obs_groups": len(spec.obs), "watched": len(spec.obs)}
+  if host is not None:
+    sizes |= {"bodies": host.nbody, "feet": host.ngeom}
+  for field, size in sizes.items():
+    for group, indices in getattr(spec, field):
+      if not indices or not all(0 <= i < size for i in indices):
+        yield f"spec.{field}: {group!r} must hold indices in 0..{size - 1}; got {tuple(indices)}"
+  if len(spec.watched) > GROUPS:
+    yield f"spec.watched has {len(spec.watched)} parts; at most {GROUPS}"
+  if spec.posture is not None and not 0 <= spec.posture[0] < len(spec.obs):
+    yield f"spec.posture: index {spec.posture[0]} is not in 0..{len(spec.obs) - 1}"
+  if len(spec.targets) > len(spec.act):
+    yield f"spec.targets names {len(spec.targets)} of {len(spec.act)} actions"

@@ -28,9 +28,8 @@ from mjx_cl.dreamer import rssm
 from mjx_cl.errors import UserError
 from mjx_cl.keys import OfMonitor
 from mjx_cl.rollout.scan import Row
-from mjx_cl.types import Array, Spec, Var
+from mjx_cl.types import GROUPS, Array, Spec, Var
 
-GROUPS = 8  # parts of the observation with a residual of their own
 LATENT = 16  # dimensions of the latent's projection
 # channels of one number, in the order of every table of them: name -> what it is
 CHANNELS = {

@@ -793,10 +793,17 @@ def test_foreign_code_ends_no_command_but_in_a_line(tmp_path, capfd, command, na
 @pytest.mark.parametrize(
   "step, said",
   [
-    ("return None", "cannot be built: TypeError: cannot unpack"),
+    ("return None", "step gives NoneType in place of a Step"),
     ("return state, 7", "step gives int in place of a Step"),
     ("raise SystemExit(3)", "cannot be built: SystemExit: 3"),
     ("return state, Step(obs[:1], obs[0], obs[0] > 0, obs[0] > 0, obs[:1])", "spec's 2 variables"),
+    ("return state, Step(obs, obs[:1], obs[0] > 0, obs[0] > 0, obs)", r"reward of shape \(1,\)"),
+    ("return state, Step(obs, obs[0], obs[0], obs[0] > 0, obs)", "terminated of type float32"),
+    ("return state, Step(obs, obs[0], obs[0] > 0, obs[0] > 0, obs[:1])", r"final_obs of shape \(1"),
+    (
+      "return EnvState(obs, 1.0 * state.step), Step(obs, obs[0], obs[0] > 0, obs[0] > 0, obs)",
+      r"a state whose step is float32\[\]; init gave int32\[\]",
+    ),
   ],
 )
 def test_a_robot_that_answers_wrongly_is_one_line(tmp_path, step, said):
@@ -806,6 +813,22 @@ def test_a_robot_that_answers_wrongly_is_one_line(tmp_path, step, said):
   with pytest.raises(PluginError, match=said) as e:
     envs.make(f"{tmp_path / 'mine.py'}:Reach")
   assert "\n" not in str(e.value)
+
+
+@pytest.mark.parametrize(
+  "own, said",
+  [
+    ("posture=(2, 0.5)", r"spec.posture: index 2 is not in 0..1"),
+    ("posture=None, watched=(('x', (0, 2)),)", r"spec.watched: 'x' must hold indices in 0..1"),
+    ("posture=None, watched=(('x', (0,)),) * 9", "spec.watched has 9 parts; at most 8"),
+    ("posture=None, act_groups=(('leg', ()),)", r"spec.act_groups: 'leg' must hold indices"),
+  ],
+)
+def test_a_spec_that_does_not_fit_itself_is_one_line(tmp_path, own, said):
+  head = "import jax, jax.numpy as jnp\nfrom mjx_cl.types import EnvState, Model, Spec, Step, Var\n"
+  (tmp_path / "mine.py").write_text(head + REACH.replace("posture=None", own))
+  with pytest.raises(PluginError, match=said):
+    envs.make(f"{tmp_path / 'mine.py'}:Reach")
 
 
 def test_what_a_users_file_raises_later_names_file_and_line(tmp_path):
