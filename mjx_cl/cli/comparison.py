@@ -26,13 +26,18 @@ def do_compare(args: Compare) -> None:
     require(out.suffix == ".png", f"--out is a picture, .png; got {args.out}")
     require(not out.is_dir(), f"--out {out} is a folder")
     require(args.overwrite or not out.exists(), f"{out} is there; --overwrite replaces it")
-  if suite := versus.parts(list(args.runs), args.change):
+  if args.by is not None:
+    require(len(args.runs) == 1, "--by compares the runs below one folder")
+    suite = versus.by(args.runs[0], args.by, args.change)
+  else:
+    suite = versus.parts(list(args.runs), args.change)
+  if suite:
     require(out is None, "--out is a picture of one run's variants; name one part's folder")
     return _compare_parts(args, suite)
   found = versus.variants(list(args.runs), args.change)
   if other := versus.unlike(found):
     say(f"note: these runs differ in {', '.join(other)}")
-  rows = [r for r in versus.compare(found) if not args.measure or r["measure"] in args.measure]
+  rows = versus.compare(found, args.measure or versus.ALL)
   if args.json:
     emit(rows)
   else:
@@ -48,7 +53,7 @@ def _compare_parts(args: Compare, suite: list[versus.Part]) -> None:
   measures = args.measure or ("reward_final", "return_lost", "terminations")
   rows, lines = [], {}
   for part in suite:
-    if other := versus.unlike(part.found):
+    if other := [k for k in versus.unlike(part.found) if k != args.by]:
       say(f"note: {part.name}: the runs differ in {', '.join(other)}")
     first, *others = part.found
     for one in others:

@@ -295,8 +295,9 @@ class Compare:
   Attributes:
     runs: FOLDER or FOLDER:ARM; of one folder alone all of its arms, of several the arm `detector`.
       The first is what the others are compared with.
-    measure: reward_final, reward_kept, return_lost, terminations, updates; default: all, of
-      parts the first, third and fourth.
+    measure: reward_final, reward_kept, return_lost, terminations, updates, alarmed, latency_steps,
+      false_alarms, recovered; default: the first five, of parts the first, third and fourth.
+    by: Setting that the suite in one folder varies, such as detector: its runs against each other.
     out: Picture (.png): shares of streams that keep so much of their reward.
     change: Of the robot: 0 the first, its fault; 1 what came next, as a repair.
     overwrite: Replace --out.
@@ -304,6 +305,7 @@ class Compare:
 
   runs: Positional[tuple[str, ...]]
   measure: tuple[str, ...] = ()
+  by: str | None = None
   change: int = 0
   out: str | None = None
   json: bool = False

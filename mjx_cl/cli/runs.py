@@ -14,7 +14,7 @@ from mjx_cl.cli.flags import Bench, Run
 from mjx_cl.cli.live import RunDisplay
 from mjx_cl.cli.machines import WORKER
 from mjx_cl.cli.output import clock, emit, say
-from mjx_cl.cli.tables import show_agents, show_summary
+from mjx_cl.cli.tables import show_agents, show_suite, show_summary
 from mjx_cl.config import RunConfig, quick
 from mjx_cl.errors import UserError, require
 from mjx_cl.io import folders, memory
@@ -124,7 +124,10 @@ def do_bench(args: Bench) -> None:
 
 
 def show_parts(value: dict, out: pathlib.Path) -> None:
-  """Prints the table of each part of bench.json's value."""
+  """Prints what the parts of bench.json's value say, several in one table."""
+  if len(value["entries"]) > 1:
+    show_suite(value["entries"])
+    return
   for name, summary in value["entries"].items():
     print(f"{name}: ", end="")
     show_summary(summary, str(out / name))

@@ -135,6 +135,13 @@ def show_summary(s: dict, out: str) -> None:
   print(f"files in {out}")
 
 
+def show_suite(entries: Mapping[str, dict]) -> None:
+  """Prints the parts of a suite in one table: a row for each part and arm."""
+  rows = [((name, arm), own) for name, s in entries.items() for arm, own in s["arms"].items()]
+  lived = max(s["steps"] - s["onset"] for s in entries.values())
+  _explain(_show_arms(("part", "arm"), rows, lived), "95 % interval", "bench.json")
+
+
 def show_agents(together: dict, apart: Mapping[str, dict]) -> None:
   """Prints what runs of several agents say: of each arm a row for all, then one for each agent.
 

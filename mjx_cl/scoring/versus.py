@@ -4,6 +4,7 @@ Statistical Precipice").
 """
 
 import pathlib
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,7 +21,13 @@ MEASURES: dict[str, tuple[str, bool]] = {
   "return_lost": ("return lost after the onset", False),
   "terminations": ("falls or crashes", False),
   "updates": ("gradient steps of the learner", False),
+  "alarmed": ("share of streams that alarm after the onset", True),
+  "latency_steps": ("control steps from the onset to the alarm, of those that alarm", False),
+  "false_alarms": ("alarms before the onset", False),
+  "recovered": ("share of affected streams that recover", True),
 }
+ALL = tuple(MEASURES)[:5]  # of a comparison that names none
+SHARES = ("alarmed", "recovered")  # their middle is a mean
 MUST_AGREE = (*stop_rule.SAME, "steps", "seeds", "first_seed")
 
 
@@ -95,6 +102,41 @@ def parts(words: list[str], change: int = 0) -> list[Part]:
   return out
 
 
+def by(word: str, setting: str, change: int = 0) -> list[Part]:
+  """The runs below a folder of a suite that differ in a setting that the suite varies, such as
+  `detector`, against each other: a Part for each combination of the others.
+
+  Args:
+    word: FOLDER or FOLDER:ARM; without an arm `detector`.
+    setting: as in the names of the runs, `detector=cusum,severity=0.5`.
+    change: as of `variants`.
+
+  Raises:
+    UserError: a setting that no two runs differ in, and as `variants`.
+  """
+  home, arm = _split(word)
+  groups: dict[str, dict[str, pathlib.Path]] = {}
+  varied: set[str] = set()
+  for name, folder in _runs(home).items():
+    entry, _, last = name.rpartition("/")
+    labels = last.split(",")
+    varied |= {label.partition("=")[0] for label in labels if "=" in label}
+    own = [label for label in labels if label.startswith(f"{setting}=")]
+    if own:
+      rest = ",".join(label for label in labels if label not in own)
+      key = "/".join(filter(None, (entry, rest))) or "."
+      groups.setdefault(key, {})[own[0]] = folder
+  groups = {key: runs for key, runs in groups.items() if len(runs) > 1}
+  if not groups:
+    known = ", ".join(sorted(varied)) or "nothing"
+    raise UserError(f"no two runs below {home} differ in {setting}; its parts vary {known}")
+  out = []
+  for key, runs in groups.items():
+    found = variants([f"{folder}:{arm or 'detector'}" for folder in runs.values()], change)
+    out.append(Part(key, [one._replace(name=label) for label, one in zip(runs, found)]))
+  return out
+
+
 def variants(words: list[str], change: int = 0) -> list[Variant]:
   """Reads FOLDER or FOLDER:ARM each; of one folder alone all of its arms, of several the arm that
   is their only one, or `detector`.
@@ -153,6 +195,12 @@ def value(row: dict[str, Any], measure: str) -> float:
   if measure == "reward_kept":
     before, after = row["reward_pre"], row["reward_final"]
     return after / before if before and before > 0 and after is not None else np.nan
+  if measure in ("alarmed", "latency_steps") and row.get("adapting_at_onset"):
+    return np.nan  # it was finetuning when the change came
+  if measure == "alarmed":
+    return float(row["latency_steps"] is not None)
+  if measure == "recovered":
+    return float(row["recovery_step"] is not None) if row.get("affected") else np.nan
   return np.nan if row.get(measure) is None else float(row[measure])
 
 
@@ -160,9 +208,9 @@ def against(one: Variant, first: Variant, measure: str) -> dict[str, Any]:
   """A variant's measure and its difference from the first variant's.
 
   Returns:
-    streams (one a seed), iqm and iqm_ci of the variant; pairs (of the same seed in both),
-    difference (mean of variant - first over the pairs), difference_ci (bootstrap over pairs),
-    better (share of the pairs in which the variant is better, ties half).
+    streams (one a seed), iqm and iqm_ci of the variant, of a share its mean; pairs (of the same
+    seed in both), difference (mean of variant - first over the pairs), difference_ci (bootstrap
+    over pairs), better (share of the pairs in which the variant is better, ties half).
   """
   own = np.array([value(row, measure) for row in one.rows.values()])
   own = own[np.isfinite(own)]
@@ -174,12 +222,13 @@ def against(one: Variant, first: Variant, measure: str) -> dict[str, Any]:
   gain = pairs[:, 0] - pairs[:, 1]
   sign = 1 if MEASURES[measure][1] else -1
   mean = lambda x, axis=-1: np.mean(x, axis)
+  middle = mean if measure in SHARES else intervals.iqm
   return {
     "variant": one.name,
     "measure": measure,
     "streams": len(own),
-    "iqm": float(intervals.iqm(own)) if len(own) else None,
-    "iqm_ci": intervals.interval(own),
+    "iqm": float(middle(own)) if len(own) else None,
+    "iqm_ci": intervals.interval(own, middle),
     "pairs": len(gain),
     "difference": float(gain.mean()) if len(gain) else None,
     "difference_ci": intervals.interval(gain, mean),
@@ -187,9 +236,9 @@ def against(one: Variant, first: Variant, measure: str) -> dict[str, Any]:
   }
 
 
-def compare(found: list[Variant]) -> list[dict[str, Any]]:
+def compare(found: list[Variant], measures: Sequence[str] = ALL) -> list[dict[str, Any]]:
   """Rows of `against` for every measure and variant, the first with itself included."""
-  return [against(one, found[0], measure) for measure in MEASURES for one in found]
+  return [against(one, found[0], measure) for measure in measures for one in found]
 
 
 def profile(one: Variant, levels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -266,6 +266,28 @@ def test_a_runs_table_keeps_to_the_terminal(capsys, monkeypatch, columns):
   assert "files in runs/x" in text
 
 
+def test_the_parts_of_a_suite_are_one_table(capsys, monkeypatch):
+  """A row for each part and arm, the part's own numbers in it."""
+  monkeypatch.setenv("COLUMNS", "200")
+  entries = store.read_json(pathlib.Path(__file__).parents[2] / "results/full/bench.json")[
+    "entries"
+  ]
+  two = dict(list(entries.items())[:2])
+  shown.show_suite(two)
+  text = capsys.readouterr().out
+  rows = [
+    [cell.strip() for cell in line.split("│")[1:-1]] for line in text.splitlines() if "│" in line
+  ]
+  rows = [row for row in rows if row[1] in ("detector", "none")]
+  assert [(row[0], row[1]) for row in rows] == [
+    (part, arm) for part, own in two.items() for arm in own["arms"]
+  ]
+  assert [row[-1] for row in rows] == [
+    f"{arm['reward_final']:.2f}" for own in two.values() for arm in own["arms"].values()
+  ]
+  assert "more in bench.json" in text
+
+
 def test_doctor(mjx):
   code, out, err = mjx("doctor", "--json")
   rows = json.loads(out)

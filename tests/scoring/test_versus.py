@@ -184,6 +184,34 @@ def test_the_parts_of_a_suite_are_compared_one_by_one(tmp_path, mjx):
     assert code == 2 and words in err and err.count("\n") == 1
 
 
+def test_a_setting_that_a_suite_varies_is_compared_over_its_parts(tmp_path, mjx):
+  """Parts that differ in the detector alone; how often and how soon it alarms, by hand."""
+  late = {"cusum": [10, 20, None], "ewma": [30, None, None]}
+  for fault in ("gear", "bias"):
+    for detector, steps in late.items():
+      folder = run_of(
+        tmp_path / "walker" / f"fault={fault},detector={detector}", {"detector": [1.0] * 3}
+      )
+      rows = tables.read_rows(folder / "runs.parquet")
+      table = {k: [r[k] for r in rows] for k in rows[0]}
+      table |= {"latency_steps": steps, "adapting_at_onset": [False] * 3}
+      table |= {"recovery_step": [5, None, None], "affected": [True, True, False]}
+      tables.write_table(folder / "runs.parquet", table)
+  run_of(tmp_path / "walker" / "fault=noise,detector=cusum", {"detector": [1.0] * 3})
+  argv = ("--by", "detector", "--measure", "alarmed", "latency_steps", "recovered", "--json")
+  rows = json.loads(mjx(tmp_path, *argv)[1])
+  assert {r["part"] for r in rows} == {"walker/fault=gear", "walker/fault=bias"}
+  assert {(r["against"], r["variant"]) for r in rows} == {("detector=cusum", "detector=ewma")}
+  first = {r["measure"]: r for r in rows if r["part"] == "walker/fault=gear"}
+  assert first["alarmed"]["difference"] == pytest.approx(-1 / 3)
+  assert first["alarmed"]["iqm"] == pytest.approx(1 / 3)  # the mean of a share
+  assert first["latency_steps"]["pairs"] == 1 and first["latency_steps"]["difference"] == 20
+  assert first["recovered"]["pairs"] == 2 and first["recovered"]["difference"] == 0
+  code, _, err = mjx(tmp_path, "--by", "severity")
+  assert code == 2 and "differ in severity; its parts vary detector, fault" in err
+  assert mjx(tmp_path, tmp_path, "--by", "detector")[0] == 2
+
+
 @pytest.mark.parametrize(
   "argv, code, words",
   [
