@@ -25,12 +25,13 @@ FAULT = ("target", "severity")  # of the preset's own fault alone
 
 
 def defaults(env: str) -> dict[str, Any]:
-  """What RunConfig's defaults are with --quick.
+  """What RunConfig's defaults are with --quick; of a robot of one's own (`FILE.py:NAME`) or of
+  another library those that all share.
 
   Raises:
-    UserError: for a robot without.
+    UserError: for another robot without.
   """
-  return choose("robot of --quick", env, QUICK)
+  return SHARED if ":" in env else choose("robot of --quick", env, QUICK)
 
 
 def check(config: RunConfig, listens: bool) -> None:
@@ -65,5 +66,7 @@ def said(config: RunConfig) -> str:
   return (
     f"--quick is a first look, no result: {config.seeds} robots for {config.steps:,} steps, "
     f"{plain['seeds']} for {plain['steps']:,} without it; its stop rule is the looser one of a "
-    "short run, and its seeds are those that the settings were chosen on"
+    "short run"
+    + ", and its seeds are those that the settings were chosen on"
+    * (config.env in QUICK)
   )

@@ -268,8 +268,8 @@ class Runner:
     lost = np.flatnonzero(~np.isfinite(digest.signals[:, phase_lib.SIGNALS.index("reward")]))
     if len(lost):
       raise FileError(
-        f"numeric failure at step {now} in stream {self.labels[lost[0]]}: its reward is not "
-        "finite; the last checkpoint is intact"
+        "numeric failure by step {} in arm {}, seed {}: the robot's reward is not finite; the last "
+        "checkpoint is intact".format(now, *self.labels[lost[0]])
       )
     for g in np.flatnonzero(digest.decision == phase_lib.ABORT_NUMERIC):
       bad = int(digest.failed[g])

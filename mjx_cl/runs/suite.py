@@ -127,7 +127,9 @@ def _check_names(where: str, values: dict) -> None:
       try:
         choose("setting", before + name, known)
       except UserError as e:
-        raise UserError(f"{where}: {e}") from None
+        other = {f.name for f in dataclasses.fields(AdaptConfig)}
+        place = f"; {name} is a setting of its table adapt" * (not before and name in other)
+        raise UserError(f"{where}: {e}{place}") from None
 
 
 def _check_name(what: str, name: Any) -> None:

@@ -43,6 +43,9 @@ def test_flags_override_quick():
   assert (
     asked("walker", "--quick", "--seeds", "4", "--onset", "5000", "--steps", "25000").onset == 5000
   )
+  for robot in ("mine.py:Robot", "brax:ant"):  # what all share
+    own = asked(robot, "--quick")
+    assert (own.seeds, own.steps, own.onset, own.fault) == (2, 6400, 2000, ("gear",))
   # another fault comes without the target and severity of quick's
   other = asked("car", "--quick", "--fault", "payload")
   assert (other.fault, other.target, other.severity, other.onset) == (("payload",), None, (), 2000)

@@ -642,7 +642,14 @@ def test_a_file_robot_that_is_a_shipped_one_by_another_path(tmp_path, capsys):
   assert agents.is_shipped(heir) and agents.of(heir).card["env"] == "car"
   heir.agents_of = None
   assert not agents.is_shipped(heir)
-  with pytest.raises(UserError, match="no agent 'fast:car'"):
+  training = tmp_path / "training"
+  (training / "agent").mkdir(parents=True)
+  (training / "agent" / "card.json").write_text("{}")
+  with pytest.raises(UserError, match="is a training; its agent is .*training/agent"):
+    agents.load(str(training), "car", 1, 1)
+  with pytest.raises(UserError, match="no agent ships for 'reach': give one with --agent; mjx-cl"):
+    agents.load(None, "reach", 1, 1)
+  with pytest.raises(UserError, match="no agent ships for 'fast:car'"):
     agents.of(heir)
   tables.write_table(
     tmp_path / "certificates.parquet",

@@ -238,6 +238,14 @@ def load(
   if not (folder / "card.json").exists():
     folder = HERE / name
   if not (folder / "card.json").exists():
+    require(
+      path is not None,
+      f"no agent ships for {env_name!r}: give one with --agent; mjx-cl train makes one, OUT/agent",
+    )
+    require(
+      not pathlib.Path(name, "agent", "card.json").exists(),
+      f"{name} is a training; its agent is {pathlib.Path(name, 'agent')}",
+    )
     raise UserError(
       f"no agent {name!r}; shipped: {', '.join(shipped()) or 'none'}; or give a folder that "
       "holds agent.npz and card.json"
