@@ -28,6 +28,7 @@ from mjx_cl import __version__
 from mjx_cl.adapt.arms import ARMS
 from mjx_cl.cli.flags import (
   Bench,
+  Calibrate,
   Certify,
   Compare,
   Detect,
@@ -54,6 +55,7 @@ COMMANDS = {
   Run: "runs",
   Train: "agents",
   Eval: "agents",
+  Calibrate: "robots",
   Certify: "robots",
   Record: "board",
   Leaderboard: "board",

@@ -119,6 +119,35 @@ class Eval:
 
 
 @dataclass(frozen=True)
+class Calibrate:
+  """The threshold at which a detector gives a wanted rate of false alarms on healthy robots; for a
+  robot or agent of your own, as `run` knows those of the shipped ones.
+
+  Example: mjx-cl calibrate robot.py:Robot --agent runs/mine/agent --detector cusum
+
+  Attributes:
+    agent: Trained agent: shipped name or folder; default: the robot's own.
+    detector: Name, or FILE.py:FACTORY.
+    set: Settings of the detector, name=value ...
+    arl0: Wanted mean number of control steps between two false alarms.
+    seeds: Healthy robots, of seeds first_seed, first_seed + 1, ...
+    first_seed: The first seed; `run` takes 0 and on.
+    steps: Control steps of each.
+  """
+
+  env: Positional[str]
+  agent: str | None = None
+  detector: str = "rolling_sigma"
+  set: tuple[str, ...] = ()
+  arl0: float = 10_000
+  seeds: int = 10
+  first_seed: int = 100
+  steps: int = 20_000
+  physics: str = "auto"
+  json: bool = False
+
+
+@dataclass(frozen=True)
 class Certify:
   """Proves for every fault that it acts, and measures what it costs; writes certificates.parquet
   and certificates.md into --out.

@@ -1,20 +1,48 @@
 """The commands certify and render: what faults do to a robot, and how that looks."""
 
 import dataclasses
+import shlex
 from typing import Any
 
 from mjx_cl import envs
 from mjx_cl.cli.agents import MOST_EPISODES
-from mjx_cl.cli.flags import Certify, Render
+from mjx_cl.cli.flags import Calibrate, Certify, Render
 from mjx_cl.cli.output import emit, say
-from mjx_cl.config import FaultConfig, own_agent
+from mjx_cl.config import FOREVER, FaultConfig, own_agent, settings
 from mjx_cl.envs import adapters
 from mjx_cl.errors import FileError, UserError, require
 from mjx_cl.faults import presets
 from mjx_cl.faults.certificate import faulty
 from mjx_cl.render import compare, pictures
-from mjx_cl.runs import certificate_tables, certify
+from mjx_cl.runs import calibrate, certificate_tables, certify
 from mjx_cl.training import agents
+
+
+def do_calibrate(args: Calibrate) -> None:
+  """Finds a detector's threshold."""
+  require(args.arl0 > 0, f"--arl0 must be above 0; got {args.arl0:g}")
+  require(
+    1 <= args.seeds <= MOST_EPISODES, f"--seeds must lie in 1..{MOST_EPISODES:,}; got {args.seeds}"
+  )
+  require(1 <= args.steps < FOREVER, f"--steps must lie in 1..{FOREVER - 1:,}; got {args.steps}")
+  require(args.first_seed >= 0, f"--first-seed must be 0 or above; got {args.first_seed}")
+  env = envs.make(args.env, args.physics)
+  trained = agents.of(env, args.agent)
+  seeds = range(args.first_seed, args.first_seed + args.seeds)
+  own = settings(args.set)
+  found = calibrate.calibrate(env, trained, args.detector, own, seeds, args.steps, args.arl0, say)
+  words = [args.env, *(["--agent", args.agent] if args.agent else []), "--detector", args.detector]
+  words += ["--set", *args.set, f"threshold={found.threshold:.6g}"]
+  if args.json:
+    emit(found._asdict() | {"settings": own | {"threshold": found.threshold}})
+    return
+  rate = "no false alarm" if found.arl0 is None else f"a false alarm in {found.arl0:,.0f}"
+  low, high = ("-" if x is None else f"{x:,.0f}" for x in found.arl0_ci)
+  print(
+    f"{args.detector} on {args.env}: threshold {found.threshold:.6g}, {rate} [{low}, {high}] "
+    f"control steps ({found.alarms} in {found.steps:,})"
+  )
+  print("mjx-cl run " + shlex.join(words))
 
 
 def do_certify(args: Certify) -> None:
