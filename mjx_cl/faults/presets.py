@@ -58,6 +58,10 @@ class Change:
   def __post_init__(self) -> None:
     fraction(self, "severity", "share")
     place(self.schedule)
+    idle = self.schedule in ("intermittent", "random_walk") and self.share == 0
+    if idle or (self.schedule == "cyclic" and self.period == 1):
+      what = "share=0" if idle else "period=1"
+      raise UserError(f"schedule {self.schedule!r} with {what} never acts; give more")
     for name, value in (("duration", self.duration), ("period", self.period)):
       if value is not None and not (1 <= value < FOREVER and value == int(value)):
         raise UserError(
@@ -219,14 +223,23 @@ def find(name: str, env_name: str) -> Preset:
   return preset
 
 
+def _names(fault: str) -> list[str]:
+  """What stands between the + of `fault` that belong to no path of a file."""
+  at = fault.find(".py:")
+  if at < 0:
+    return fault.split("+")
+  starts = [0, *(i + 1 for i in range(at) if fault[i] == "+")]
+  begin = next((s for s in starts if pathlib.Path(fault[s : at + 3]).exists()), starts[-1])
+  end = (fault + "+").index("+", at)
+  before = _names(fault[: begin - 1]) if begin else []
+  return [*before, fault[begin:end], *(_names(fault[end + 1 :]) if end < len(fault) else [])]
+
+
 def joined(fault: str) -> tuple[str, ...]:
-  """Names of the faults that `fault` joins by `+`; one name, or a file with a + in its path, is
-  itself. UserError for an empty or repeated one.
+  """Names of the faults that `fault` joins by `+`, FILE.py:NAME among them, whose path may hold a
+  +. UserError for an empty or repeated one.
   """
-  path, file, _ = fault.rpartition(".py:")
-  if "+" not in fault or (file and pathlib.Path(path + ".py").exists()):
-    return (fault,)
-  names = tuple(fault.split("+"))
+  names = tuple(_names(fault))
   if "" in names or len(set(names)) < len(names):
     raise UserError(f"fault {fault!r} joins an empty name, or a name twice; e.g. gear+noise")
   return names

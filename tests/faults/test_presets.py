@@ -128,6 +128,9 @@ def test_run_takes_a_preset_and_refuses_what_contradicts_it():
     ({"period": 2**31}, "period must be a whole"),
     ({"period": 0}, "period"),
     ({"share": 1.5}, "share"),
+    ({"schedule": "cyclic", "period": 1}, "'cyclic' with period=1 never acts"),
+    ({"schedule": "intermittent", "share": 0.0}, "'intermittent' with share=0 never acts"),
+    ({"schedule": "random_walk", "share": 0.0}, "'random_walk' with share=0 never acts"),
   ):
     with pytest.raises(UserError, match=words):
       settings.check(RunConfig("walker", **kw))
@@ -234,10 +237,14 @@ def test_faults_joined_by_plus_act_at_once(robots, tmp_path):
   own = tmp_path / "c++" / "mine.py"  # a + of a path joins nothing
   own.parent.mkdir()
   own.touch()
-  assert presets.joined(f"{own}:mine") == (f"{own}:mine",)
+  file = f"{own}:mine"
+  assert presets.joined(file) == (file,)
+  assert presets.joined(f"gear+{file}+bias") == ("gear", file, "bias")
+  assert presets.joined("a.py:b+c.py:d") == ("a.py:b", "c.py:d")
   for fault, target, said in (
     ("gear+gear", None, "joins an empty name, or a name twice"),
     ("gear+", None, "joins an empty name, or a name twice"),
+    ("a.py:b+", None, "joins an empty name, or a name twice"),
     ("gear+any/all-easy", None, "a preset stands alone"),
     ("gear+bias", "left_hip", "each of 'gear\\+bias' draws its own"),
   ):
