@@ -15,6 +15,29 @@ from mjx_cl.scoring import intervals
 from mjx_cl.training.episodes import Episodes
 
 
+class Readings:
+  """Sums over observations of `size` variables."""
+
+  def __init__(self, size: int) -> None:
+    self.count, self.first = 0, np.zeros(size)
+    self.sums, self.squares = np.zeros(size), np.zeros(size)
+
+  def add(self, obs: np.ndarray) -> None:
+    """Adds observations (N, size)."""
+    if not self.count and len(obs):
+      self.first = obs[0]  # near which squares lose no digits
+    self.count += len(obs)
+    self.sums += (obs - self.first).sum(0)
+    self.squares += ((obs - self.first) ** 2).sum(0)
+
+  def deviations(self) -> np.ndarray:
+    """Standard deviation of each variable, nan without observations."""
+    if not self.count:
+      return np.full(self.sums.shape, np.nan)
+    n = self.count
+    return np.sqrt(np.maximum(0.0, self.squares / n - (self.sums / n) ** 2))
+
+
 def evaluate(
   env: Any,
   agent: Any,
@@ -30,7 +53,9 @@ def evaluate(
 
   Returns:
     episodes, return_mean, return_iqm, return_ci (95 % bootstrap of the IQM over episodes of this
-    one agent), returns, terminations, and where the environment measures them (env.measure), means
+    one agent), returns, terminations, deviations (variable -> standard deviation of its readings
+    after the first quarter of an episode: what `scale` of a robot's spec says; None where no
+    episode lasts so long), and where the environment measures them (env.measure), means
     over the steps of all episodes with their bootstrap interval over episodes: of the quadruped
     velocity_error_m_s and fall_rate; of the car mean_speed_m_s and collision_rate. Of a robot with
     a reference driver the same for it, from the same starts: reference_return,
@@ -39,7 +64,8 @@ def evaluate(
   fault, plan, target = faults.build(changes or (Change("none"),), env)
   rollout = Rollout(env, agent, fault, repeat, deterministic)
   how: dict[str, Any] = {"plan": plan, "target": target}
-  total, steps, sums, ended = live(env, rollout, agent, params, episodes, seed, **how)
+  seen = Readings(len(env.spec.obs))
+  total, steps, sums, ended = live(env, rollout, agent, params, episodes, seed, seen, **how)
 
   def counted(name: str, hits: np.ndarray) -> dict[str, Any]:
     share = intervals.wilson(int(hits.sum()), episodes)
@@ -62,6 +88,10 @@ def evaluate(
     "return_ci": intervals.interval(total),
     **counted("terminations", ended),
     "returns": [round(float(x), 2) for x in total],
+    "deviations": {
+      var.name: float(f"{x:.3g}") if np.isfinite(x) else None
+      for var, x in zip(env.spec.obs, seen.deviations())
+    },
   }
   for name, value in sums.items():
     out |= per_step(name, value, steps)
@@ -71,7 +101,7 @@ def evaluate(
   if hasattr(env, "reference"):
     driver = Rollout(env, agent, fault, repeat, expert=lambda stream: env.reference(stream.env))
     how |= {"drive": True}
-    reference, steps, sums, ended = live(env, driver, agent, params, episodes, seed, **how)
+    reference, steps, sums, ended = live(env, driver, agent, params, episodes, seed, None, **how)
     out |= {
       "reference_return": float(reference.mean()),
       "reference_return_ci": intervals.interval(reference, np.mean),
@@ -89,11 +119,12 @@ def live(
   params: Any,
   episodes: int,
   seed: int,
+  seen: "Readings | None" = None,
   drive: bool = False,
   **fault: Any,
 ) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray], np.ndarray]:
   """One episode each: (return, measured steps, {figure: sum over the steps}, terminated), arrays
-  (episodes,); `fault` as `start` takes it.
+  (episodes,); `fault` as `start` takes it, `seen` gets the readings.
 
   A figure is read after a step, from the state; the step that ends an episode, after which a new
   one has begun, is left out.
@@ -113,7 +144,11 @@ def live(
       )
     decisions += chunk
     streams, rows = rollout.chunk(params, streams, chunk, jnp.full((1, episodes), drive))
-    lived.add(rows)
+    within = lived.add(rows)
+    if seen is not None:
+      at = np.arange(decisions - chunk, decisions) * rollout.repeat
+      late = within & (at >= env.spec.episode_steps // 4)[:, None, None]
+      seen.add(np.asarray(rows.final_obs, np.float64)[late])
     if measure is not None:
       alive = lived.alive[0]
       steps += alive

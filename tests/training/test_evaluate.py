@@ -22,17 +22,18 @@ def case(request):
 
 
 def by_hand(env, agent, params, seed, rollout, drive=False):
-  """Return, the measured figure in all steps but the one that ends, terminated."""
+  """Return, the measured figure in all steps but the one that ends, terminated, readings."""
   stream = quick.jit(lambda key: start(env, agent, rollout.fault, key))(jax.random.key(seed))
   lead = lambda tree: jax.tree.map(lambda x: x[None, None], tree)
-  streams, total, seen = lead(stream), 0.0, []
+  streams, total, seen, read = lead(stream), 0.0, [], []
   for _ in range(env.spec.episode_steps):
     streams, rows = rollout.chunk(
       jax.tree.map(lambda x: x[None], params), streams, 1, jnp.full((1, 1), drive)
     )
     total += float(rows.reward[0, 0, 0])
+    read.append(np.asarray(rows.final_obs[0, 0, 0], np.float64))
     if bool(rows.terminated[0, 0, 0] | rows.truncated[0, 0, 0]):
-      return total, seen, bool(rows.terminated[0, 0, 0])
+      return total, seen, bool(rows.terminated[0, 0, 0]), np.array(read)
     if hasattr(env, "measure"):
       seen.append(
         float(env.measure(jax.tree.map(lambda x: x[0, 0], streams.env))["mean_speed_m_s"])
@@ -51,7 +52,12 @@ def test_figures_are_those_of_single_episodes(case):
     "returns",
     "return_mean",
     "return_iqm",
+    "deviations",
   }  # these two: return_ci
+  late = [x[env.spec.episode_steps // 4 :] for *_, x in hand]
+  want = np.concatenate(late).std(0) if sum(map(len, late)) else None
+  for k, value in enumerate(got["deviations"].values()):
+    assert value == (None if want is None else pytest.approx(want[k], rel=0.01, abs=1e-5))
   if env.spec.name == "walker":
     assert "mean_speed_m_s" not in got
     return
