@@ -70,11 +70,16 @@ def _compare_parts(args: Compare, suite: list[versus.Part]) -> None:
     mine = [line for (_, name), line in lines.items() if name == variant]
     cells.append((f"{len(mine)} parts", variant, "", *map(_told, zip(*mine))))
   heads = ("part", "variant", "pairs", *measures)
-  console().print(table(heads, cells, left=heads[:2], box=box.SIMPLE, pad_edge=False))
+  alone = {variant for _, variant in lines}
+  if len(alone) == 1:  # it stands below
+    heads, cells = heads[:1] + heads[2:], [cell[:1] + cell[2:] for cell in cells]
+  left = [head for head in heads if head in ("part", "variant")]
+  console().print(table(heads, cells, left=left, box=box.SIMPLE, pad_edge=False))
   firsts = ", ".join(dict.fromkeys(part.found[0].name for part in suite))
   print(
-    f"difference from {firsts}, mean over pairs of one seed [95 % interval of each part by itself: "
-    "one in twenty leaves out 0 by chance]; last: parts whose interval leaves out 0"
+    f"{alone.pop() if len(alone) == 1 else 'variant'} less {firsts}: mean over pairs of one seed "
+    "[95 % interval of each part by itself: one in twenty leaves out 0 by chance]; last: parts "
+    "whose interval leaves out 0"
   )
   for what, more in (versus.MEASURES[m] for m in measures):
     print(f"{what}: {'more' if more else 'less'} is better")
