@@ -151,7 +151,9 @@ def _asked(where: str, function: Callable, *args: Any) -> Any:
 def _figures(
   name: str, build: Callable[..., Any], robot: str | None, agent: str | None, shared: bool
 ) -> dict:
-  """What `make` hands on to a factory of its own accord."""
+  """What `make` hands on to a factory of its own accord; `shared`: one threshold for both residuals
+  of `rolling_sigma`.
+  """
   if name == "rolling_sigma":
     return (one_threshold if shared else calibrated_settings)(robot, agent)
   handed = {"robot": robot, "agent": agent, "make": make}
@@ -215,7 +217,8 @@ def make(
     robot: whose agent's figures `rolling_sigma` starts from, where CALIBRATED has them, default the
       walker's; handed on to a factory that takes it. Others: see `calibrated`.
     agent: that acts, a shipped name or a folder, likewise; default: the robot's own.
-    shared: `rolling_sigma` has one threshold for both residuals, see `one_threshold`.
+    shared: `rolling_sigma` has one threshold for both residuals, see `one_threshold`; so it has
+      where a `threshold` is given without a `threshold_rpr`.
     **settings: of the factory. One that takes `make` is handed this function, to build others.
   """
   name, own = split(name)
@@ -226,6 +229,7 @@ def make(
   build = _pure(name, build) if ":" in name else build
   if not takes_number(build) and (channel is not None or log is not None or whiten):
     raise UserError(f"detector {name!r} has channels of its own; leave out channel, log and whiten")
+  shared = shared or ("threshold" in settings and "threshold_rpr" not in settings)
   detector = _built(name, build, patience, _figures(name, build, robot, agent, shared) | settings)
   if takes_number(build):
     detector = combine.whitened(detector, whiten) if whiten else detector
