@@ -52,12 +52,16 @@ def _told(use: str, settings: dict) -> dict:
   """What `settings` say beyond the defaults of `make` and of the factory; channels in the order of
   their names.
   """
-  parameters = {**inspect.signature(factory(use)).parameters, **inspect.signature(make).parameters}
+  build, every = factory(use), inspect.signature(make).parameters
+  own = inspect.signature(build).parameters
+  parameters = {**own, **every} if takes_number(build) else {**every, **own}
   channels = sorted((settings.get("channel") or "opr+rpr").split("+"))
-  if settings.get("log") is True and "reward" not in channels:  # as without it
-    settings = settings | {"log": None}
-  told = {k: v for k, v in settings.items() if k not in ("use", "channel")}
-  plain = {k: p.default for k, p in parameters.items() if p.default is not p.empty}
+  plain = {"patience": 1} if takes_number(build) or "patience" not in own else {}
+  plain = {k: p.default for k, p in parameters.items() if p.default is not p.empty} | plain
+  if takes_number(build) and "reward" not in channels:
+    plain["log"] = True
+  given = {k: v for k, v in settings.items() if k not in every or v is not None}
+  told = {k: v for k, v in given.items() if k not in ("use", "channel")}
   return {k: v for k, v in told.items() if k not in plain or v != plain[k]} | {"channel": channels}
 
 
@@ -161,10 +165,11 @@ def _figures(
   return {k: v for k, v in handed.items() if v is not None and k in taken}
 
 
-def _built(name: str, build: Callable[..., Any], patience: int, settings: dict) -> Detector:
+def _built(name: str, build: Callable[..., Any], patience: int | None, settings: dict) -> Detector:
   """The detector of a factory, whose refusals become one line."""
   try:
-    if patience == 1:
+    own = not takes_number(build) and {"patience", "..."} & set(known_settings(build))
+    if patience is None or patience == 1 and not own:
       return build(**settings)
     if takes_number(build):
       return combine.patience(build, patience, **settings)
@@ -191,7 +196,7 @@ def make(
   channel: str | None = None,
   log: bool | None = None,
   whiten: int = 0,
-  patience: int = 1,
+  patience: int | None = None,
   cool_down: int = 0,
   robot: str | None = None,
   agent: str | None = None,
@@ -211,7 +216,7 @@ def make(
       of the channel, behind the logarithm; its own warm-up begins after that of combine.whitened;
       0: none.
     patience: scores in a row above the threshold before a single-residual detector fires, see
-      combine.patience; others have their own setting of this name, or none.
+      combine.patience, default: 1; others have their own setting of this name, or none.
     cool_down: samples after an alarm in which no other counts, of the channels together, see
       combine.cool_down.
     robot: whose agent's figures `rolling_sigma` starts from, where CALIBRATED has them, default the

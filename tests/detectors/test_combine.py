@@ -283,6 +283,24 @@ def test_a_residual_detector_keeps_its_own_settings():
     detectors.make("rolling_sigma_plain", whiten=4)
 
 
+def test_a_patience_of_one_is_one():
+  """Where the detector's own default is another: the car's calibrated rule wants 20 in a row."""
+  steps = 400
+  x = np.exp(np.random.default_rng(0).normal(size=steps)) + 5 * (np.arange(steps) % 50 == 49)
+  of = lambda **told: run(
+    detectors.make("rolling_sigma", robot="car", window=50, warmup=20, **told), rows(x)
+  )[1]
+  assert of(patience=1).any() and not of().any() and not of(patience=None).any()
+  plain, one = (detectors.make("cusum", **told) for told in ({}, {"patience": 1}))
+  assert jax.tree.structure(plain.init()) == jax.tree.structure(one.init())
+  known = [detectors.calibrated("cusum", "walker", told) for told in ({}, {"patience": 1})]
+  assert known[0] is not None and known[0] == known[1]
+  assert detectors.calibrated("cusum", "walker", {"patience": 2}) is None
+  detectors.make("hotelling", patience=1)  # has none, and one is as none
+  with pytest.raises(UserError, match="patience"):
+    detectors.make("hotelling", patience=2)
+
+
 @pytest.mark.parametrize(
   "settings, match",
   [
