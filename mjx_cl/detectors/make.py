@@ -211,7 +211,7 @@ def make(
     channel: what a single-residual detector watches: one of combine.CHANNELS, or several joined by
       `+`, each with a detector of its own; the alarm of any counts. Default: `opr+rpr`.
     log: take the logarithm of the channel first; default: of all but the reward, which may be
-      negative.
+      negative. Detectors of the whole residual have their own setting of this name, or none.
     whiten: order of the autoregression whose innovations a single-residual detector sees in place
       of the channel, behind the logarithm; its own warm-up begins after that of combine.whitened;
       0: none.
@@ -232,8 +232,13 @@ def make(
   told = {"log": log, "whiten": whiten, "patience": patience, "cool_down": cool_down}
   check_kinds(name, settings | told, *_reads(build), make)
   build = _pure(name, build) if ":" in name else build
-  if not takes_number(build) and (channel is not None or log is not None or whiten):
-    raise UserError(f"detector {name!r} has channels of its own; leave out channel, log and whiten")
+  if not takes_number(build):
+    if log is not None and "log" in known_settings(build):
+      settings, log = settings | {"log": log}, None
+    if channel is not None or log is not None or whiten:
+      raise UserError(
+        f"detector {name!r} has channels of its own; leave out channel, log and whiten"
+      )
   shared = shared or ("threshold" in settings and "threshold_rpr" not in settings)
   detector = _built(name, build, patience, _figures(name, build, robot, agent, shared) | settings)
   if takes_number(build):

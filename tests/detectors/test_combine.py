@@ -283,6 +283,30 @@ def test_a_residual_detector_keeps_its_own_settings():
     detectors.make("rolling_sigma_plain", whiten=4)
 
 
+@pytest.mark.parametrize(
+  "name, settings",
+  [
+    ("hotelling", {"smooth": 5}),
+    ("mewma", {}),
+    ("max_variables", {"smooth": 5}),
+    ("rolling_sigma", {"window": 50, "smooth": 5}),
+    ("rolling_sigma_plain", {"window": 50}),
+  ],
+)
+def test_a_residual_detector_takes_its_own_logarithm(name, settings):
+  """As its factory does; not told, its own default holds."""
+  xs = rows(np.exp(np.random.default_rng(0).normal(size=300)))
+  settings |= {"warmup": 40} | ({} if "rolling" in name else {"channels": "opr+rpr"})
+  of = lambda **told: run(detectors.make(name, **settings, **told), xs)[2]
+  by_hand = lambda log: run(detectors.DETECTORS[name](**settings, log=log), xs)[2]
+  for log in (True, False):
+    np.testing.assert_array_equal(of(log=log), by_hand(log))
+  assert (by_hand(True) != by_hand(False)).any()
+  np.testing.assert_array_equal(of(), of(log=name != "rolling_sigma_plain"))
+  with pytest.raises(UserError, match="log"):
+    detectors.make("knn", log=False)
+
+
 def test_a_patience_of_one_is_one():
   """Where the detector's own default is another: the car's calibrated rule wants 20 in a row."""
   steps = 400
