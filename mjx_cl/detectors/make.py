@@ -32,7 +32,7 @@ def calibrated(name: str, robot: str, settings: dict, agent: str | None = None) 
   is set so. Those of paper_rule.PAPER have figures of their own.
   """
   use, channel = split(name)
-  _check_channels(name, channel, settings.get("channel"))
+  _check_channels(use, channel, settings.get("channel"))
   known = known_of(robot, agent)
   rows = [row for row in known.values() if row["settings"]["use"] == use]
   own = settings | ({"channel": channel} if channel else {})
@@ -42,10 +42,13 @@ def calibrated(name: str, robot: str, settings: dict, agent: str | None = None) 
   return None
 
 
-def _check_channels(name: str, *channels: Any) -> None:
-  for channel in channels:
+def _check_channels(name: str, own: str | None, given: Any) -> None:
+  """Refuses what is no channel, and another one beside that of `name@channel`."""
+  for channel in (own, given):
     if channel is not None and not (channel and isinstance(channel, str)):
       raise UserError(f"detector {name!r}: {channel!r} is no channel; choose from: {combine.NAMES}")
+  if None not in (own, given) and own != given:
+    raise UserError(f"detector {name}@{own} is given another channel, {given}; leave one out")
 
 
 def _told(use: str, settings: dict) -> dict:

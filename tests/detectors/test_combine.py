@@ -307,6 +307,13 @@ def test_a_residual_detector_takes_its_own_logarithm(name, settings):
     detectors.make("knn", log=False)
 
 
+def test_two_channels_for_one_detector_are_refused():
+  for ask in (detectors.make, lambda name, **told: detectors.calibrated(name, "walker", told)):
+    with pytest.raises(UserError, match="cusum@opr is given another channel, rpr"):
+      ask("cusum@opr", channel="rpr")
+    assert ask("cusum@opr", channel="opr") is not None
+
+
 def test_a_patience_of_one_is_one():
   """Where the detector's own default is another: the car's calibrated rule wants 20 in a row."""
   steps = 400

@@ -523,7 +523,7 @@ def test_what_stands_on_the_board_takes_its_threshold_from_there(robot):
   ):
     assert same(("cusum", {}), ("cusum", other)), other
   assert same(("cusum@surprise", {}), ("cusum", {"channel": "surprise"})) and same(
-    ("cusum@opr", {}), ("cusum@opr", {"channel": "rpr"})
+    ("cusum@opr", {}), ("cusum@opr", {"channel": "opr"})
   )  # as in `make`
   assert same(("hotelling", {}), ("hotelling", {"patience": 1})) and not same(
     ("cusum@opr", {}), ("cusum@rpr", {})
