@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from mjx_cl.config import kinds
@@ -142,9 +143,38 @@ def _answering(name: str, detector: Detector) -> Detector:
     if not pair or not isinstance(alarm, Alarm):
       given = type(alarm).__name__
       raise PluginError(f"detector {name!r}: update gives {given} in place of (state, Alarm)")
+    _check_alarm(name, alarm)
+    given, wanted = _form(answer[0]), _form(state)
+    if given != wanted:
+      raise PluginError(
+        f"detector {name!r}: update gives a state of form {given} in place of {wanted}, as before it"
+      )
     return answer
 
   return detector._replace(init=init, update=update)
+
+
+def _form(tree: Any) -> str:
+  """Structure, shapes and types, weak or not, in one line."""
+  return str(jax.tree.map(_kind, tree)).replace("'", "")
+
+
+def _kind(leaf: Any) -> str:
+  """Type and shape of what an array can be made of; the Python type of anything else."""
+  try:
+    return str(jax.typeof(jnp.asarray(leaf))).lstrip("~")
+  except (TypeError, ValueError):
+    return type(leaf).__name__
+
+
+def _check_alarm(name: str, alarm: Alarm) -> None:
+  """Refuses what is no flag and one number."""
+  fired, score = map(_kind, alarm)
+  if fired != "bool[]" or score[-2:] != "[]":
+    raise PluginError(
+      f"detector {name!r}: update gives an Alarm(fired {fired}, score {score}) in place of "
+      "(bool[], float32[])"
+    )
 
 
 def _asked(where: str, function: Callable, *args: Any) -> Any:
