@@ -147,7 +147,7 @@ def _answering(name: str, detector: Detector) -> Detector:
     given, wanted = _form(answer[0]), _form(state)
     if given != wanted:
       raise PluginError(
-        f"detector {name!r}: update gives a state of form {given} in place of {wanted}, as before it"
+        f"detector {name!r}: update gives a state of form {given} in place of {wanted}"
       )
     return answer
 

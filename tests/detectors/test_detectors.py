@@ -480,8 +480,10 @@ def test_a_threshold_that_is_given_moves_both_residuals(robot, agent):
   small = dict(robot=robot, agent=agent, window=100, warmup=20, smooth=40, lag=2, threshold=0.8)
   xs = residuals(jax.random.key(6), 400, invalid=0.0)
   fired = lambda **more: (
-    jax.lax.scan((d := detectors.make("rolling_sigma", **small | more)).update, d.init(), xs)[1]
-  ).fired
+    (
+      jax.lax.scan((d := detectors.make("rolling_sigma", **small | more)).update, d.init(), xs)[1]
+    ).fired
+  )
   np.testing.assert_array_equal(fired(), fired(threshold_rpr=0.8 * ratio))
   np.testing.assert_array_equal(fired(threshold_rpr=None), fired(threshold_rpr=0.8))
   assert fired().any() and not fired(threshold=100.0).any()
