@@ -399,6 +399,12 @@ def test_a_detector_in_the_loop_has_the_boards_threshold(tmp_path, monkeypatch):
     ("walker", "always", {}, None),
     ("walker", "random", {}, None),
     ("walker", "rolling_sigma", {}, None),
+    ("quadruped", "rolling_sigma", {"agent": "quadruped-trot-3"}, None),
+    ("car_real", "rolling_sigma", {}, None),
+    ("FILE:Reach", "rolling_sigma", {}, "calibrated for walker, at threshold 6.5: it is not calib"),
+    ("FILE:Reach", "rolling_sigma", {"settings": {"threshold": 9.0}}, None),
+    ("FILE:Reach", "rolling_sigma", {"arms": ("none", "oracle")}, None),
+    ("FILE:Reach", "rolling_sigma_plain", {}, None),
     ("walker", "rolling_sigma_plain", {}, None),
     ("walker", "rolling_sigma_FILE", {}, "its own default threshold, 4:"),
   ],
@@ -413,6 +419,8 @@ def test_what_a_detector_runs_with_is_said(robot, detector, change, text, tmp_pa
       "cusum(threshold=threshold)\n"
     )
     detector = f"{tmp_path}/rolling_sigma_mine.py:mine"
+  (tmp_path / "reach.py").write_text(PLUG)
+  robot = robot.replace("FILE", f"{tmp_path}/reach.py")
   said = doubts.watching(RunConfig(robot, fault="noise", detector=detector, **change))
   assert said is None if text is None else text in said
 
