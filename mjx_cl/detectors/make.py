@@ -19,7 +19,7 @@ from mjx_cl.detectors.paper_rule import (
   paper_rule,
 )
 from mjx_cl.detectors.rolling_sigma import rolling_sigma
-from mjx_cl.detectors.table import factory, split
+from mjx_cl.detectors.table import DETECTORS, factory, split
 from mjx_cl.detectors.thresholds import Threshold, known_of
 from mjx_cl.errors import PluginError, UserError
 from mjx_cl.io.plugins import line
@@ -264,7 +264,7 @@ def make(
   build, channel = factory(name), own or channel
   told = {"log": log, "whiten": whiten, "patience": patience, "cool_down": cool_down}
   check_kinds(name, settings | told, *_reads(build), make)
-  build = _pure(name, build) if ":" in name else build
+  build = build if name in DETECTORS.own else _pure(name, build)
   if not takes_number(build):
     if log is not None and "log" in known_settings(build):
       settings, log = settings | {"log": log}, None

@@ -18,7 +18,7 @@ from mjx_cl.detectors import (
   whitened,
   z_score,
 )
-from mjx_cl.errors import UserError
+from mjx_cl.errors import PluginError, UserError
 from mjx_cl.rollout.monitor import unknown
 
 
@@ -265,6 +265,17 @@ def test_the_whole_chain_keeps_the_contract(same):
     )  # float32, perhaps fused another way
   masked, alarm = jax.jit(jax.vmap(detector.update))(last, rows(np.full(streams, np.nan)))
   assert same(masked, last) and not alarm.fired.any() and np.isnan(alarm.score).all()
+
+
+def test_a_detector_of_another_package_is_held_to_its_form(monkeypatch):
+  """As one of a file: its state keeps its types, its alarm is a flag and a number."""
+  drifts = lambda threshold=1.0: Detector(
+    lambda: jnp.int32(0), lambda state, x: (state + 0.5, Alarm(x.opr > threshold, x.opr))
+  )
+  monkeypatch.setitem(detectors.DETECTORS, "theirs", drifts)
+  made = detectors.make("theirs")
+  with pytest.raises(PluginError, match=r"'theirs': update gives a state of form float32\[\] in "):
+    made.update(made.init(), jax.tree.map(lambda x: x[0], rows(np.ones(1))))
 
 
 def test_a_residual_detector_keeps_its_own_settings():
