@@ -163,9 +163,8 @@ class Loop:
       own: methods of the run, as in Choices.
     """
     a = self.agent
-    spread = lambda tree: jax.tree.map(
-      lambda x: jnp.broadcast_to(x, (groups,) + x.shape).copy(), tree
-    )
+    copies = lambda x: jnp.broadcast_to(x, (groups,) + x.shape).copy()
+    spread = lambda tree: jax.tree.map(lambda x: copies(jnp.asarray(x)), tree)
     shapes = jax.eval_shape(
       lambda: replay_lib.init(1, self.capacity, a.obs_size, a.act_size, a.size.deter, a.size.stoch)
     )

@@ -127,6 +127,7 @@ def evaluate(agent: Agent, minds: Minds, rows: Row, keys: jax.Array) -> tuple[ja
 
 def refit(detector: Detector, state: Any, past: Residual, over: jax.Array) -> Any:
   """`state` of the detector, where `over` (groups,): one that has seen the rows `past` alone."""
-  fresh = jax.tree.map(lambda x: jnp.broadcast_to(x, (over.shape[0],) + x.shape), anew(detector)())
+  spread = lambda x: jnp.broadcast_to(x, (over.shape[0],) + jnp.shape(x))
+  fresh = jax.tree.map(spread, anew(detector)())
   fresh, _ = jax.lax.scan(jax.vmap(detector.update), fresh, past)
   return choose(over, fresh, state)

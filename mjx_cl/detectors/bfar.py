@@ -19,6 +19,7 @@ Blocks stand for the paper's episodes, since streams of robots that do not fall 
 that a Residual shows. A block should be longer than the memory of the reward.
 """
 
+import numbers
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -183,11 +184,16 @@ def bfar(
   episodes, without smoothing or a drawn reference.
   """
   horizons = tuple(horizons)
+  whole_numbers = all(isinstance(h, numbers.Integral) for h in horizons)
   demand(
     "bfar",
     bins=(bins, bins >= 1, "at least 1"),
     block=(block, block >= 1 and block % max(1, bins) == 0, "a multiple of `bins`, above 0"),
-    horizons=(horizons, min(horizons, default=0) >= 1, "one or several numbers, each at least 1"),
+    horizons=(
+      horizons,
+      whole_numbers and min(horizons, default=0) >= 1,
+      "one or several whole numbers, each at least 1",
+    ),
     threshold=(threshold, above(threshold, 0), "above 0"),
     alpha=(alpha, 0 < alpha < 1, "in (0, 1)"),
     blocks=(blocks, blocks >= max(horizons, default=1), "at least the longest horizon"),

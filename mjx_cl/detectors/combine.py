@@ -19,8 +19,10 @@ from mjx_cl.types import Array
 NAMES = f"{', '.join(CHANNELS)}, variable_0 and so on"
 
 
-def is_channel(name: str) -> bool:
+def is_channel(name: Any) -> bool:
   """Whether `read` knows the name; how many variables there are only the residual tells."""
+  if not isinstance(name, str):
+    return False
   return name in CHANNELS or name.startswith("variable_") and name[9:].isdigit()
 
 

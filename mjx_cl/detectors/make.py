@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from mjx_cl.config import kinds
@@ -18,7 +19,7 @@ from mjx_cl.detectors.paper_rule import (
   paper_rule,
 )
 from mjx_cl.detectors.rolling_sigma import rolling_sigma
-from mjx_cl.detectors.table import factory, split
+from mjx_cl.detectors.table import DETECTORS, factory, split
 from mjx_cl.detectors.thresholds import Threshold, known_of
 from mjx_cl.errors import PluginError, UserError
 from mjx_cl.io.plugins import line
@@ -32,7 +33,7 @@ def calibrated(name: str, robot: str, settings: dict, agent: str | None = None) 
   is set so. Those of paper_rule.PAPER have figures of their own.
   """
   use, channel = split(name)
-  _check_channels(name, channel, settings.get("channel"))
+  _check_channels(use, channel, settings.get("channel"))
   known = known_of(robot, agent)
   rows = [row for row in known.values() if row["settings"]["use"] == use]
   own = settings | ({"channel": channel} if channel else {})
@@ -42,22 +43,29 @@ def calibrated(name: str, robot: str, settings: dict, agent: str | None = None) 
   return None
 
 
-def _check_channels(name: str, *channels: Any) -> None:
-  for channel in channels:
+def _check_channels(name: str, own: str | None, given: Any) -> None:
+  """Refuses what is no channel, and another one beside that of `name@channel`."""
+  for channel in (own, given):
     if channel is not None and not (channel and isinstance(channel, str)):
       raise UserError(f"detector {name!r}: {channel!r} is no channel; choose from: {combine.NAMES}")
+  if None not in (own, given) and own != given:
+    raise UserError(f"detector {name}@{own} is given another channel, {given}; leave one out")
 
 
 def _told(use: str, settings: dict) -> dict:
   """What `settings` say beyond the defaults of `make` and of the factory; channels in the order of
   their names.
   """
-  parameters = {**inspect.signature(factory(use)).parameters, **inspect.signature(make).parameters}
+  build, every = factory(use), inspect.signature(make).parameters
+  own = inspect.signature(build).parameters
+  parameters = {**own, **every} if takes_number(build) else {**every, **own}
   channels = sorted((settings.get("channel") or "opr+rpr").split("+"))
-  if settings.get("log") is True and "reward" not in channels:  # as without it
-    settings = settings | {"log": None}
-  told = {k: v for k, v in settings.items() if k not in ("use", "channel")}
-  plain = {k: p.default for k, p in parameters.items() if p.default is not p.empty}
+  plain = {"patience": 1} if takes_number(build) or "patience" not in own else {}
+  plain = {k: p.default for k, p in parameters.items() if p.default is not p.empty} | plain
+  if takes_number(build) and "reward" not in channels:
+    plain["log"] = True
+  given = {k: v for k, v in settings.items() if k not in every or v is not None}
+  told = {k: v for k, v in given.items() if k not in ("use", "channel")}
   return {k: v for k, v in told.items() if k not in plain or v != plain[k]} | {"channel": channels}
 
 
@@ -135,9 +143,38 @@ def _answering(name: str, detector: Detector) -> Detector:
     if not pair or not isinstance(alarm, Alarm):
       given = type(alarm).__name__
       raise PluginError(f"detector {name!r}: update gives {given} in place of (state, Alarm)")
+    _check_alarm(name, alarm)
+    given, wanted = _form(answer[0]), _form(state)
+    if given != wanted:
+      raise PluginError(
+        f"detector {name!r}: update gives a state of form {given} in place of {wanted}"
+      )
     return answer
 
   return detector._replace(init=init, update=update)
+
+
+def _form(tree: Any) -> str:
+  """Structure, shapes and types, weak or not, in one line."""
+  return str(jax.tree.map(_kind, tree)).replace("'", "")
+
+
+def _kind(leaf: Any) -> str:
+  """Type and shape of what an array can be made of; the Python type of anything else."""
+  try:
+    return str(jax.typeof(jnp.asarray(leaf))).lstrip("~")
+  except (TypeError, ValueError):
+    return type(leaf).__name__
+
+
+def _check_alarm(name: str, alarm: Alarm) -> None:
+  """Refuses what is no flag and one number."""
+  fired, score = map(_kind, alarm)
+  if fired != "bool[]" or score[-2:] != "[]":
+    raise PluginError(
+      f"detector {name!r}: update gives an Alarm(fired {fired}, score {score}) in place of "
+      "(bool[], float32[])"
+    )
 
 
 def _asked(where: str, function: Callable, *args: Any) -> Any:
@@ -151,7 +188,9 @@ def _asked(where: str, function: Callable, *args: Any) -> Any:
 def _figures(
   name: str, build: Callable[..., Any], robot: str | None, agent: str | None, shared: bool
 ) -> dict:
-  """What `make` hands on to a factory of its own accord."""
+  """What `make` hands on to a factory of its own accord; `shared`: one threshold for both residuals
+  of `rolling_sigma`.
+  """
   if name == "rolling_sigma":
     return (one_threshold if shared else calibrated_settings)(robot, agent)
   handed = {"robot": robot, "agent": agent, "make": make}
@@ -159,10 +198,11 @@ def _figures(
   return {k: v for k, v in handed.items() if v is not None and k in taken}
 
 
-def _built(name: str, build: Callable[..., Any], patience: int, settings: dict) -> Detector:
+def _built(name: str, build: Callable[..., Any], patience: int | None, settings: dict) -> Detector:
   """The detector of a factory, whose refusals become one line."""
   try:
-    if patience == 1:
+    own = not takes_number(build) and {"patience", "..."} & set(known_settings(build))
+    if patience is None or patience == 1 and not own:
       return build(**settings)
     if takes_number(build):
       return combine.patience(build, patience, **settings)
@@ -189,7 +229,7 @@ def make(
   channel: str | None = None,
   log: bool | None = None,
   whiten: int = 0,
-  patience: int = 1,
+  patience: int | None = None,
   cool_down: int = 0,
   robot: str | None = None,
   agent: str | None = None,
@@ -204,18 +244,19 @@ def make(
     channel: what a single-residual detector watches: one of combine.CHANNELS, or several joined by
       `+`, each with a detector of its own; the alarm of any counts. Default: `opr+rpr`.
     log: take the logarithm of the channel first; default: of all but the reward, which may be
-      negative.
+      negative. Detectors of the whole residual have their own setting of this name, or none.
     whiten: order of the autoregression whose innovations a single-residual detector sees in place
       of the channel, behind the logarithm; its own warm-up begins after that of combine.whitened;
       0: none.
     patience: scores in a row above the threshold before a single-residual detector fires, see
-      combine.patience; others have their own setting of this name, or none.
+      combine.patience, default: 1; others have their own setting of this name, or none.
     cool_down: samples after an alarm in which no other counts, of the channels together, see
       combine.cool_down.
     robot: whose agent's figures `rolling_sigma` starts from, where CALIBRATED has them, default the
       walker's; handed on to a factory that takes it. Others: see `calibrated`.
     agent: that acts, a shipped name or a folder, likewise; default: the robot's own.
-    shared: `rolling_sigma` has one threshold for both residuals, see `one_threshold`.
+    shared: `rolling_sigma` has one threshold for both residuals, see `one_threshold`; so it has
+      where a `threshold` is given without a `threshold_rpr`.
     **settings: of the factory. One that takes `make` is handed this function, to build others.
   """
   name, own = split(name)
@@ -223,9 +264,15 @@ def make(
   build, channel = factory(name), own or channel
   told = {"log": log, "whiten": whiten, "patience": patience, "cool_down": cool_down}
   check_kinds(name, settings | told, *_reads(build), make)
-  build = _pure(name, build) if ":" in name else build
-  if not takes_number(build) and (channel is not None or log is not None or whiten):
-    raise UserError(f"detector {name!r} has channels of its own; leave out channel, log and whiten")
+  build = build if name in DETECTORS.own else _pure(name, build)
+  if not takes_number(build):
+    if log is not None and "log" in known_settings(build):
+      settings, log = settings | {"log": log}, None
+    if channel is not None or log is not None or whiten:
+      raise UserError(
+        f"detector {name!r} has channels of its own; leave out channel, log and whiten"
+      )
+  shared = shared or ("threshold" in settings and "threshold_rpr" not in settings)
   detector = _built(name, build, patience, _figures(name, build, robot, agent, shared) | settings)
   if takes_number(build):
     detector = combine.whitened(detector, whiten) if whiten else detector

@@ -46,7 +46,7 @@ def split(name: str, channels: str | tuple[str, ...]) -> tuple[str, ...]:
   if not channels or len(set(channels)) < len(channels) or not all(map(is_channel, channels)):
     raise UserError(
       f"detector {name!r}: channels must be one or several of groups, {NAMES}, each once; got "
-      f"{'+'.join(channels)}"
+      f"{'+'.join(map(str, channels))}"
     )
   return channels
 

@@ -63,6 +63,8 @@ def com(env: Any) -> Fault:
 
     r' = r + 0.5 severity g e,   g = sqrt(trace(I) / (2 m)) radius of gyration, e the direction
 
+  The walker's reward still takes the nominal place (walker.center_x).
+
   Severity: 1 moves it by half the radius of gyration [m]: quadruped 0.13 (Loquercio et al. 2022
   train with 0.1), walker 0.10. Target: a direction (drawn), forward, backward, left, right, up,
   down as far as the robot can move there. Owns `mj.body_ipos`. Source: shifts of the trunk's centre

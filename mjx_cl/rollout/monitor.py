@@ -33,7 +33,7 @@ from mjx_cl.types import GROUPS, Array, Spec, Var
 LATENT = 16  # dimensions of the latent's projection
 # channels of one number, in the order of every table of them: name -> what it is
 CHANNELS = {
-  "opr": "observation residual, null where its window was cut",
+  "opr": "observation residual, null where fewer than 5 steps of its window are left",
   "rpr": "reward residual, as opr",
   "reward": "of arriving",
   "surprise": "KL(posterior || prior) [nats]",

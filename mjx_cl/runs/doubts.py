@@ -5,7 +5,7 @@ import inspect
 
 from mjx_cl import detectors, envs
 from mjx_cl.adapt.arms import ARMS
-from mjx_cl.config import CHUNK, RunConfig, own_agent
+from mjx_cl.config import CHUNK, RunConfig, own_agent, whose
 from mjx_cl.faults.presets import becomes, changes
 from mjx_cl.runs.identity import agent_of, known_as
 from mjx_cl.runs.records import acts
@@ -14,18 +14,20 @@ from mjx_cl.scoring import intervals
 
 def watching(config: RunConfig) -> str | None:
   """The threshold that a detector has without having been given one, in a line; None where it was,
-  takes none, is one of the paper's rules or looks at nothing.
+  takes none, looks at nothing or is one of the paper's rules with settings of its own.
   """
   name = detectors.split(config.detector)[0]
   build = detectors.factory(config.detector)
   if (
-    name in detectors.PAPER
+    name == "rolling_sigma_plain"
     or getattr(build, "reference", False)
     or "threshold" in config.settings
     or "threshold" not in detectors.known_settings(build)
     or not any(ARMS[arm].trigger.listens for arm in config.arms)
   ):
     return None
+  if name == "rolling_sigma":
+    return _uncalibrated(config)
   robot = known_as(envs.make(config.env, config.physics))
   found = detectors.calibrated(config.detector, robot, config.settings, agent_of(config))
   if found is None:
@@ -56,6 +58,22 @@ def watching(config: RunConfig) -> str | None:
     f"gave {found.alarms} false alarms in {steps:,.0f} healthy control steps, "
     f"one in {found.arl0:,.0f} [{low:,.0f}, {high:,.0f}]"
     + (f"; this run has another {' and '.join(other)}" if other else "")
+  )
+
+
+def _uncalibrated(config: RunConfig) -> str | None:
+  """Whose settings `rolling_sigma` takes on a robot that it is not calibrated for, in a line."""
+  known, agent = detectors.CALIBRATED, agent_of(config)
+  if own_agent(config.env) in known or agent in known:
+    return None
+  robot = known_as(envs.make(config.env, config.physics))
+  if own_agent(robot) in known:
+    return None
+  taken = whose(known, robot, agent)
+  return (
+    f"detector {config.detector} runs with the settings calibrated for {taken}, at threshold "
+    f"{known[taken]['threshold']:g}: it is not calibrated for {robot}, and false alarms may be "
+    "many; --set threshold=... sets another"
   )
 
 

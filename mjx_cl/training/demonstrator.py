@@ -21,7 +21,7 @@ import numpy as np
 
 from mjx_cl import envs
 from mjx_cl.envs.adapters import brax_env, brax_module
-from mjx_cl.errors import FileError
+from mjx_cl.errors import FileError, UserError
 from mjx_cl.io import arrays, folders, runtime
 from mjx_cl.types import EnvState, Model, Step
 
@@ -267,15 +267,13 @@ def main() -> None:
     "--resume", action="store_true", help="go on from the last evaluation in --out"
   )
   args = parser.parse_args()
-  train(
-    envs.make(args.env),
-    args.out,
-    args.steps,
-    args.seed,
-    args.evals,
-    lambda row: print(json.dumps(row), file=sys.stderr, flush=True),
-    args.resume,
-  )
+  told = lambda row: print(json.dumps(row), file=sys.stderr, flush=True)
+  try:
+    env = envs.make(args.env)
+    train(env, args.out, args.steps, args.seed, args.evals, told, args.resume)
+  except UserError as e:
+    print(f"mjx-cl: {e}", file=sys.stderr)
+    raise SystemExit(e.exit_code) from None
 
 
 if __name__ == "__main__":

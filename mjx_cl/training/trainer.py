@@ -73,7 +73,7 @@ class Trainer:
   ) -> None:
     check(env, dreamer, config)
     self.env, self.dreamer, self.config, self.out = env, dreamer, config, pathlib.Path(out)
-    self.seeds, self.mesh = seeds, seeds_mesh(seeds)
+    self.seed, self.seeds, self.mesh = seed, seeds, seeds_mesh(seeds)
     env = shaped(eased(env, config.penalties), config.shaping)
     self.expert = expert(env, config.demonstrator) if config.demonstrator else None
     self.expert_return = 0.0
@@ -82,7 +82,7 @@ class Trainer:
     self.owed = self.seconds = 0.0
     self.rows: list[dict] = []
     self.own: list[float] = []
-    self.failed: dict[int, str] = {}  # seed -> the term that was not finite, and when
+    self.failed: dict[int, str] = {}  # seed, from 0 -> the term that was not finite, and when
     sizes = len(env.spec.obs), len(env.spec.act)
     self.plain = Agent(dreamer, *sizes)
     needs.check(
@@ -208,10 +208,13 @@ class Trainer:
 
   def _new_fault(self, stream: Stream, ended: jax.Array) -> Stream:
     """`stream` with another target and severity where its episode `ended`, so far as these are
-    drawn: that follows from its key and its clock.
+    drawn: that follows from its key and its clock. What the faults remember is of the episode that
+    has begun since, and stays.
     """
     key = jax.random.fold_in(jax.random.fold_in(stream.key, OfStream.TRAINING_FAULT), stream.t)
     fresh = faults.begin(self.fault, key, self._drawn(key), self.target)
+    states = zip(fresh.states, stream.injection.states)
+    fresh = fresh._replace(states=tuple(new._replace(memory=old.memory) for new, old in states))
     return stream._replace(
       injection=jax.tree.map(
         lambda a, b: jnp.where(ended, jnp.asarray(a, b.dtype), b), fresh, stream.injection
@@ -317,8 +320,8 @@ class Trainer:
         f"{int(np.asarray(self.state.train.updates)[g]) + 1}"
       )
       print(
-        f"mjx-cl: numeric failure of seed {g}: {self.failed[int(g)]}; it stops here, its last "
-        "sound weights are kept",
+        f"mjx-cl: numeric failure of seed {self.seed + g}: {self.failed[int(g)]}; it stops here, "
+        "its last sound weights are kept",
         file=sys.stderr,
         flush=True,
       )

@@ -305,6 +305,19 @@ def test_who_is_told_its_stop_keeps_the_weights_of_that_snapshot(same):
   assert not same(told, snapshots[chunk - 2]) and not same(told, snapshots[chunk])
 
 
+def found(batch):
+  """The latents that the batch came with."""
+  return batch.deter[:, 1:], batch.stoch[:, 1:]
+
+
+def test_an_update_is_tried_on_what_the_learner_draws():
+  """Dreamer's own passes, and so does one that reads the batch alone."""
+  whole = lambda agent, memory, state, batch, key: agent.update(state, batch, key)
+  still = lambda agent, memory, state, batch, key: (state, {"x": batch.reward[0, 0]}, found(batch))
+  for update in (whole, still):
+    methods.check("mine", Method(update=update), AGENT)
+
+
 BROKEN = {
   "init of its method fails: KeyError": Method(init=lambda params: params["policy"]),
   "act of its method fails: AttributeError": Method(act=lambda memory, view: view.weights),
@@ -320,6 +333,18 @@ BROKEN = {
   ),
   "keep of its method must keep structure, shapes and types of the learner's state": Method(
     keep=lambda memory, before, after: after.params
+  ),
+  "update of its method fails: ValueError: not enough values to unpack": Method(
+    update=lambda agent, memory, state, batch, key: (state, {})
+  ),
+  "update of its method fails: NameError: name 'undefined'": Method(
+    update=lambda agent, memory, state, batch, key: (state, {}, undefined)  # noqa: F821
+  ),
+  "update of its method must keep structure, shapes and types of the learner's state": Method(
+    update=lambda agent, memory, state, batch, key: (state.params, {}, found(batch))
+  ),
+  "update of its method must keep shapes of the latents": Method(
+    update=lambda agent, memory, state, batch, key: (state, {}, (batch.deter, batch.stoch))
   ),
   "hides of its method must keep structure, shapes and types of one bool": Method(
     hides=lambda memory: 1.0

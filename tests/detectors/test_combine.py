@@ -18,7 +18,7 @@ from mjx_cl.detectors import (
   whitened,
   z_score,
 )
-from mjx_cl.errors import UserError
+from mjx_cl.errors import PluginError, UserError
 from mjx_cl.rollout.monitor import unknown
 
 
@@ -267,6 +267,17 @@ def test_the_whole_chain_keeps_the_contract(same):
   assert same(masked, last) and not alarm.fired.any() and np.isnan(alarm.score).all()
 
 
+def test_a_detector_of_another_package_is_held_to_its_form(monkeypatch):
+  """As one of a file: its state keeps its types, its alarm is a flag and a number."""
+  drifts = lambda threshold=1.0: Detector(
+    lambda: jnp.int32(0), lambda state, x: (state + 0.5, Alarm(x.opr > threshold, x.opr))
+  )
+  monkeypatch.setitem(detectors.DETECTORS, "theirs", drifts)
+  made = detectors.make("theirs")
+  with pytest.raises(PluginError, match=r"'theirs': update gives a state of form float32\[\] in "):
+    made.update(made.init(), jax.tree.map(lambda x: x[0], rows(np.ones(1))))
+
+
 def test_a_residual_detector_keeps_its_own_settings():
   own = detectors.make("rolling_sigma_plain", window=50, warmup=20, patience=3, threshold=0.5)
   xs = rows(1 + np.random.default_rng(0).normal(size=200))
@@ -281,6 +292,55 @@ def test_a_residual_detector_keeps_its_own_settings():
   assert 0 < cooled.sum() < run(own, xs)[1].sum()
   with pytest.raises(UserError, match="whiten"):
     detectors.make("rolling_sigma_plain", whiten=4)
+
+
+@pytest.mark.parametrize(
+  "name, settings",
+  [
+    ("hotelling", {"smooth": 5}),
+    ("mewma", {}),
+    ("max_variables", {"smooth": 5}),
+    ("rolling_sigma", {"window": 50, "smooth": 5}),
+    ("rolling_sigma_plain", {"window": 50}),
+  ],
+)
+def test_a_residual_detector_takes_its_own_logarithm(name, settings):
+  """As its factory does; not told, its own default holds."""
+  xs = rows(np.exp(np.random.default_rng(0).normal(size=300)))
+  settings |= {"warmup": 40} | ({} if "rolling" in name else {"channels": "opr+rpr"})
+  of = lambda **told: run(detectors.make(name, **settings, **told), xs)[2]
+  by_hand = lambda log: run(detectors.DETECTORS[name](**settings, log=log), xs)[2]
+  for log in (True, False):
+    np.testing.assert_array_equal(of(log=log), by_hand(log))
+  assert (by_hand(True) != by_hand(False)).any()
+  np.testing.assert_array_equal(of(), of(log=name != "rolling_sigma_plain"))
+  with pytest.raises(UserError, match="log"):
+    detectors.make("knn", log=False)
+
+
+def test_two_channels_for_one_detector_are_refused():
+  for ask in (detectors.make, lambda name, **told: detectors.calibrated(name, "walker", told)):
+    with pytest.raises(UserError, match="cusum@opr is given another channel, rpr"):
+      ask("cusum@opr", channel="rpr")
+    assert ask("cusum@opr", channel="opr") is not None
+
+
+def test_a_patience_of_one_is_one():
+  """Where the detector's own default is another: the car's calibrated rule wants 20 in a row."""
+  steps = 400
+  x = np.exp(np.random.default_rng(0).normal(size=steps)) + 5 * (np.arange(steps) % 50 == 49)
+  of = lambda **told: run(
+    detectors.make("rolling_sigma", robot="car", window=50, warmup=20, **told), rows(x)
+  )[1]
+  assert of(patience=1).any() and not of().any() and not of(patience=None).any()
+  plain, one = (detectors.make("cusum", **told) for told in ({}, {"patience": 1}))
+  assert jax.tree.structure(plain.init()) == jax.tree.structure(one.init())
+  known = [detectors.calibrated("cusum", "walker", told) for told in ({}, {"patience": 1})]
+  assert known[0] is not None and known[0] == known[1]
+  assert detectors.calibrated("cusum", "walker", {"patience": 2}) is None
+  detectors.make("hotelling", patience=1)  # has none, and one is as none
+  with pytest.raises(UserError, match="patience"):
+    detectors.make("hotelling", patience=2)
 
 
 @pytest.mark.parametrize(

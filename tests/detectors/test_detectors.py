@@ -470,6 +470,26 @@ def test_one_threshold_for_both_residuals_is_both_thresholds_in_proportion(robot
   )
 
 
+@pytest.mark.parametrize("robot, agent", CALIBRATED)
+def test_a_threshold_that_is_given_moves_both_residuals(robot, agent):
+  """Alone, in the calibrated proportion; `threshold_rpr` beside it is taken as it is, None: the
+  same for both.
+  """
+  own = detectors.CALIBRATED[agent]
+  ratio = own.get("threshold_rpr", own["threshold"]) / own["threshold"]
+  small = dict(robot=robot, agent=agent, window=100, warmup=20, smooth=40, lag=2, threshold=0.8)
+  xs = residuals(jax.random.key(6), 400, invalid=0.0)
+  fired = lambda **more: (
+    (
+      jax.lax.scan((d := detectors.make("rolling_sigma", **small | more)).update, d.init(), xs)[1]
+    ).fired
+  )
+  np.testing.assert_array_equal(fired(), fired(threshold_rpr=0.8 * ratio))
+  np.testing.assert_array_equal(fired(threshold_rpr=None), fired(threshold_rpr=0.8))
+  assert fired().any() and not fired(threshold=100.0).any()
+  assert fired(threshold=100.0, threshold_rpr=0.4).any()
+
+
 def test_an_agent_has_its_own_threshold_where_one_was_found():
   of = lambda name, agent: detectors.calibrated(name, "walker", {}, agent)
   values = [of("innovations", agent).value for agent in (None, "walker", "walker-2", "walker-3")]
@@ -505,7 +525,7 @@ def test_what_stands_on_the_board_takes_its_threshold_from_there(robot):
   ):
     assert same(("cusum", {}), ("cusum", other)), other
   assert same(("cusum@surprise", {}), ("cusum", {"channel": "surprise"})) and same(
-    ("cusum@opr", {}), ("cusum@opr", {"channel": "rpr"})
+    ("cusum@opr", {}), ("cusum@opr", {"channel": "opr"})
   )  # as in `make`
   assert same(("hotelling", {}), ("hotelling", {"patience": 1})) and not same(
     ("cusum@opr", {}), ("cusum@rpr", {})

@@ -5,6 +5,7 @@ distribution or a published run length.
 import chex
 import jax
 import jax.numpy as jnp
+import jaxtyping
 import numpy as np
 import pytest
 import quick
@@ -192,6 +193,23 @@ def test_trail_is_the_sum_of_the_last_known_samples():
 def test_bad_settings_are_refused(build, settings):
   with pytest.raises(UserError, match=build.__name__):
     build(**settings)
+
+
+@pytest.mark.parametrize(
+  "name, settings",
+  [
+    ("hotelling", dict(channels=[5])),
+    ("mewma", dict(channels=["opr", None])),
+    ("max_variables", dict(channels=[1.5])),
+    ("bfar", dict(horizons=[1.5])),
+    ("bfar", dict(horizons=[5, 1.5])),
+  ],
+)
+def test_lists_of_the_wrong_kind_are_refused(name, settings, monkeypatch):
+  """As a user without the tests' check of types is told."""
+  monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
+  with pytest.raises(UserError, match=f"{name}': {next(iter(settings))} must be one or several"):
+    detectors.make(name, **settings)
 
 
 @pytest.mark.parametrize(

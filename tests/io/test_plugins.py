@@ -20,7 +20,7 @@ from mjx_cl import detectors, envs, faults
 from mjx_cl.cli import app
 from mjx_cl.cli.flags import List, Run
 from mjx_cl.errors import PluginError, UserError
-from mjx_cl.io import plugins
+from mjx_cl.io import plugins, tables
 from mjx_cl.io.plugins import Registry
 from mjx_cl.rollout.monitor import unknown
 
@@ -399,6 +399,12 @@ def test_a_detector_in_the_loop_has_the_boards_threshold(tmp_path, monkeypatch):
     ("walker", "always", {}, None),
     ("walker", "random", {}, None),
     ("walker", "rolling_sigma", {}, None),
+    ("quadruped", "rolling_sigma", {"agent": "quadruped-trot-3"}, None),
+    ("car_real", "rolling_sigma", {}, None),
+    ("FILE:Reach", "rolling_sigma", {}, "calibrated for walker, at threshold 6.5: it is not calib"),
+    ("FILE:Reach", "rolling_sigma", {"settings": {"threshold": 9.0}}, None),
+    ("FILE:Reach", "rolling_sigma", {"arms": ("none", "oracle")}, None),
+    ("FILE:Reach", "rolling_sigma_plain", {}, None),
     ("walker", "rolling_sigma_plain", {}, None),
     ("walker", "rolling_sigma_FILE", {}, "its own default threshold, 4:"),
   ],
@@ -413,6 +419,8 @@ def test_what_a_detector_runs_with_is_said(robot, detector, change, text, tmp_pa
       "cusum(threshold=threshold)\n"
     )
     detector = f"{tmp_path}/rolling_sigma_mine.py:mine"
+  (tmp_path / "reach.py").write_text(PLUG)
+  robot = robot.replace("FILE", f"{tmp_path}/reach.py")
   said = doubts.watching(RunConfig(robot, fault="noise", detector=detector, **change))
   assert said is None if text is None else text in said
 
@@ -518,7 +526,6 @@ def test_robot_and_fault_of_a_file(tmp_path, capsys, tiny):
 
   from mjx_cl.config import RunConfig
   from mjx_cl.faults.presets import changes
-  from mjx_cl.io import tables
   from mjx_cl.runs import certify, identity, run, settings
   from mjx_cl.training import agents
 
@@ -627,7 +634,6 @@ def test_a_file_robot_that_is_a_shipped_one_by_another_path(tmp_path, capsys):
   """
   import types
 
-  from mjx_cl.io import tables
   from mjx_cl.leaderboard import record
   from mjx_cl.runs import certificate_tables
   from mjx_cl.training import agents
@@ -751,7 +757,8 @@ def test_the_fault_of_the_docs(tmp_path):
 
 
 HOSTILE = """
-import mjx_cl.detectors
+import jax.numpy as jnp, mjx_cl.detectors
+from mjx_cl.detectors import Alarm
 class Own(BaseException):
   def __str__(self): raise ValueError
 def leaves(threshold=1.0): raise SystemExit(0)
@@ -766,9 +773,42 @@ def words(threshold=1.0):
   return mjx_cl.detectors.Detector(lambda: (), lambda state, x: "no answer")
 def unlike(threshold=1.0):
   return mjx_cl.detectors.Detector(lambda: "no state", lambda state, x: state)
+def pair(threshold=1.0):
+  alarm = lambda x: Alarm(jnp.array([True, False]), x.opr)
+  return mjx_cl.detectors.Detector(lambda: (), lambda state, x: (state, alarm(x)))
+def whole(threshold=1.0):
+  return mjx_cl.detectors.Detector(lambda: (), lambda state, x: (state, Alarm(1, x.opr)))
+def drifts(threshold=1.0):
+  answer = lambda state, x: (state + 0.5, Alarm(state > 3, x.opr))
+  return mjx_cl.detectors.Detector(lambda: jnp.int32(0), answer)
+def grows(threshold=1.0):
+  answer = lambda state, x: ((state, state), Alarm(x.opr > 3, x.opr))
+  return mjx_cl.detectors.Detector(lambda: 0.0, answer)
 def iterates(threshold=1.0):
   return mjx_cl.detectors.Detector(lambda: next(iter(())), lambda state, x: state)
 """
+
+
+SCALARS = """
+import jax.numpy as jnp, numpy as np
+from mjx_cl.detectors import Alarm, Detector
+def count(threshold=1e9, warmup=10):
+  def update(state, x):
+    n, mean, seen, squares = state
+    new = n + 1, 0.9 * mean + jnp.where(x.valid, x.reward, 0.0), True, np.zeros(2)
+    return new, Alarm(n > threshold, mean)
+  return Detector(lambda: (0, 0.0, False, np.zeros(2)), update)
+"""
+
+
+def test_a_state_may_hold_numbers_of_python(tmp_path, capfd):
+  (tmp_path / "count.py").write_text(SCALARS)
+  source, out = f"{tmp_path / 'count.py'}:count", tmp_path / "out"
+  short = ("--seeds", "1", "--steps", "192", "--onset", "100", "--arm", "detector")
+  short += ("--set", "threshold=100", "--adapt.warmup", "50", "--adapt.refit", "64")
+  status = app.main(["run", "walker", *short, "--detector", source, "--out", str(out)])
+  assert status == 0, capfd.readouterr().err[-500:]
+  assert tables.read_arrow(out / "trace.parquet").num_rows == 192
 
 
 @pytest.mark.parametrize(
@@ -781,6 +821,10 @@ def iterates(threshold=1.0):
     ("late", "SystemExit: 0"),
     ("words", "update gives str in place of (state, Alarm)"),
     ("unlike", "init gives str in place of arrays"),
+    ("pair", "Alarm(fired bool[2], score float32[]) in place of (bool[], float32[])"),
+    ("whole", "Alarm(fired int32[], score float32[])"),
+    ("drifts", "a state of form float32[] in place of int32[]"),
+    ("grows", "a state of form (float32[], float32[]) in place of float32[]"),
     ("iterates", "init raised StopIteration"),
   ],
 )

@@ -29,6 +29,16 @@ def brax_policy(obs_size, act_size):
   return params, networks.make_inference_fn(net)(params, deterministic=True)
 
 
+def test_a_training_that_cannot_go_on_is_one_line(tmp_path, monkeypatch, capsys):
+  monkeypatch.setattr("sys.argv", ["demonstrator", "car", "--out", str(tmp_path), "--resume"])
+  monkeypatch.setattr(demonstrator.runtime, "setup", lambda: None)
+  with pytest.raises(SystemExit) as e:
+    demonstrator.main()
+  said = capsys.readouterr().err
+  assert e.value.code == FileError.exit_code and said.count("\n") == 1
+  assert said.startswith(f"mjx-cl: {tmp_path} holds no demonstrator training")
+
+
 def test_policy_equals_brax():
   params, infer = brax_policy(5, 2)
   obs = jax.random.normal(jax.random.key(3), (7, 5))

@@ -33,6 +33,12 @@ def make_trainer(env, out):
   return trainer
 
 
+def test_a_seed_that_fails_is_named_as_its_folder_is(short_walker, tmp_path, capfd):
+  trainer = train.Trainer(short_walker, DREAMER, CONFIG, tmp_path, seed=5, seeds=3)
+  trainer._notice_failures(np.array([-1, 0, -1]))
+  assert "numeric failure of seed 6: " in capfd.readouterr().err and list(trainer.failed) == [1]
+
+
 def seed(tree, g):
   return jax.tree.map(lambda x: x[g], tree)
 

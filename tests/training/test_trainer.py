@@ -197,6 +197,21 @@ def test_randomised_faults_are_drawn_anew_with_each_episode(short_walker, tmp_pa
     train.Trainer(short_walker, DREAMER, TrainConfig(fault="geer"), tmp_path)
 
 
+def test_a_new_draw_keeps_what_a_fault_remembers(short_walker, tmp_path, same):
+  """The chunk may have lived part of the next episode, whose start alone fills a memory."""
+  config = TrainConfig(envs=40, fault="stuck+command_delay", severity=0.5)
+  trainer = train.Trainer(short_walker, DREAMER, config, tmp_path)
+  streams = trainer.state.streams
+  full = lambda state: state._replace(memory=jax.tree.map(lambda x: x + 1, state.memory))
+  injection = streams.injection._replace(states=tuple(map(full, streams.injection.states)))
+  streams = streams._replace(injection=injection, t=streams.t + 1)
+  new = trainer._redraw(streams, np.ones((1, 40), bool)).injection
+  memory = lambda injection: [state.memory for state in injection.states]
+  assert jax.tree.leaves(memory(injection)) and same(memory(new), memory(injection))
+  assert (new.plan.severity != injection.plan.severity).all()
+  assert (new.target != injection.target).any()
+
+
 @pytest.mark.slow
 def test_a_preset_is_trained_under_as_it_is(short_walker, tmp_path):
   """Severities, clocks and the targets that it names, for every robot, and still after a new draw;

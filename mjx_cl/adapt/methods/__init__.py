@@ -23,7 +23,9 @@ from mjx_cl.adapt.methods.base import (
   follow,
 )
 from mjx_cl.adapt.settling import SIGNALS
-from mjx_cl.dreamer.agent import Agent, TrainState
+from mjx_cl.dreamer import replay as replay_lib
+from mjx_cl.dreamer.agent import Agent, TrainState, culprit
+from mjx_cl.dreamer.state import Record
 from mjx_cl.errors import PluginError, choose
 from mjx_cl.io import plugins
 
@@ -81,6 +83,22 @@ def remember(method: Method, params: Any) -> Any:
   return jax.tree.map(array, method.init(params))
 
 
+def _drawn(agent: Agent) -> tuple[Record, tuple[jax.Array, jax.Array], jax.Array]:
+  """A batch as the learner draws it, the latents that an update finds of it, and a key."""
+  c, size, key = agent.config, agent.size, jax.random.key(0)
+  length = c.length + 1
+  replay = replay_lib.init(1, length, agent.obs_size, agent.act_size, size.deter, size.stoch)
+  batch = replay_lib.sample(replay, key, c.batch, length)[1]
+  return batch, (batch.deter[:, 1:], batch.stoch[:, 1:]), key
+
+
+def _updated(method: Method, agent: Agent, *given: Any) -> tuple[TrainState, Any]:
+  """(state', latents) of the method's update, whose metrics are read as the loop reads them."""
+  learnt, metrics, latents = method.update(agent, *given)  # type: ignore[misc]
+  culprit(metrics)
+  return learnt, latents
+
+
 def check(name: str, method: Method, agent: Agent) -> None:
   """Tries the functions of a method on shapes alone.
 
@@ -123,6 +141,13 @@ def check(name: str, method: Method, agent: Agent) -> None:
     raise PluginError(f"arm {name!r}: act of its method must keep structure and shapes of memory")
   if method.keep is not None:
     like("keep", tried("keep", method.keep, memory, train, train), train, "the learner's state")
+  if method.update is not None:
+    update = lambda *given: _updated(method, agent, *given)
+    batch, latents, key = jax.eval_shape(lambda: _drawn(agent))
+    learnt, found = tried("update", update, memory, train, batch, key)
+    like("update", learnt, train, "the learner's state")
+    if form(found) != form(latents) or shapes(found) != shapes(latents):
+      raise PluginError(f"arm {name!r}: update of its method must keep shapes of the latents")
   if method.hides is not None:
     hides = tried("hides", method.hides, memory)
     like("hides", hides, flag, "one bool")
