@@ -38,7 +38,7 @@ def watching(config: RunConfig) -> str | None:
     return (
       f"detector {config.detector} runs at {own}: none was found for {robot} with these "
       "settings, and false alarms may be many; --set threshold=... "
-      "(`mjx-cl leaderboard` finds one)"
+      "(`mjx-cl calibrate` finds one)"
     )
   steps = found.arl0 * found.alarms
   low, high = (steps / n for n in reversed(intervals.poisson(found.alarms)))
@@ -73,7 +73,7 @@ def _uncalibrated(config: RunConfig) -> str | None:
   return (
     f"detector {config.detector} runs with the settings calibrated for {taken}, at threshold "
     f"{known[taken]['threshold']:g}: it is not calibrated for {robot}, and false alarms may be "
-    "many; --set threshold=... sets another"
+    "many; --set threshold=... sets another (`mjx-cl calibrate` finds one)"
   )
 
 
