@@ -1,5 +1,5 @@
 """The pictures of docs/detection.md, from simulation with fixed seeds: run lengths, latency,
-censoring, two AUROC traps, the limit.
+censoring, two AUROC traps.
 
 python benchmarks/figures_detection.py --out docs
 """
@@ -113,55 +113,11 @@ def traps(ax, rng):
   ax.legend(loc="upper left", fontsize=8)
 
 
-def limit(ax, rng):
-  """Delay against ARL0 for a shift of one deviation: the closed form, a CUSUM tuned to it, and a
-  threshold on single samples.
-  """
-  from mjx_cl.scoring import limits
-
-  rates = np.geomspace(50, 20_000, 12)
-  ax.plot(
-    rates,
-    [limits.brownian(r, 1.0).delay for r in rates],
-    color="k",
-    label="limit: no detector is faster (closed form)",
-  )
-  healthy, faulty = (
-    cusum(rng.standard_normal((20_000, 300))),
-    cusum(rng.standard_normal((400, 20_000)) + 1.0),
-  )
-  points = []
-  for h in (2.5, 3.0, 3.5, 4.0, 5.0, 6.0):
-    points.append(
-      (np.minimum(first(healthy > h), 20_000).mean() + 1, (first(faulty > h) + 1).mean())
-    )
-  ax.plot(*zip(*points), "o", color=BLUE, label="CUSUM, simulated")
-  from scipy.stats import norm
-
-  k = np.linspace(2.0, 4.0, 9)
-  ax.plot(
-    1 / norm.sf(k),
-    1 / norm.sf(k - 1.0),
-    "s",
-    color=ORANGE,
-    label="threshold on single samples (exact)",
-  )
-  ax.set(
-    xscale="log",
-    yscale="log",
-    xlabel="ARL0 [control steps]",
-    ylabel="mean delay [control steps]",
-    title="Shift of one deviation in independent samples",
-  )
-  ax.legend(fontsize=8)
-
-
 PICTURES = {
   "arl": run_lengths,
   "latency": latency,
   "censoring": censoring,
   "auroc": traps,
-  "limit": limit,
 }
 
 
