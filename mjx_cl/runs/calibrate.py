@@ -12,6 +12,7 @@ import numpy as np
 from mjx_cl import detectors, faults
 from mjx_cl.config import CHUNK
 from mjx_cl.errors import PluginError, UserError, require
+from mjx_cl.io import memory
 from mjx_cl.rollout.monitor import Monitor, Residual
 from mjx_cl.rollout.scan import Rollout, nest, start, stream_keys
 from mjx_cl.runs.identity import known_as
@@ -134,6 +135,11 @@ def calibrate(
     counted / arl0 >= LEAST,
     f"{len(seeds)} robots of {steps:,} control steps give {counted / arl0:.3g} false alarms at one "
     f"in {arl0:g}; {LEAST} are needed: more --seeds or --steps",
+  )
+  held = 8 * rows * len(seeds) * (2 * len(env.spec.obs) + 64)  # bytes, twice while joined
+  require(
+    held <= memory.MARGIN * memory.free(),
+    f"{len(seeds)} robots of {steps:,} control steps take {held / 2**30:.1f} GiB; fewer would fit",
   )
   told = {"robot": known_as(env), "agent": agents.called(trained)} | settings
   factory = detectors.factory(detectors.split(detector)[0])

@@ -201,7 +201,7 @@ def test_each_fault_and_severity_is_a_run_of_its_own(mjx, tmp_path):  # noqa: F8
   given = ("--fault", "friction", "offset", "--severity", "0.4", "0.6")
   code, text, _ = mjx(*plain, *given, "--out", both)
   parts = [f"fault={f},severity={s}" for f in ("friction", "offset") for s in (0.4, 0.6)]
-  assert code == 0 and all(f"{name}: car, " in text for name in parts)
+  assert code == 0 and all(name in text for name in parts)
   assert list(json.loads((both / "bench.json").read_text())["entries"]) == parts
   assert mjx(*plain, "--fault", "offset", "--severity", "0.6", "--out", alone)[0] == 0
 
