@@ -70,8 +70,8 @@ BASES = {
   "detect charts": Base(["detect", "log.csv", "--nominal", "nominal.csv", "--inject", "0.2", "--out", "out"], ("out",),
                         ("log.csv", "nominal.csv"), 2),
   "compare": Base(["compare", "run", "run", "--out", "out.png"], ("out.png",), RESULT),
-  "calibrate": Base(["calibrate", "walker", "--agent", "agent", "--detector", "cusum", "--seeds", "1", "--steps", "2000",
-                     "--arl0", "100"], (), AGENT),
+  "calibrate": Base(["calibrate", "walker", "--agent", "agent", "--detector", "cusum", "--seeds",
+                     "1", "--steps", "2000", "--arl0", "100"], (), AGENT),
   "certify": Base(["certify", "walker", "--fault", "gear", "--episodes", "0", "--out", "out"], ("out",)),
   "bench": Base(["bench", "suite.toml", "--out", "out", "--jobs", "1"], ("out",), ("suite.toml", *AGENT), 2),
   "bench again": Base(["bench", "suite.toml", "--out", "bench", "--jobs", "1"], ("bench",), (

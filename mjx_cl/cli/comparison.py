@@ -115,11 +115,11 @@ def _better(row: dict) -> str:
 
 def _show_comparison(rows: list[dict], first: str) -> None:
   """A table for each measure: a line for each variant, intervals beneath the numbers."""
-  number = _number
-  between = lambda x: "" if x is None else f"\n[{number(x[0])}, {number(x[1])}]"
+  between = lambda x: "" if x is None else f"\n[{_number(x[0])}, {_number(x[1])}]"
   shared = os.path.commonprefix([row["variant"] for row in rows]).rfind("/") + 1
-  heads = ("variant", "n", "IQM", "pairs", "difference", "better")
   for measure in dict.fromkeys(row["measure"] for row in rows):
+    middle = "mean" if measure in versus.SHARES else "iqm"
+    heads = ("variant", "n", middle.replace("iqm", "IQM"), "pairs", "difference", "better")
     cells = []
     for row in (row for row in rows if row["measure"] == measure):
       own = row["variant"] == first
@@ -127,9 +127,9 @@ def _show_comparison(rows: list[dict], first: str) -> None:
         (
           row["variant"][shared:],
           row["streams"],
-          number(row["iqm"]) + between(row["iqm_ci"]),
+          _number(row[middle]) + between(row[f"{middle}_ci"]),
           "" if own else row["pairs"],
-          "" if own else number(row["difference"]) + between(row["difference_ci"]),
+          "" if own else _number(row["difference"]) + between(row["difference_ci"]),
           "" if own else _better(row),
         )
       )

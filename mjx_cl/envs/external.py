@@ -1,22 +1,19 @@
 """Environments of Brax and MuJoCo Playground as robots of this package: `brax:NAME` and
-`playground:NAME` wherever a robot is named, `from_brax` and `from_playground` for one that is at
-hand. Both step MuJoCo XLA, so that faults reach their models' fields.
+`playground:NAME` wherever a robot is named, `External` for one that is at hand. Both step MuJoCo
+XLA, so that faults reach their models' fields.
 """
 
-import contextlib
 import copy
-import importlib
-import io
-import types
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import mujoco
 
-from mjx_cl.envs.mjcf import FIELDS, describe
+from mjx_cl.envs.mjcf import describe
 from mjx_cl.errors import UserError, choose
+from mjx_cl.io import plugins
+from mjx_cl.physics.fields import FAULTY
 from mjx_cl.types import EnvState, Model, Step
 
 
@@ -49,47 +46,60 @@ PLAYGROUND = Access("_mjx_model", "data")
 
 
 class External:
-  """An environment with `reset(key) -> state` and `step(state, action) -> state`, where a state has
-  `obs`, `reward` and `done`, as a robot: `spec`, `model`, `init`, `step`.
+  """A `mujoco_playground.MjxEnv` of implementation jax, or a `brax.envs.PipelineEnv` of backend mjx
+  without brax's wrappers, as a robot: `spec`, `model`, `init`, `step`.
 
-  An episode terminates where `done` is set and is truncated after `episode_steps`. What a fault
-  owns replaces the fields of the environment's mjx.Model for that step, with the constants that
-  follow from masses (physics.mjx); forces go to qfrc_applied. The reward and its weights are the
-  environment's own.
+  An episode terminates where its state's `done` is set and is truncated after `episode_steps`. What
+  a fault owns replaces the fields of the environment's mjx.Model for that step, with the constants
+  that follow from masses (physics.mjx); forces go to qfrc_applied. The reward and its weights are
+  the environment's own.
+
+  Args:
+    env: environment.
+    name: what tables and agents' cards call it; None: that of its class in lower case.
+    episode_steps: control steps until truncation.
+    acceptance: mean reward a control step from which the task counts as done well enough.
+    scale: typical deviation of the observation, a number or one for each entry: the unit of faults
+      of its sensors.
 
   Raises:
-    UserError: an observation that is not one vector.
+    UserError: another environment, or an observation that is not one vector.
+
+  Example:
+    Ant = lambda: External(brax.envs.get_environment("ant", backend="mjx"), acceptance=3.0)
   """
 
   def __init__(
     self,
     env: Any,
-    access: Access,
-    mj_model: mujoco.MjModel,
-    name: str,
-    episode_steps: int,
-    acceptance: float,
-    scale: float | Sequence[float],
+    name: str | None = None,
+    episode_steps: int = 1000,
+    acceptance: float = 0.0,
+    scale: float | Sequence[float] = 1.0,
   ) -> None:
     from mjx_cl.physics.mjx import Mjx  # a costly import
 
-    self.env, self.access, self.mj_model = env, access, mj_model
-    own = getattr(env, access.model)
-    self.physics = Mjx(mj_model, 1, model=own)
-    fields = [field for field in FIELDS if field not in ("gravity", *self.physics.inert)]
+    name = name or type(env).__name__.lower()
+    if hasattr(env, PLAYGROUND.model):
+      self.access, host = PLAYGROUND, env.mj_model
+    elif getattr(env, "backend", None) == "mjx":
+      self.access, host = BRAX, env.sys.mj_model
+    else:
+      raise UserError(f"robot {name!r} is none of MuJoCo Playground, nor of brax's backend mjx")
+    own = getattr(env, self.access.model)
+    self.env, self.mj_model, self.physics = env, host, Mjx(host, 1, model=own)
+    fields = [field for field in FAULTY if field not in ("gravity", *self.physics.inert)]
     self.model = Model(
       {field: jnp.asarray(getattr(own, field), jnp.float32) for field in fields}
       | {"gravity": jnp.asarray(own.opt.gravity, jnp.float32)},
       {},
-      jnp.zeros(mj_model.nv),
+      jnp.zeros(host.nv),
     )
     obs = vector(jax.eval_shape(env.reset, jax.random.key(0)).obs)
     if len(obs.shape) != 1:
       raise UserError(f"robot {name!r} observes arrays of shape {obs.shape}; one vector is needed")
     names = tuple(f"obs_{i}" for i in range(obs.shape[0]))
-    self.spec = describe(
-      mj_model, name, names, float(env.dt), episode_steps, acceptance, scale=scale
-    )
+    self.spec = describe(host, name, names, float(env.dt), episode_steps, acceptance, scale)
 
   def init(self, model: Model, key: jax.Array) -> tuple[EnvState, jax.Array]:
     """A fresh episode drawn from `key`: state and observation."""
@@ -127,76 +137,20 @@ def vector(obs: Any) -> Any:
   return obs
 
 
-def from_brax(
-  env: Any,
-  name: str | None = None,
-  episode_steps: int = 1000,
-  acceptance: float = 0.0,
-  scale: float | Sequence[float] = 1.0,
-) -> External:
-  """A `brax.envs.PipelineEnv` of backend mjx as a robot, without brax's wrappers.
-
-  Args:
-    env: environment.
-    name: what tables and agents' cards call it; None: that of its class.
-    episode_steps: control steps until truncation.
-    acceptance: mean reward a control step from which the task counts as done well enough.
-    scale: typical deviation of the observation, a number or one for each entry: the unit of faults
-      of its sensors.
-
-  Raises:
-    UserError: another backend, or an observation that is not one vector.
-
-  Example:
-    Ant = lambda: from_brax(brax.envs.get_environment("ant", backend="mjx"), acceptance=3.0)
-  """
-  if getattr(env, "backend", None) != "mjx":
-    got = getattr(env, "backend", type(env).__name__)
-    raise UserError(f"faults change MuJoCo's model: brax's backend must be mjx; got {got}")
-  name = name or type(env).__name__.lower()
-  return External(env, BRAX, env.sys.mj_model, name, episode_steps, acceptance, scale)
-
-
-def from_playground(
-  env: Any,
-  name: str | None = None,
-  episode_steps: int = 1000,
-  acceptance: float = 0.0,
-  scale: float | Sequence[float] = 1.0,
-) -> External:
-  """A `mujoco_playground.MjxEnv` of implementation jax as a robot; arguments as of `from_brax`.
-
-  Example:
-    run = registry.load("CheetahRun", config_overrides={"impl": "jax"})
-    Cheetah = lambda: from_playground(run, acceptance=0.8)
-  """
-  name = name or type(env).__name__.lower()
-  return External(env, PLAYGROUND, env.mj_model, name, episode_steps, acceptance, scale)
-
-
-def _imported(package: str, extra: str) -> types.ModuleType:
-  """A package; what its import prints stays off standard output."""
-  try:
-    with contextlib.redirect_stdout(io.StringIO()):
-      return importlib.import_module(package)
-  except ImportError as e:
-    raise UserError(f"this robot needs {package} ({e}): pip install {extra}") from None
-
-
 def brax_robot(name: str) -> External:
   """`brax:NAME`."""
-  envs = _imported("brax.envs", "brax")
+  envs = plugins.optional("brax", "brax.envs")
   choose("brax environment", name, envs._envs)
-  return from_brax(envs.get_environment(name, backend="mjx"), f"brax:{name}")
+  return External(envs.get_environment(name, backend="mjx"), f"brax:{name}")
 
 
 def playground_robot(name: str) -> External:
   """`playground:NAME`, with its own length of an episode."""
-  registry = _imported("mujoco_playground", "playground").registry
+  registry = plugins.optional("playground", "mujoco_playground").registry
   choose("playground environment", name, dict.fromkeys(registry.ALL_ENVS))
   steps = int(registry.get_default_config(name).episode_length)
   env = registry.load(name, config_overrides={"impl": "jax"})
-  return from_playground(env, f"playground:{name}", steps)
+  return External(env, f"playground:{name}", steps)
 
 
 LIBRARIES: dict[str, Callable[[str], External]] = {

@@ -12,21 +12,9 @@ import numpy as np
 
 from mjx_cl import physics as physics_lib
 from mjx_cl.errors import PluginError, UserError
+from mjx_cl.physics.fields import FAULTY
 from mjx_cl.types import EnvState, Model, Spec, Step, Var
 
-# what faults own of a MuJoCo model
-FIELDS = (
-  "actuator_gear",
-  "geom_friction",
-  "body_mass",
-  "body_inertia",
-  "body_ipos",
-  "dof_armature",
-  "dof_damping",
-  "dof_frictionloss",
-  "jnt_range",
-  "gravity",
-)
 Pose = tuple[jax.Array, jax.Array]  # float32 qpos (nq,), qvel (nv,)
 
 
@@ -75,7 +63,7 @@ class Robot:
     self._middle = jnp.asarray(np.where(limited, (low + high) / 2, 0))
     self._half = jnp.asarray(np.where(limited, (high - low) / 2, 1))
     self.model = Model(
-      physics_lib.leaves(host, *FIELDS, backend=self.physics), {}, jnp.zeros(host.nv)
+      physics_lib.leaves(host, *FAULTY, backend=self.physics), {}, jnp.zeros(host.nv)
     )
     like = (
       jax.ShapeDtypeStruct((host.nq,), np.float32),

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import mujoco
 
 from mjx_cl import physics as physics_lib
+from mjx_cl.physics.fields import FAULTY
 from mjx_cl.types import EnvState, Model, Spec, Step, Var
 
 STAND_HEIGHT = 1.2  # [m]
@@ -160,20 +161,7 @@ class Walker:
     self.spec = make_spec(self.mj_model)
     self.reward_terms = tuple(REWARD_TERMS)
     self.model = Model(
-      mj=physics_lib.leaves(
-        self.mj_model,
-        "actuator_gear",
-        "geom_friction",
-        "body_mass",
-        "body_inertia",
-        "body_ipos",
-        "dof_armature",
-        "dof_damping",
-        "dof_frictionloss",
-        "jnt_range",
-        "gravity",
-        backend=self.physics,
-      ),  # fmt: skip
+      mj=physics_lib.leaves(self.mj_model, *FAULTY, backend=self.physics),
       task={
         "reward_weights": jnp.asarray(WEIGHTS, jnp.float32),
         "command_range": jnp.asarray([WALK_SPEED], jnp.float32),

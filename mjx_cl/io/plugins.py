@@ -3,12 +3,14 @@ or out of a file, path/to/file.py:Name.
 """
 
 import collections
+import contextlib
 import difflib
 import functools
 import hashlib
 import importlib
 import importlib.metadata
 import importlib.util
+import io
 import os
 import pathlib
 import sys
@@ -118,6 +120,18 @@ def line(e: BaseException, lines: int | None = None) -> str:
   except BaseException:  # a foreign one's own method
     said = "its message cannot be read"
   return f"{type(e).__name__}: {said or 'without a message'}"
+
+
+def optional(install: str, *modules: str) -> types.ModuleType:
+  """The last of these modules, each imported; UserError, with what pip is told to install, where a
+  package is missing. What imports print (brax's a line where warp is absent) stays off standard
+  output.
+  """
+  try:
+    with contextlib.redirect_stdout(io.StringIO()):
+      return [importlib.import_module(module) for module in modules][-1]
+  except ImportError as e:
+    raise UserError(f"this needs {modules[0]} ({e}): pip install {install}") from None
 
 
 _FILE = "mjx_cl_file_"  # what the names of modules out of a user's file begin with

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_cl import detectors, faults
-from mjx_cl.config import CHUNK
+from mjx_cl.config import CHUNK, AdaptConfig
 from mjx_cl.errors import PluginError, UserError, require
 from mjx_cl.io import memory
 from mjx_cl.rollout.monitor import Monitor, Residual
@@ -20,7 +20,7 @@ from mjx_cl.scoring import metrics, thresholds
 from mjx_cl.training import agents
 
 LEAST = 5  # alarms that the wanted rate must give, below which it cannot be read off
-WARMUP = 1000  # control steps of a stream in which no alarm counts, as adapt.warmup
+WARMUP = AdaptConfig.warmup  # control steps of a stream in which no alarm counts, as in a run
 
 
 class Calibrated(NamedTuple):
@@ -111,7 +111,7 @@ def calibrate(
   tell: Callable[[str], Any] = lambda text: None,
 ) -> Calibrated:
   """The least threshold from which on healthy robots give no more than steps / arl0 alarms, counted
-  with restarts from control step 1,000 on.
+  with restarts from control step WARMUP on.
 
   Args:
     env: robot.

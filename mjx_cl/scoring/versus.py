@@ -27,7 +27,7 @@ MEASURES: dict[str, tuple[str, bool]] = {
   "recovered": ("share of affected streams that recover", True),
 }
 ALL = tuple(MEASURES)[:5]  # of a comparison that names none
-SHARES = ("alarmed", "recovered")  # their middle is a mean
+SHARES = ("alarmed", "recovered")
 MUST_AGREE = (*stop_rule.SAME, "steps", "seeds", "first_seed")
 
 
@@ -208,9 +208,9 @@ def against(one: Variant, first: Variant, measure: str) -> dict[str, Any]:
   """A variant's measure and its difference from the first variant's.
 
   Returns:
-    streams (one a seed), iqm and iqm_ci of the variant, of a share its mean; pairs (of the same
-    seed in both), difference (mean of variant - first over the pairs), difference_ci (bootstrap
-    over pairs), better (share of the pairs in which the variant is better, ties half).
+    streams (one a seed), iqm and iqm_ci of the variant, of SHARES mean and mean_ci; pairs (of the
+    same seed in both), difference (mean of variant - first over the pairs), difference_ci
+    (bootstrap over pairs), better (share of the pairs in which the variant is better, ties half).
   """
   own = np.array([value(row, measure) for row in one.rows.values()])
   own = own[np.isfinite(own)]
@@ -222,13 +222,13 @@ def against(one: Variant, first: Variant, measure: str) -> dict[str, Any]:
   gain = pairs[:, 0] - pairs[:, 1]
   sign = 1 if MEASURES[measure][1] else -1
   mean = lambda x, axis=-1: np.mean(x, axis)
-  middle = mean if measure in SHARES else intervals.iqm
+  name, middle = ("mean", mean) if measure in SHARES else ("iqm", intervals.iqm)
   return {
     "variant": one.name,
     "measure": measure,
     "streams": len(own),
-    "iqm": float(middle(own)) if len(own) else None,
-    "iqm_ci": intervals.interval(own, middle),
+    name: float(middle(own)) if len(own) else None,
+    f"{name}_ci": intervals.interval(own, middle),
     "pairs": len(gain),
     "difference": float(gain.mean()) if len(gain) else None,
     "difference_ci": intervals.interval(gain, mean),

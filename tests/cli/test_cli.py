@@ -275,9 +275,8 @@ def test_the_parts_of_a_suite_are_one_table(capsys, monkeypatch):
   two = dict(list(entries.items())[:2])
   shown.show_suite(two)
   text = capsys.readouterr().out
-  rows = [
-    [cell.strip() for cell in line.split("│")[1:-1]] for line in text.splitlines() if "│" in line
-  ]
+  lines = [line for line in text.splitlines() if "│" in line]
+  rows = [[cell.strip() for cell in line.split("│")[1:-1]] for line in lines]
   rows = [row for row in rows if row[1] in ("detector", "none")]
   assert [(row[0], row[1]) for row in rows] == [
     (part, arm) for part, own in two.items() for arm in own["arms"]

@@ -341,7 +341,8 @@ def test_a_missing_package_is_one_line(short_walker, monkeypatch, package, call)
     monkeypatch.setitem(sys.modules, name, None)
   with pytest.raises(UserError) as refused:
     call(short_walker)
-  assert f"pip install 'mjx-cl[{package}]'" in str(refused.value) and "\n" not in str(refused.value)
+  install = {"gymnasium": "'mjx-cl[gymnasium]'", "brax": "brax"}[package]
+  assert str(refused.value).endswith(f"pip install {install}") and "\n" not in str(refused.value)
 
 
 # ---- gymnasium's names ---------------------------------------------------------------------------

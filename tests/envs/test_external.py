@@ -1,4 +1,4 @@
-"""Robots of Brax and MuJoCo Playground: C MuJoCo as oracle of what a fault does to them, bad names."""
+"""Robots of Brax and MuJoCo Playground: C MuJoCo as oracle of what faults do to them, bad names."""
 
 import copy
 import importlib.util
@@ -89,8 +89,8 @@ def test_what_cannot_be_had_is_one_line(pendulum, monkeypatch):
     assert "\n" not in str(e.value)
   with pytest.raises(UserError, match="no physics backend to choose"):
     envs.make("brax:inverted_pendulum", "native")
-  with pytest.raises(UserError, match="backend must be mjx; got Pendulum"):
-    external.from_brax(type("Pendulum", (), {})())
+  with pytest.raises(UserError, match="'pendulum' is none of MuJoCo Playground, nor of brax"):
+    external.External(type("Pendulum", (), {})())
   if importlib.util.find_spec("mujoco_playground") is None:
     with pytest.raises(UserError, match="pip install playground"):
       envs.make("playground:CheetahRun")

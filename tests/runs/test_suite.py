@@ -854,8 +854,8 @@ def test_a_reward_that_is_no_number_ends_a_run_in_one_line(mini, tmp_path):  # n
   with pytest.raises(
     FileError,
     match=(
-      r"^numeric failure by step 128 in arm none, seed 1: the robot's reward is not finite; the last "
-      r"checkpoint is intact$"
+      r"^numeric failure by step 128 in arm none, seed 1: the robot's reward is not finite; "
+      r"the last checkpoint is intact$"
     ),
   ):
     runner.step()

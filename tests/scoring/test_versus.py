@@ -204,7 +204,8 @@ def test_a_setting_that_a_suite_varies_is_compared_over_its_parts(tmp_path, mjx)
   assert {(r["against"], r["variant"]) for r in rows} == {("detector=cusum", "detector=ewma")}
   first = {r["measure"]: r for r in rows if r["part"] == "walker/fault=gear"}
   assert first["alarmed"]["difference"] == pytest.approx(-1 / 3)
-  assert first["alarmed"]["iqm"] == pytest.approx(1 / 3)  # the mean of a share
+  assert first["alarmed"]["mean"] == pytest.approx(1 / 3) and "iqm" not in first["alarmed"]
+  assert first["latency_steps"]["iqm"] == 30
   assert first["latency_steps"]["pairs"] == 1 and first["latency_steps"]["difference"] == 20
   assert first["recovered"]["pairs"] == 2 and first["recovered"]["difference"] == 0
   code, _, err = mjx(tmp_path, "--by", "severity")

@@ -9,14 +9,11 @@ imported by the first call that needs them.
 
 from __future__ import annotations
 
-import contextlib
-import importlib
-import io
 import types
 from typing import TYPE_CHECKING, Any
 
 from mjx_cl.envs.adapters.driven import FaultSettings, Puppet, Robots, join, worst
-from mjx_cl.errors import UserError
+from mjx_cl.io import plugins
 
 if TYPE_CHECKING:
   from mjx_cl.envs.adapters.brax import BraxEnv
@@ -35,25 +32,13 @@ __all__ = [
 ]
 
 
-def _optional(package: str, module: str) -> types.ModuleType:
-  """A module that needs an optional package. What brax's imports print (a line where warp is
-  absent) stays off standard output.
-  """
-  try:
-    with contextlib.redirect_stdout(io.StringIO()):
-      importlib.import_module(package)
-      return importlib.import_module(module)
-  except ImportError as e:
-    raise UserError(f"this needs {package} ({e}): pip install 'mjx-cl[{package}]'") from None
-
-
 def brax_module(name: str) -> types.ModuleType:
   """Brax's module of that name.
 
   Raises:
     UserError where brax is not installed.
   """
-  return _optional("brax", f"brax.{name}")
+  return plugins.optional("brax", "brax", f"brax.{name}")
 
 
 def brax_env(env: Any, fault: str | None = None, **settings: Any) -> BraxEnv:
@@ -64,14 +49,18 @@ def brax_env(env: Any, fault: str | None = None, **settings: Any) -> BraxEnv:
   robot from its own first state. They leave `info` alone, which is where the fault and its clock
   live: a reset touches neither.
   """
-  return _optional("brax", f"{__name__}.brax").BraxEnv(env, fault, **settings)
+  return plugins.optional("brax", "brax", f"{__name__}.brax").BraxEnv(env, fault, **settings)
+
+
+def _gymnasium() -> types.ModuleType:
+  return plugins.optional("'mjx-cl[gymnasium]'", "gymnasium", f"{__name__}.gymnasium")
 
 
 def gymnasium_env(env: Any, seed: int = 0, physics: str = "auto", **fault: Any) -> GymnasiumEnv:
   """One robot as a `gymnasium.Env`; arguments and the meaning of a reset as in
   `gymnasium_vector`.
   """
-  return _optional("gymnasium", f"{__name__}.gymnasium").GymnasiumEnv(env, seed, physics, **fault)
+  return _gymnasium().GymnasiumEnv(env, seed, physics, **fault)
 
 
 def gymnasium_vector(
@@ -100,5 +89,4 @@ def gymnasium_vector(
     robots = gymnasium_vector("walker", 8, fault="gear", severity=0.5, onset=5000)
     obs, infos = robots.reset(seed=0)
   """
-  made = _optional("gymnasium", f"{__name__}.gymnasium").GymnasiumVector
-  return made(env, num_envs, seed, physics, **fault)
+  return _gymnasium().GymnasiumVector(env, num_envs, seed, physics, **fault)
