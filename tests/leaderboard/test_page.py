@@ -1,5 +1,6 @@
 """The leaderboard's page: what is embedded, how it is written, and what a browser shows of it."""
 
+import base64
 import errno
 import html.parser
 import json
@@ -263,7 +264,27 @@ def test_every_figure_is_embedded(board, file):
   assert data["curves"]["glr"]["walker"][3]["detected"] == pytest.approx(
     board["curves"]["glr"]["walker"][3]["detected"], rel=1e-5
   )
-  assert data["faults"][0]["channels"]["opr"][100:104] == [None] * 4  # nan
+  given = board["faults"][0]["channels"]["opr"]
+  shown = unpacked(data["faults"][0]["channels"]["opr"])
+  np.testing.assert_allclose(shown, given, rtol=2**-11, atol=2**-25 * np.nanmax(np.abs(given)))
+  assert np.isnan(shown[100:104]).all()
+
+
+def unpacked(channel):
+  exponent, text = channel
+  return 2.0**exponent * np.frombuffer(base64.b64decode(text), "<f2").astype(float)
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-30, 0.7, 65_504, 65_536, 3e12])
+def test_a_stream_of_any_size_is_embedded_to_three_digits(size):
+  """Half a last bit of a half float: 2^-11."""
+  values = [size, -size / 3, None, 0.0]
+  np.testing.assert_allclose(
+    unpacked(page.halves(values)), [size, -size / 3, np.nan, 0.0], rtol=2**-11
+  )
+  assert np.isnan(unpacked(page.halves([None, np.nan]))).all()
+  with pytest.raises(UserError, match="a channel is infinite"):
+    page.halves([size, np.inf])
 
 
 def noted(board, **edit):

@@ -16,6 +16,16 @@
   const isNull = value => value === null || value === undefined;
   const entries = object => new Map(Object.entries(object || {}));
 
+  /** Numbers: 2^exponent times the IEEE 754 half floats, little-endian, of a base64 text; null for what is not finite. */
+  function halves([exponent, text]) {
+    const view = new DataView(Uint8Array.from(atob(text), c => c.charCodeAt(0)).buffer);
+    return Array.from({length: view.byteLength / 2}, (_, k) => {
+      const bits = view.getUint16(2 * k, true), power = bits >> 10 & 31, rest = bits & 1023;
+      const size = 2 ** exponent * (power ? 2 ** (power - 25) * (1024 + rest) : 2 ** -24 * rest);
+      return power === 31 ? null : bits >> 15 ? -size : size;
+    });
+  }
+
   // ---- data ------------------------------------------------------------------------------------------------------------------------
 
   const references = new Set(data.references);
@@ -457,7 +467,8 @@
   }
 
   function showStreams(fault, alarms, others) {
-    const channels = entries(fault.channels), w = byId("streams").clientWidth, left = Math.min(150, 0.3 * w), right = w - Math.min(84, 0.2 * w);
+    const channels = new Map([...entries(fault.channels)].map(([name, packed]) => [name, halves(packed)]));
+    const w = byId("streams").clientWidth, left = Math.min(150, 0.3 * w), right = w - Math.min(84, 0.2 * w);
     const every = fault.every || 1, first = fault.first || 0, time = step => (step - fault.onset) * fault.control_s;
     const longest = Math.max(0, ...[...channels.values()].map(values => values.length));
     const ends = [time(first), Math.max(time(first + every * Math.max(0, longest - 1)), ...alarms.map(([, step]) => time(step ?? fault.onset)))];
