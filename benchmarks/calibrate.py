@@ -34,36 +34,6 @@ TUNE = {"walker": ("gear", 0.5), "quadruped": ("joint_damping", 1.0), "car": ("d
 WARMUP = 1000  # control steps at the start of a stream that nothing is counted in, as in `run`
 
 
-def record(env, trained, keys, steps, fault="none", severity=0.0, onset=0):
-  """Acts with a frozen agent, one stream for each of `keys`, `steps` decisions. Gives opr, rpr and
-  reward, float32 (steps, streams), and target, int (streams,).
-  """
-  import jax
-
-  from mjx_cl import faults
-  from mjx_cl.config import CHUNK
-  from mjx_cl.rollout.monitor import Monitor
-  from mjx_cl.rollout.scan import Rollout, nest, start
-
-  agent, its_fault = trained.agent, faults.make(fault, env)
-  rollout = Rollout(env, agent, its_fault, trained.repeat)
-  monitor = Monitor(agent, spec=env.spec)
-  streams = nest(lambda k: start(env, agent, its_fault, k, severity, onset), 0, 0)(keys[None])
-  params = jax.tree.map(lambda x: x[None], trained.train.params)
-  history, watch = monitor.init(1, len(keys)), jax.jit(monitor.update)
-  out = {"opr": [], "rpr": [], "reward": []}
-  for chunk in range(-(-steps // CHUNK)):
-    streams, rows = rollout.chunk(params, streams, CHUNK)
-    key = jax.random.split(jax.random.fold_in(keys[0], chunk), 1)
-    history, residual = watch(params, history, rows, key)
-    for name, values in out.items():
-      values.append(np.asarray(getattr(residual, name))[:, 0])
-    if chunk % 100 == 99:
-      print(f"{(chunk + 1) * CHUNK}/{steps}", file=sys.stderr)
-  result = {k: np.concatenate(v)[:steps] for k, v in out.items()}
-  return result | {"target": np.asarray(streams.injection.target)[0, :, 0]}
-
-
 def scores(
   x: np.ndarray, window: int, smooth: int = 1, lag: int = 0, warmup: int = 500
 ) -> np.ndarray:
@@ -168,6 +138,7 @@ def main() -> None:
   from mjx_cl import envs
   from mjx_cl.io import tables
   from mjx_cl.rollout.scan import stream_keys
+  from mjx_cl.runs.calibrate import watched
   from mjx_cl.training import agents
 
   seeds = range(100, 110)
@@ -178,11 +149,13 @@ def main() -> None:
   else:
     env = envs.make(args.robot)
     trained = agents.of(env, args.agent)
-    nominal = record(env, trained, stream_keys(seeds, args.streams), args.steps)
-    fault = record(env, trained, stream_keys(seeds, 4), 7500, *TUNE[args.robot], 5000)
-    data = {f"n_{k}": nominal[k] for k in ("opr", "rpr", "reward")} | {
-      f"f_{k}": fault[k] for k in ("opr", "rpr", "reward", "target")
+    tell = lambda text: print(text, file=sys.stderr)
+    keys = {"n": stream_keys(seeds, args.streams), "f": stream_keys(seeds, 4)}
+    seen = {
+      "n": watched(env, trained, keys["n"], args.steps, tell=tell),
+      "f": watched(env, trained, keys["f"], 7500, fault=(*TUNE[args.robot], 5000), tell=tell),
     }
+    data = {f"{k}_{c}": getattr(x, c) for k, x in seen.items() for c in ("opr", "rpr", "reward")}
     if args.cache:
       np.savez(args.cache, **data)
   pre, post = data["f_reward"][WARMUP:5000].mean(0), data["f_reward"][5000:7000].mean(0)

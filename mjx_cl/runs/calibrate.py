@@ -41,28 +41,32 @@ class Calibrated(NamedTuple):
   steps: int
 
 
-def healthy(
+def watched(
   env: Any,
   trained: agents.Trained,
-  seeds: Sequence[int],
+  keys: jax.Array,
   rows: int,
-  signed: bool,
+  signed: bool = False,
+  fault: tuple[str, float, int] = ("none", 0.0, 0),
   tell: Callable[[str], Any] = lambda text: None,
 ) -> Residual:
-  """Residuals of healthy robots that learn nothing, leading (rows, seeds), NumPy.
+  """Residuals of robots that learn nothing, leading (rows, S), NumPy.
 
   Args:
     env: robot.
     trained: its agent.
-    seeds: a stream each, that which `run` has of it.
+    keys: (S,), as of `stream_keys`.
     rows: decisions.
     signed: with signed errors as well.
+    fault: name, severity, onset in control steps.
     tell: gets a line now and then.
   """
-  keys, none = stream_keys(seeds, 1), faults.make("none", env)
-  rollout = Rollout(env, trained.agent, none, trained.repeat)
+  name, severity, onset = fault
+  broken = faults.make(name, env)
+  rollout = Rollout(env, trained.agent, broken, trained.repeat)
   monitor = Monitor(trained.agent, spec=env.spec, signed=signed)
-  streams = nest(lambda k: start(env, trained.agent, none, k), 0, 0)(keys[None])
+  begin = lambda k: start(env, trained.agent, broken, k, severity, onset)
+  streams = nest(begin, 0, 0)(keys[None])
   params = jax.tree.map(lambda x: x[None], trained.train.params)
   history, watch, parts = monitor.init(1, len(keys)), jax.jit(monitor.update), []
   for chunk in range(-(-rows // CHUNK)):
@@ -71,7 +75,7 @@ def healthy(
     history, residual = watch(params, history, seen, key)
     parts.append(jax.tree.map(lambda x: np.asarray(x)[:, 0], residual))
     if chunk % 50 == 49:
-      tell(f"{(chunk + 1) * CHUNK:,} of {rows:,} decisions of {len(keys)} healthy robots")
+      tell(f"{(chunk + 1) * CHUNK:,} of {rows:,} decisions of {len(keys)} robots")
   return jax.tree.map(lambda *x: np.concatenate(x)[:rows], *parts)
 
 
@@ -147,7 +151,8 @@ def calibrate(
   require("threshold" in known, f"detector {detector!r} has no threshold")
   build = lambda level: detectors.make(detector, **told, threshold=level)
   build(1.0)  # whatever its settings refuse
-  residual = healthy(env, trained, seeds, rows, getattr(factory, "signed", False), tell)
+  signed = getattr(factory, "signed", False)
+  residual = watched(env, trained, stream_keys(seeds, 1), rows, signed, tell=tell)
   run = alarms(build, residual)
   try:
     quiet = run(np.full(thresholds.TOGETHER, 1e30))

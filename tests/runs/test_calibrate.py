@@ -8,6 +8,7 @@ import pytest
 
 from mjx_cl import detectors, envs
 from mjx_cl.cli import app
+from mjx_cl.rollout.scan import stream_keys
 from mjx_cl.runs import calibrate
 from mjx_cl.training import agents
 
@@ -33,7 +34,7 @@ def test_the_threshold_gives_the_wanted_rate(mjx):
   found = json.loads(text)
   assert code == 0 and found["settings"] == {"slack": 1, "threshold": found["threshold"]}
   env = envs.make("walker")
-  residual = calibrate.healthy(env, agents.of(env), SEEDS, STEPS, False)
+  residual = calibrate.watched(env, agents.of(env), stream_keys(SEEDS, 1), STEPS)
   assert residual.opr.shape == (STEPS, 2)
 
   def alarms(threshold):
