@@ -99,10 +99,10 @@ def told_after_a_tenth(config, spans, core, cores=2):
   raise AssertionError("a run has a tenth")
 
 
-# of the published runs; those that miss noticed more or less than others of their robot do, or
-# learn longer (steady/trot-3: until 90 % of the reward is back)
-WITHIN, PLANNED, RUNS = 91, 104, 115
-HEARD_WITHIN, HEARD = 50, 71  # those of them with an arm that waits for an alarm
+# Least share of the published runs; those that miss noticed more or less than others of their robot
+# do, or learn longer (steady/trot-3: until 90 % of the reward is back). HEARD: of those with an arm
+# that waits for an alarm.
+WITHIN, HEARD, PLANNED = 0.7, 0.6, 0.85
 
 
 @pytest.mark.parametrize("core", [CORE, SLOW], ids=["expected", "slow"])
@@ -116,9 +116,7 @@ def test_time_left_after_a_tenth_is_within_a_quarter(published, core, monkeypatc
     told, true = told_after_a_tenth(config, spans, core)
     good.append(abs(told / true - 1) <= 0.25)
     heard.append(any(ARMS[arm].trigger.listens for arm in config.arms))
-  assert (sum(good), len(good)) == (WITHIN, RUNS)
-  waiting = np.array(good)[heard]
-  assert (waiting.sum(), len(waiting)) == (HEARD_WITHIN, HEARD)
+  assert np.mean(good) >= WITHIN and np.mean(np.array(good)[heard]) >= HEARD
 
 
 def starts_of(published, env):
@@ -202,7 +200,7 @@ def test_the_plan_is_within_a_factor_of_two_of_the_timelines(published, monkeypa
     _, done, _ = lived(clock, spans)
     told = clock.expected(0, [Standing()] * len(clock.labels))
     ratios.append(work.wall(told, CORE, 2).sum() / work.wall(done, CORE, 2).sum())
-  assert (sum(0.5 < x < 2 for x in ratios), len(ratios)) == (PLANNED, RUNS)
+  assert np.mean([0.5 < x < 2 for x in ratios]) >= PLANNED
 
 
 def test_a_stream_that_was_not_heard_of_is_expected_less_and_less():
