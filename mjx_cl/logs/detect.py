@@ -155,6 +155,9 @@ def detect(
     _same_rate(log, nominal, path, nominal_path)
   seconds, rate = _clock(log, rate, len(xs))
   if not names:
+    settling = max(*healthy.NOW, *healthy.BEFORE)
+    if len(xs) <= settling:
+      raise FileError(f"{path}: {len(xs)} rows; judged are those after the first {settling}")
     own = found[: len(found) - len(set(commands))]
     times = Times(seconds, rate, None if given else gaps.places(log.time))
     places = None if given else gaps.places(nominal.time)

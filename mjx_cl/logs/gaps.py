@@ -55,6 +55,7 @@ def taken(found: verdict.Found, at: np.ndarray | None) -> verdict.Found:
     {name: np.logical_or.reduceat(fired, begin) for name, fired in found.fired.items()},
     np.logical_or.reduceat(found.above, begin),
     found.known[at],
+    found.xs[at],
   )
 
 

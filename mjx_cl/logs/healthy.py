@@ -257,11 +257,15 @@ def _predicted(weights: np.ndarray, lags: tuple[int, ...], z: np.ndarray) -> np.
 
 
 def residuals(
-  model: Healthy, z: np.ndarray, fold: int = -1, error: np.ndarray | None = None
+  model: Healthy,
+  z: np.ndarray,
+  fold: int = -1,
+  error: np.ndarray | None = None,
+  farthest: float = FARTHEST,
 ) -> np.ndarray:
   """(2, ..., T, W): what z (..., T, C), from `standard`, deviates from both predictions, in
-  deviations, which an error (T, C) of samples that are `filled` widens; nan where the past is
-  unknown or the error too large.
+  deviations, cut at `farthest`, which an error (T, C) of samples that are `filled` widens; nan
+  where the past is unknown or the error too large.
   """
   own = model.watched
   found = np.stack(
@@ -280,7 +284,7 @@ def residuals(
       one /= np.sqrt(1 + more)
       one[more > DOUBTFUL] = np.nan
   found[..., : max(*NOW, *BEFORE), :] = np.nan
-  return np.clip(found, -FARTHEST, FARTHEST, out=found)
+  return np.clip(found, -farthest, farthest, out=found)
 
 
 def folds(rows: int) -> list[slice]:

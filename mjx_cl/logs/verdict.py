@@ -68,6 +68,7 @@ class Found(NamedTuple):
     fired: chart -> bool, likewise: the score rises above its threshold.
     above: bool (T,), some score is.
     known: bool (T, W), the sample is judged.
+    xs: (T, C) the log.
   """
 
   residuals: np.ndarray
@@ -75,6 +76,7 @@ class Found(NamedTuple):
   fired: dict[str, np.ndarray]
   above: np.ndarray
   known: np.ndarray
+  xs: np.ndarray
 
 
 def watch(own: Watch, xs: np.ndarray) -> Found:
@@ -83,9 +85,7 @@ def watch(own: Watch, xs: np.ndarray) -> Found:
 
 
 def _watch(own: Watch, xs: np.ndarray) -> Found:
-  z, error = healthy.filled(own.model, healthy.standard(own.model, healthy.held(xs)), xs)
-  residuals = healthy.residuals(own.model, z, error=error)
-  residuals = healthy.judged(own.model, residuals, xs, error)
+  residuals = _residuals(own, xs, healthy.FARTHEST)
   scores = charts.scores(residuals, own.scales)
   fired = {name: charts.alarms(x, own.thresholds[name]) for name, x in scores.items()}
   above = [(x > own.thresholds[name]).any(1) for name, x in scores.items()]
@@ -93,15 +93,27 @@ def _watch(own: Watch, xs: np.ndarray) -> Found:
   known &= ~healthy.absent(xs, own.model.held)[:, : own.model.watched]
   settling = slice(0, max(*healthy.NOW, *healthy.BEFORE))
   known[settling] = healthy.known(xs[settling], own.model.held)[:, None]
-  return Found(residuals, scores, fired, np.any(above, 0), known)
+  return Found(residuals, scores, fired, np.any(above, 0), known, xs)
+
+
+def _residuals(own: Watch, xs: np.ndarray, farthest: float) -> np.ndarray:
+  """(2, T, W) of a log (T, C), cut at `farthest` deviations."""
+  z, error = healthy.filled(own.model, healthy.standard(own.model, healthy.held(xs)), xs)
+  residuals = healthy.residuals(own.model, z, error=error, farthest=farthest)
+  return healthy.judged(own.model, residuals, xs, error)
+
+
+def _around(own: Watch) -> tuple[int, int]:
+  """Rows that a part of a log is watched with, before it and after it, so that no average knows the
+  difference.
+  """
+  warm = WARM * max(SPANS[-1], own.model.slow if own.model.drifts.any() else 0)
+  return warm, int(own.model.held.max()) + max(*healthy.NOW, *healthy.BEFORE) + 1
 
 
 def _in_parts(own: Watch, xs: np.ndarray, rows: int = ROWS, kind: Any = np.float16) -> Found:
-  """`watch` of `rows` rows at a time, each with so many before it that no average knows the
-  difference; residuals and scores are kept as `kind`.
-  """
-  warm = WARM * max(SPANS[-1], own.model.slow if own.model.drifts.any() else 0)
-  ahead = int(own.model.held.max()) + max(*healthy.NOW, *healthy.BEFORE) + 1  # ends of stretches
+  """`watch` of `rows` rows at a time; residuals and scores are kept as `kind`."""
+  warm, ahead = _around(own)
   total, columns = len(xs), own.model.watched
   size = {name: 1 if name == "joint" else columns for name in CHARTS}
   found = Found(
@@ -110,6 +122,7 @@ def _in_parts(own: Watch, xs: np.ndarray, rows: int = ROWS, kind: Any = np.float
     {name: np.empty((total, n), bool) for name, n in size.items()},
     np.empty(total, bool),
     np.empty((total, columns), bool),
+    xs,
   )
   for begin in range(0, total, rows):
     from_ = max(0, begin - warm)
@@ -197,6 +210,20 @@ def _moved(own: Watch, shift: np.ndarray) -> list[tuple[int, float]]:
   return [(c, float(b)) for c, b in zip(named, by)]
 
 
+def _whole(own: Watch, found: Found, begin: int, end: int) -> np.ndarray:
+  """(end - begin, W) residuals of what the others foretell, not cut: a cut one hides how far its
+  column moved, and which column moved it.
+  """
+  cut = found.residuals[0, begin:end].astype(float)
+  if not (np.abs(cut) >= healthy.FARTHEST).any():
+    return cut
+  warm, ahead = _around(own)
+  from_ = max(0, begin - warm)
+  part = np.ascontiguousarray(found.xs[from_ : end + ahead], np.float64)
+  whole = _residuals(own, part, np.inf)[0, begin - from_ : end - from_]
+  return np.where(np.abs(cut) >= healthy.FARTHEST, whole, cut)
+
+
 def _where(
   own: Watch, found: Found, begin: int, end: int, names: list[str]
 ) -> list[dict[str, Any]]:
@@ -204,7 +231,7 @@ def _where(
   the former changes the spread of what is predicted from it.
   """
   columns = []
-  shift = np.nan_to_num(found.residuals[0, begin:end]).mean(0)
+  shift = np.nan_to_num(_whole(own, found, begin, end)).mean(0)
   shift *= min(1.0, (end - begin) / SPANS[1])
   for c, by in _moved(own, shift):
     columns.append(

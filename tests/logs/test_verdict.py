@@ -86,6 +86,37 @@ def test_what_changed_when_and_where(logs):
   assert any("drifting while healthy" in note for note in said["notes"])
 
 
+@pytest.mark.parametrize("memory", [np.float64, np.float16])
+@pytest.mark.parametrize(
+  ("column", "now", "by"),
+  [(0, None, 1.0), (0, 65_535.0, 65_535.0), (0, -999.0, -999.0), (1, -999.0, -999.8), (5, 0.0, -50.4)],
+)
+def test_a_large_fault_names_its_own_column(watched, monkeypatch, column, now, by, memory):
+  """A saturated encoder, a sentinel value, a dead supply: residuals are cut for the charts, so
+  those that the column foretells are cut too, and would be named in its place.
+  """
+  if memory is np.float16:
+    monkeypatch.setattr(verdict, "LARGE", 0)
+  x = gait(6000, 1)
+  x[3000:, column] = x[3000:, column] + by if now is None else now
+  own = watched[1]
+  events = verdict.judge(own, verdict.watch(own, x), NAMES, 500)
+  (event,) = [e for e in events if e["believed"]]
+  assert abs(event["begin"] - 3000) < 25
+  (found,) = event["columns"]
+  assert (found["column"], found["how"]) == (NAMES[column], "mean")
+  # the fitted prediction of a column from the others' present shares in what it moves by; a
+  # drifting one is seen against an average that follows it
+  assert found["by"] == pytest.approx(by, rel=0.4 if column == 5 else 0.03)
+
+
+@pytest.mark.parametrize("rows", [1, 16])
+def test_a_log_that_is_too_short_to_be_judged_is_refused(logs, tmp_path, rows):
+  save(tmp_path / "short.csv", gait(rows, 1))
+  with pytest.raises(FileError, match=f"short.csv: {rows} rows; judged are those after the first"):
+    detect.detect(tmp_path / "short.csv", logs[2])
+
+
 def test_ten_healthy_minutes_hold_no_event(logs):
   said = detect.detect(logs[1], logs[2]).summary
   assert not said["verdict"]["changed"] and "begin" not in said["verdict"]
