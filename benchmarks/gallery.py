@@ -77,7 +77,7 @@ def drawn(env, acting: dict, step: int, seed: int, weak: str | None) -> np.ndarr
   scene, _ = pictures.painter(env, WIDTH, HEIGHT)
   with contextlib.closing(scene):
     if model := getattr(scene, "model", None):
-      compare.tint(model, compare.bodies(env, weak))
+      compare.tint(model, compare.bodies(env, weak), True)
     *_, frame = pictures.act(env, step, seed, **acting)
     return scene.picture(frame)
 

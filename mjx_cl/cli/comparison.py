@@ -142,7 +142,8 @@ def _show_comparison(rows: list[dict], first: str) -> None:
     "one seed; better: of pairs, a tie is half a pair; [95 % interval]"
   )
   others = [row for row in rows if row["variant"] != first]
-  if alone := list(dict.fromkeys(row["variant"] for row in others if not row["pairs"])):
+  paired = {row["variant"] for row in others if row["pairs"]}
+  if alone := list(dict.fromkeys(r["variant"] for r in others if r["variant"] not in paired)):
     print(f"no pair of one seed with {', '.join(alone)}: nothing is said of the difference")
   if any(0 < row["pairs"] < FEW for row in others):
     print(f"fewer than {FEW} pairs: such intervals are too narrow; take more seeds")

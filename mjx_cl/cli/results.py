@@ -4,6 +4,7 @@ figures are drawn anew.
 
 import decimal
 import importlib
+import itertools
 import math
 import pathlib
 import sys
@@ -48,7 +49,9 @@ def do_query(args: Query) -> None:
   more, rows = limit is not None and len(rows) > limit, rows[:limit]
   if args.json:
     for k, name in enumerate(names):  # two columns of one name would be one in JSON
-      names[k] = name if name not in names[:k] else f"{name}_{k}"
+      others = {*names[:k], *names[k + 1 :]}
+      free = (f"{name}_{n}" for n in itertools.count(k) if f"{name}_{n}" not in others)
+      names[k] = name if name not in names[:k] else next(free)
     emit([{n: json_value(x) for n, x in zip(names, r)} for r in rows])
   else:
     for k in range(0, max(1, len(rows)), FIRST):  # a long table takes long to be set

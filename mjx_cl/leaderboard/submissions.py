@@ -18,7 +18,7 @@ from mjx_cl.leaderboard.calibration import CURVE, Found, at_rate, curve, found
 from mjx_cl.leaderboard.streams import COLUMNS, Data, Streams, StreamSet
 from mjx_cl.scoring import thresholds
 
-HALVINGS = 8  # of a factor of 8, until less than a hundredth is left
+HALVINGS = 20  # of a factor of 8, until 2e-6 is left; fewer where the alarms asked for are met
 # streams of each kind on which a plain class must give the same answers when they are cut off
 TRIED = 2
 
@@ -229,7 +229,9 @@ def from_host(
 
 
 def _least(alarms: Callable[[float], int], target: float, what: str) -> float:
-  """The least value above 0 with at most `target` alarms, to a hundredth of itself."""
+  """A value above 0 with `target` alarms, rounded down; where there is none the least with
+  fewer, to 2e-6 of itself.
+  """
   few = lambda value: np.asarray(alarms(float(value)) <= target)
   low, high, enough = thresholds.reach(few, np.asarray(1 / 8), np.asarray(1.0))
   if not enough:
@@ -246,7 +248,13 @@ def _least(alarms: Callable[[float], int], target: float, what: str) -> float:
       "fewer alarms: give the class a setting of that kind (a score that is negative wants "
       "an offset)"
     )
-  return float(thresholds.halve(few, low, high, lambda a, b: np.sqrt(a * b), HALVINGS))
+  for _ in range(HALVINGS):
+    between = np.sqrt(low * high)
+    given = alarms(float(between))
+    if given == int(target):
+      return float(between)
+    low, high = (low, between) if given <= target else (between, high)
+  return float(high)
 
 
 def export(

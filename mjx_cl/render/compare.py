@@ -6,6 +6,7 @@ robot's over the whole film.
 """
 
 import contextlib
+import functools
 import os
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -55,19 +56,27 @@ def bodies(env: Any, target: str | None) -> set[int]:
   return found
 
 
-def tint(model: mujoco.MjModel, weak: set[int]) -> None:
-  """One colour for a robot's parts, another for those of the bodies `weak`."""
+def tint(model: mujoco.MjModel, weak: set[int], acts: bool) -> None:
+  """One colour for a robot's parts, another for those of the bodies `weak` while the fault acts."""
   for geom in range(model.ngeom):
     if (body := int(model.geom_bodyid[geom])) > 0 and model.geom_rgba[geom, 3] > 0:
       model.geom_matid[geom] = -1
-      model.geom_rgba[geom] = WEAK if body in weak else SOUND
+      model.geom_rgba[geom] = WEAK if acts and body in weak else SOUND
 
 
 def live(
-  pane: Pane, steps: int, skip: int, every: int, lately: int, scene: Any, **acting: Any
+  pane: Pane,
+  steps: int,
+  skip: int,
+  every: int,
+  lately: int,
+  scene: Any,
+  paint: Callable[[bool], None],
+  **acting: Any,
 ) -> tuple[list[np.ndarray], list[float], float]:
   """(pictures, mean reward of the last `lately` decisions at each, mean reward of all that is
-  shown) of one robot; `steps`, `skip` and `every` count decisions.
+  shown) of one robot; `steps`, `skip` and `every` count decisions; `paint` is told before each
+  picture whether the fault acts.
   """
   images, means, rewards = [], [], []
   repeat = pane.acting.get("repeat", 1)
@@ -75,6 +84,7 @@ def live(
   for k, frame in enumerate(acted):
     rewards.append(frame.reward)
     if k >= skip and (k - skip) % every == 0:
+      paint(frame.severity > 0)
       images.append(scene.picture(frame))
       means.append(float(np.mean(rewards[-lately:])))
   return images, means, float(np.mean(rewards[skip:]))
@@ -134,7 +144,7 @@ def film(
     height: likewise.
     fps: pictures a second.
     view: one of pictures.VIEWS.
-    weak: actuator or group of them, red in all panes but the first.
+    weak: actuator or group of them, red where and while the fault acts.
     say: takes lines for standard error.
     **acting: of `pictures.act`, for all panes.
 
@@ -162,10 +172,10 @@ def film(
       tell = (lambda text: None) if k else say
       scene, drawn_by = pictures.painter(pane.env, width, height, view, tell)
       with contextlib.closing(scene):
-        if model := getattr(scene, "model", None):
-          tint(model, bodies(pane.env, weak) if k else set())
+        model, parts = getattr(scene, "model", None), bodies(pane.env, weak)
+        paint = functools.partial(tint, model, parts) if model else lambda acts: None
         lately = max(1, round(1.0 / paces[0]))
-        lives.append(live(pane, shown, before, every, lately, scene, **acting))
+        lives.append(live(pane, shown, before, every, lately, scene, paint, **acting))
     whole = lives[0][2] or 1.0
     pages = (
       page(

@@ -107,13 +107,16 @@ def table(rows: list[dict]) -> str:
       if r["severity"] > top.setdefault((r["fault"], r["target"]), r)["severity"]:
         top[r["fault"], r["target"]] = r
     several = len({r["physics"] for r in rows if r["robot"] == robot}) > 1
-    agent = next((r for r in mine if r["episodes"]), None)
-    said = "No agent is shipped for it, so no return is given."
-    if agent is not None:
-      said = (
-        f"Nominal return {agent['return_nominal']:.0f} over {agent['episodes']} episodes of "
-        f"agent `{agent['agent']}`."
-      )
+    by: dict[tuple, list[str]] = {}
+    for r in mine:
+      if r["episodes"]:
+        by.setdefault((r["return_nominal"], r["episodes"], r["agent"]), []).append(r["fault"])
+    said = " ".join(
+      f"Nominal return {value:.0f} over {episodes} episodes of agent `{agent}`"
+      + (f" ({', '.join(dict.fromkeys(own))})." if len(by) > 1 else ".")
+      for (value, episodes, agent), own in by.items()
+    )
+    said = said or "No agent is shipped for it, so no return is given."
     title = f"## {robot}" + (f", physics {physics}" if several else "")
     out += [title, "", said, "", HEAD, *map(_line, top.values()), ""]
   return "\n".join(out)

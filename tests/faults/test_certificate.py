@@ -286,6 +286,13 @@ def test_files_keep_the_rows_of_other_robots(tmp_path, short):
   certificate_tables.guard(tmp_path, ("other",), 2)
   text = (tmp_path / "certificates.md").read_text()
   assert "## car" in text and "## other" in text and "| sensor | noise | lidar | 1 |" in text
+  lost = lambda agent, n, **more: {"agent": agent, "episodes": n, "return_nominal": 9.0 * n} | more
+  noisy = [r for r in rows if r["fault"] == "noise"]
+  own = [r | lost("a", 20) for r in noisy] + [r | lost("b", 5, fault="bias") for r in noisy]
+  said = certificate_tables.table(own)
+  assert "Nominal return 180 over 20 episodes of agent `a` (noise)." in said
+  assert "Nominal return 45 over 5 episodes of agent `b` (bias)." in said
+  assert "episodes of agent `a`.\n" in certificate_tables.table(own[: len(noisy)])
   assert all(row["holds"] for row in certificate_tables.summary(rows) if row["goal"])
   json.dumps(certificate_tables.summary(rows))
   both = certificate_tables.table(

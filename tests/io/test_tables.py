@@ -479,6 +479,9 @@ def test_query_on_the_command_line(tree, capsys):
     {"x": 0, "x_1": 0},
     {"x": 1, "x_1": 1},
   ]
+  assert json.loads(call("select 1 as x_2, 2 as x, 3 as x", "--json")) == [
+    {"x_2": 1, "x": 2, "x_3": 3}
+  ]
   assert json.loads(call("select 'nan'::float as x", "--json")) == [{"x": None}]
   assert json.loads(
     call(

@@ -89,7 +89,13 @@ def test_what_changed_when_and_where(logs):
 @pytest.mark.parametrize("memory", [np.float64, np.float16])
 @pytest.mark.parametrize(
   ("column", "now", "by"),
-  [(0, None, 1.0), (0, 65_535.0, 65_535.0), (0, -999.0, -999.0), (1, -999.0, -999.8), (5, 0.0, -50.4)],
+  [
+    (0, None, 1.0),
+    (0, 65_535.0, 65_535.0),
+    (0, -999.0, -999.0),
+    (1, -999.0, -999.8),
+    (5, 0.0, -50.4),
+  ],
 )
 def test_a_large_fault_names_its_own_column(watched, monkeypatch, column, now, by, memory):
   """A saturated encoder, a sentinel value, a dead supply: residuals are cut for the charts, so

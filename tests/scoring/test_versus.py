@@ -79,6 +79,16 @@ def test_runs_that_share_nothing_are_told_apart(tmp_path, mjx):
   assert all(name in out + err for name in ("duration", "first_seed"))
 
 
+def test_a_variant_with_pairs_in_one_measure_is_not_said_to_have_none(tmp_path, mjx):
+  """Seed 0 alone has a final reward, the other arm's too late."""
+  run = run_of(tmp_path / "a", {"detector": [1.0, None], "none": [None, 0.5]})
+  measures = ("--measure", "reward_final", "terminations")
+  code, out, _ = mjx(run, *measures)
+  assert code == 0 and "no pair of one seed" not in out
+  code, out, _ = mjx(run, *measures[:2])
+  assert code == 0 and "no pair of one seed with none" in " ".join(out.split())
+
+
 def test_one_run_is_not_compared_with_itself(tmp_path, mjx):
   run = run_of(tmp_path / "a", {"detector": [1.0, 1.2]})
   code, _, err = mjx(run, f"{tmp_path}/../{tmp_path.name}/a")

@@ -80,7 +80,7 @@
     if (kind === "ratio") return value.toFixed(3);
     if (kind === "share") {
       const percent = 100 * value;
-      return percent.toFixed(percent % 1 < 0.05 || (percent >= 10 && percent <= 90) ? 0 : 1);
+      return percent.toFixed(Math.abs(percent) % 1 < 0.05 || (Math.abs(percent) >= 10 && percent <= 90) ? 0 : 1);
     }
     if (kind === "integer" || Math.abs(value) >= 1000) return Math.round(value).toLocaleString("en-US");
     if (value === 0 || Math.abs(value) >= 0.001) return String(Number(value.toPrecision(3)));
