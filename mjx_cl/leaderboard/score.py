@@ -261,13 +261,18 @@ def _row(
 
 def reward_lost(data: Data, key: tuple[str, float]) -> float | None:
   """Share of the reward that a fault takes from the recorded robots, which do not adapt: 1 - mean
-  reward within the horizon after the onset / mean reward of healthy streams of the same seeds; None
-  where that is not positive or unknown.
+  reward within the horizon after the onset / that of the same robots whole, in the same control
+  steps; None where the latter is not positive or unknown.
   """
-  reward, own = np.asarray(data.fault.residual.reward), data.own(key)
-  after = [reward[t : t + data.horizon, k] for k, t in zip(own, data.fault.onset[own])]
-  healthy = np.nanmean(np.asarray(data.score.residual.reward)[data.count_from :])
-  broken = np.nanmean(np.concatenate(after))
+  if data.twins is None:
+    return None
+  own = data.own(key)
+  at = data.fault.onset[own]
+  after = lambda reward, columns: np.nanmean(
+    np.concatenate([reward[t : t + data.horizon, k] for k, t in zip(columns, at)])
+  )
+  healthy = after(data.twins, range(len(own)))
+  broken = after(np.asarray(data.fault.residual.reward), own)
   return float(1 - broken / healthy) if healthy > 0 and np.isfinite(broken) else None
 
 

@@ -368,6 +368,8 @@ class Data(NamedTuple):
     count_from: of the suite, and so are the next two [control steps].
     arl0: [control steps].
     horizon_s: [s].
+    twins: (T, S) reward of the healthy robots that the fault streams were one with until the onset,
+      seed by seed as in `score`; None: unknown.
   """
 
   robot: str
@@ -377,6 +379,7 @@ class Data(NamedTuple):
   count_from: int
   arl0: float
   horizon_s: float
+  twins: np.ndarray | None = None
 
   @property
   def horizon(self) -> int:
@@ -401,8 +404,10 @@ def load(streams: StreamSet, robot: str) -> Data:
   keys, suite = streams.faults(robot), streams.suite
   numbers = np.concatenate([streams.find(robot, "fault", "score", *key) for key in keys])
   fault = streams.get(robot, numbers, signed)
-  data = Data(robot, tune, score, fault, suite.count_from, suite.arl0, suite.horizon_s)
   seeds = list(dict.fromkeys(score.seed.tolist()))
+  past = streams.get(robot, streams.find(robot, "past", "score"))
+  twins = past.residual.reward if past.seed.tolist() == seeds else None
+  data = Data(robot, tune, score, fault, suite.count_from, suite.arl0, suite.horizon_s, twins)
   for name, severity in keys:
     if fault.seed[data.own((name, severity))].tolist() != seeds:
       raise FileError(
