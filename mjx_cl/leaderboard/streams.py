@@ -406,7 +406,7 @@ def load(streams: StreamSet, robot: str) -> Data:
   fault = streams.get(robot, numbers, signed)
   seeds = list(dict.fromkeys(score.seed.tolist()))
   past = streams.get(robot, streams.find(robot, "past", "score"))
-  twins = past.residual.reward if past.seed.tolist() == seeds else None
+  twins = np.asarray(past.residual.reward) if past.seed.tolist() == seeds else None
   data = Data(robot, tune, score, fault, suite.count_from, suite.arl0, suite.horizon_s, twins)
   for name, severity in keys:
     if fault.seed[data.own((name, severity))].tolist() != seeds:
