@@ -214,6 +214,7 @@ def _judged(
       raise UserError(f"{what} must lie in 0..1e9 seconds (or samples); got {value}")
   choose("model", model, dict.fromkeys(healthy.MODELS))
   tell("model of the nominal log")
+  past, wild = healthy.plausible(past)
   even, even_past = gaps.evened(xs, times.places), gaps.evened(past, past_places)
   used, at = healthy.thinned(even_past)
   own = verdict.calibrated(used, arl0, model, past.shape[1] - len(names))
@@ -245,7 +246,12 @@ def _judged(
   said |= {"silent": silent, "ended": gaps.ended(lost, names, len(even))}
   said |= {"unjudged": unjudged, "refractory": pause}
   said |= {"arl0": arl0, "rate_hz": times.rate, "detectors": rows}
-  notes = _said_of(own, names, found.known, len(used), arl0, silent, unjudged)
+  notes = [
+    f"{name}: nominal samples beyond {healthy.WILD:g} of its deviations are taken as missing: {n}"
+    for name, n in zip(names, wild)
+    if n
+  ]
+  notes += _said_of(own, names, found.known, len(used), arl0, silent, unjudged)
   said |= {**_sizes(xs, past, 0), "notes": notes}
   if len(used) < len(past):
     said["notes"].append(
@@ -256,7 +262,7 @@ def _judged(
     within = times.samples(inject, 1)
     tell("faults put into the nominal log")
     found_faults, places = injection.smallest(
-      own, healthy.completed(own.model, used), names, within
+      own, healthy.completed(own.model, used), names, within, healthy.since(own.model, used)
     )
     said["inject"] = {"within": within, "places": places, "faults": found_faults}
     if not places:
@@ -282,7 +288,7 @@ def _said_of(
   if drifts := [name for name, yes in zip(names, own.model.drifts) if yes]:
     notes.append(
       f"{', '.join(drifts)}: drifting while healthy, so only changes quicker than "
-      f"{own.model.slow} samples are seen there"
+      f"{own.model.slow} samples are seen there, and less in the first of a log"
     )
   notes += [
     f"{name} has {why}; there the other columns are judged without it"

@@ -13,6 +13,7 @@ which all that rests on it is measured; what would be measured in more than twic
 variance is not judged.
 """
 
+import warnings
 from typing import NamedTuple
 
 import numpy as np
@@ -27,6 +28,8 @@ RIDGES = (1e-4, 1e-2, 1.0, 100.0)  # tried, relative to the mean square of a fea
 USEFUL = 0.05  # share of a column's variance that a prediction has to explain to be used
 DRIFTS = 0.2  # share of a column's variance in the means of DRIFT_BLOCKS shares: above, it drifts
 DRIFT_BLOCKS = 10
+STRAIGHT = 0.8  # R^2 of a line through these means, above which little drift is drift
+WILD, RARE = 200.0, 5e-4  # deviations of a nominal sample that is not believed; most of a column
 SLOW = 1000  # samples of a drifting column's average, a tenth of the nominal log at most
 # rows that a missing sample is replaced for; twice the usual distance of a column that is written
 # less often than others
@@ -143,6 +146,14 @@ def absent(x: np.ndarray, longest: np.ndarray) -> np.ndarray:
   return missing & ~_apart(x, longest)[:, None]
 
 
+def since(model: Healthy, x: np.ndarray) -> np.ndarray:
+  """(T, W) rows since the sample whose residual stands at one of x (T, C): where a healthy log has
+  none either, the last one.
+  """
+  own, rows = x[:, : model.watched], np.arange(len(x))[:, None]
+  return np.where(absent(x, model.held)[:, : model.watched], 0, np.minimum(ages(own), rows))
+
+
 def filled(model: Healthy, z: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
   """Z of `standard`, what is `absent` in x (T, C) filled, and the deviation (T, C) of the error of
   that, 0 where there is a sample; None where nothing is filled.
@@ -203,8 +214,8 @@ def judged(
   """
   own, reach = x[:, : residuals.shape[-1]], max(*NOW, *BEFORE)
   missing = absent(x, model.held)[:, : own.shape[1]]
-  at = np.where(missing, 0, np.minimum(ages(own), np.arange(len(x))[:, None]))
-  found = np.take_along_axis(residuals, (np.arange(len(x))[:, None] - at)[None], 1)
+  at = np.arange(len(x))[:, None] - since(model, x)
+  found = np.take_along_axis(residuals, at[None], 1)
   found[:, ~known(x, model.held)] = np.nan
   found[1, missing] = np.nan
   if error is not None:
@@ -213,6 +224,37 @@ def judged(
   found[0, missing] = np.nan
   found[:, :reach] = np.nan
   return found
+
+
+def unsettled(model: Healthy, residuals: np.ndarray) -> np.ndarray:
+  """Residuals (2, T, W) of a log, those of its first rows widened by what the average of a drifting
+  column, which begins anew with a log, may still be off: e^(-2 t / slow) deviations; nan where that
+  is too much.
+  """
+  if not model.drifts.any():
+    return residuals
+  found, own = residuals.copy(), model.watched
+  rows = min(found.shape[1], model.slow)
+  error = np.where(model.drifts, np.exp(-2 * np.arange(rows) / model.slow)[:, None], 0.0)
+  used = (model.others, NOW), (model.past, _before(own, error))
+  for one, scale, (weights, lags) in zip(found, model.scale, used):
+    more = _added(weights[-1], lags, error, scale) + (error[:, :own] / scale) ** 2
+    one[:rows] /= np.sqrt(1 + more)
+    one[:rows][more > DOUBTFUL] = np.nan
+  return found
+
+
+def plausible(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+  """A nominal log (N, C) without its wild samples, which would set the scale of their columns, and
+  how many there are (C,): those more than WILD deviations (1.4826 x the median absolute one) from
+  the median, where they are no more than RARE of a column.
+  """
+  with np.errstate(invalid="ignore", over="ignore"), warnings.catch_warnings():
+    warnings.simplefilter("ignore", RuntimeWarning)  # a column without a sample
+    off = np.abs(x - np.nanmedian(x, 0))
+    wild = off > WILD * 1.4826 * np.nanmedian(np.where(off > 0, off, np.nan), 0)
+  wild &= wild.sum(0) <= np.maximum(1, RARE * len(x))
+  return np.where(wild, np.nan, x) if wild.any() else x, wild.sum(0)
 
 
 def _levelled(x: np.ndarray, drifts: np.ndarray, slow: int) -> np.ndarray:
@@ -305,12 +347,17 @@ def unseen(model: Healthy, z: np.ndarray, error: np.ndarray | None = None) -> np
 
 
 def drifting(x: np.ndarray) -> np.ndarray:
-  """Bool (C,): columns of (N, C) whose means of DRIFT_BLOCKS shares hold DRIFTS of their variance;
-  where nothing moves slowly they hold about DRIFT_BLOCKS / N.
+  """Bool (C,): columns of (N, C) whose means of DRIFT_BLOCKS shares hold DRIFTS of their variance,
+  or lie on a line (R^2 above STRAIGHT) and hold a twentieth of DRIFTS and twenty times what they do
+  where nothing moves slowly, some DRIFT_BLOCKS / N: a short log shows little of a slow drift.
   """
   usable = len(x) // DRIFT_BLOCKS * DRIFT_BLOCKS
   means = x[:usable].reshape(DRIFT_BLOCKS, -1, x.shape[1]).mean(1)
-  return means.var(0) > DRIFTS * np.maximum(x.var(0), 1e-300)
+  share = means.var(0) / np.maximum(x.var(0), 1e-300)
+  time = np.arange(DRIFT_BLOCKS) - (DRIFT_BLOCKS - 1) / 2
+  along = (time @ means) ** 2 / (time @ time) / DRIFT_BLOCKS
+  straight = along > STRAIGHT * np.maximum(means.var(0), 1e-300)
+  return (share > DRIFTS) | straight & (share > max(DRIFTS / 20, 20 * DRIFT_BLOCKS / len(x)))
 
 
 def _before(watched: int, z: np.ndarray) -> tuple[int, ...]:

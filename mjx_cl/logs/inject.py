@@ -59,19 +59,29 @@ def _places(rows: int, within: int) -> list[tuple[int, int]]:
   return found
 
 
-def _alarmed(own: Watch, xs: np.ndarray, folds: np.ndarray) -> np.ndarray:
-  """Bool (B,): whether stretches (B, BEFORE + within, C) give an alarm after BEFORE."""
+def _alarmed(own: Watch, xs: np.ndarray, since: np.ndarray, folds: np.ndarray) -> np.ndarray:
+  """Bool (B,): whether stretches (B, BEFORE + within, C) give an alarm after BEFORE; since: (B,
+  BEFORE + within, W), as of `healthy.since`.
+  """
+  rows = np.arange(xs.shape[1])[:, None]
   found = np.zeros(len(xs), bool)
   for k in np.unique(folds):
     of = folds == k
     residuals = healthy.residuals(own.model, healthy.standard(own.model, xs[of]), int(k))
+    at = np.maximum(rows - since[of], 0)[None]
+    residuals = np.take_along_axis(residuals, at, 2)
     for name, score in charts.scores(residuals, own.scales).items():
       found[of] |= (score[:, BEFORE:] > own.thresholds[name]).any((1, 2))
   return found
 
 
 def smallest(
-  own: Watch, past: np.ndarray, names: list[str], within: int, seed: int = 0
+  own: Watch,
+  past: np.ndarray,
+  names: list[str],
+  within: int,
+  since: np.ndarray | None = None,
+  seed: int = 0,
 ) -> tuple[list[dict[str, Any]], int]:
   """The smallest severity of each kind of fault that is seen within so many samples.
 
@@ -80,6 +90,7 @@ def smallest(
     past: (N, C) the nominal log, none missing.
     names: of the columns that are watched.
     within: samples.
+    since: (N, W) of the log, as of `healthy.since`; None: 0, no sample was missing.
     seed: of noise and dropout.
 
   Returns:
@@ -91,9 +102,12 @@ def smallest(
   if not places:
     return [], 0
   cut = np.stack([past[at : at + BEFORE + within] for at, _ in places])
+  since = np.zeros((len(past), own.model.watched), int) if since is None else since
+  ago = np.stack([since[at : at + BEFORE + within] for at, _ in places])
   folds = np.array([k for _, k in places])
-  quiet = ~_alarmed(own, cut, folds)
-  cut, folds, rng = cut[quiet], folds[quiet], np.random.default_rng(seed)
+  quiet = ~_alarmed(own, cut, ago, folds)
+  cut, ago, folds = cut[quiet], ago[quiet], folds[quiet]
+  rng = np.random.default_rng(seed)
   rows: list[dict[str, Any]] = []
   if not len(cut):
     return [], 0
@@ -105,7 +119,9 @@ def smallest(
         one = cut.copy()
         one[:, :, c] = spoiled(cut[:, :, c], kind, severity, BEFORE, spread, rng)
         every.append(one)
-      fired = _alarmed(own, np.concatenate(every), np.tile(folds, len(severities)))
+      times = len(severities)
+      again = np.tile(ago, (times, 1, 1)), np.tile(folds, times)
+      fired = _alarmed(own, np.concatenate(every), *again)
       shares = fired.reshape(len(severities), -1).mean(1)
       seen = np.flip(np.logical_and.accumulate(np.flip(shares >= SEEN)))
       least = float(severities[int(np.argmax(seen))]) if seen.any() else None

@@ -2,23 +2,22 @@
 
 Alarms of the charts that lie closer together than the refractory time are one event. An event is
 believed where a healthy log of this length would show as much less than DOUBT times, by the tails
-of `charts`; the columns it names are the few that, moved by themselves, would move the residuals so
-(orthogonal matching pursuit, Pati, Rezaiifar and Krishnaprasad 1993).
+of `charts`; the columns it names (`blame`) are the few that, moved by themselves, would move the
+residuals so.
 """
 
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from mjx_cl.logs import charts, healthy
+from mjx_cl.logs import blame, charts, healthy
 from mjx_cl.logs.charts import CHARTS, SPANS
 
 DOUBT = 0.01  # expected number of such events in a healthy log, above which one is not believed
-MOST = 4  # columns that an event names
-GAIN = 25.0  # squared deviations that a column has to explain to be named
 FACTOR = 1.2  # of a spread, below which it is not said to have changed
 SHIFT = 3.0  # healthy deviations of the longest average in use, above which a mean has moved
-SHARE = 0.1  # of what the first column explains, that each of the others has to
+NOISY = 2.0  # healthy deviations beyond which residuals scatter so much that a mean means less
+LASTING = 0.8  # of the samples that are looked at, beyond which a shift is taken to last
 ROWS = 50_000  # of a large log watched at a time
 LARGE = 10_000_000  # samples of all columns from which a log is watched so and kept in 16 bits
 WARM = 40  # longest averages of the rows before that such a part begins with; e^-80 is left of more
@@ -85,11 +84,12 @@ def watch(own: Watch, xs: np.ndarray) -> Found:
 
 
 def _watch(own: Watch, xs: np.ndarray) -> Found:
-  residuals = _residuals(own, xs, healthy.FARTHEST)
+  judged = _residuals(own, xs, healthy.FARTHEST)
+  residuals = healthy.unsettled(own.model, judged)
   scores = charts.scores(residuals, own.scales)
   fired = {name: charts.alarms(x, own.thresholds[name]) for name, x in scores.items()}
   above = [(x > own.thresholds[name]).any(1) for name, x in scores.items()]
-  known = np.isfinite(residuals).any(0)
+  known = np.isfinite(judged).any(0)
   known &= ~healthy.absent(xs, own.model.held)[:, : own.model.watched]
   settling = slice(0, max(*healthy.NOW, *healthy.BEFORE))
   known[settling] = healthy.known(xs[settling], own.model.held)[:, None]
@@ -162,7 +162,7 @@ def _begin(x: np.ndarray, at: int) -> int:
   """First sample of a shift of x (T,) that was noticed at `at`: where the cumulative sum of x less
   half of the shift was lowest (Page 1954), within four of the longest spans before.
   """
-  shift = np.nanmean(x[at : at + SPANS[-1]]) if np.isfinite(x[at : at + SPANS[-1]]).any() else 0.0
+  shift = _shift(x[at : at + SPANS[-1]].astype(float))
   from_ = max(0, at - 4 * SPANS[-1])
   moved = np.nan_to_num(x[from_:at] * np.sign(shift)) - abs(shift) / 2
   return from_ + int(np.argmin(np.r_[0.0, np.cumsum(moved)]))
@@ -181,82 +181,104 @@ def _series(own: Watch, found: Found, chart: str, c: int, at: int) -> np.ndarray
   return found.residuals[0][:, c]
 
 
-def _moved(own: Watch, shift: np.ndarray) -> list[tuple[int, float]]:
-  """(column, deviations that it moved by) that explain a shift of the residuals (W,), the first
-  most.
-
-  One of a column by itself shifts its own residual by one and those it predicts by minus its
-  weights.
-  """
-  columns = len(shift)
-  every = len(own.model.mean)
-  gains = own.model.others[-1].reshape(len(healthy.NOW), every, every).sum(0)[:columns, :columns]
-  effect = (np.eye(columns) - gains.T) / own.model.scale[0][:, None]
-  root = np.linalg.cholesky(own.means).T
-  left, seen = root @ shift, root @ effect
-  named: list[int] = []
-  first, by = 0.0, np.zeros(0)
-  target = left.copy()
-  while len(named) < min(MOST, columns):
-    explains = (seen.T @ left) ** 2 / np.maximum((seen**2).sum(0), 1e-300)
-    explains[named] = 0.0
-    best = int(np.argmax(explains))
-    if explains[best] < max(GAIN, SHARE * first):
-      break
-    first = first or float(explains[best])
-    named.append(best)
-    by = np.linalg.lstsq(seen[:, named], target, rcond=None)[0]
-    left = target - seen[:, named] @ by
-  return [(c, float(b)) for c, b in zip(named, by)]
-
-
 def _whole(own: Watch, found: Found, begin: int, end: int) -> np.ndarray:
-  """(end - begin, W) residuals of what the others foretell, not cut: a cut one hides how far its
-  column moved, and which column moved it.
+  """(2, end - begin, W) residuals that are not cut: a cut one hides how far its column moved, and
+  which column moved it.
   """
-  cut = found.residuals[0, begin:end].astype(float)
+  cut = found.residuals[:, begin:end].astype(float)
   if not (np.abs(cut) >= healthy.FARTHEST).any():
     return cut
   warm, ahead = _around(own)
   from_ = max(0, begin - warm)
   part = np.ascontiguousarray(found.xs[from_ : end + ahead], np.float64)
-  whole = _residuals(own, part, np.inf)[0, begin - from_ : end - from_]
+  whole = _residuals(own, part, np.inf)[:, begin - from_ : end - from_]
   return np.where(np.abs(cut) >= healthy.FARTHEST, whole, cut)
 
 
-def _where(
-  own: Watch, found: Found, begin: int, end: int, names: list[str]
-) -> list[dict[str, Any]]:
-  """Columns that an event is in: those whose mean moved, else those whose spread was noticed, since
-  the former changes the spread of what is predicted from it.
+def _shift(x: np.ndarray) -> float:
+  """Mean of x (T,) over the first samples of that one of SPANS over which it stands out most."""
+  means = [(np.nanmean(p), np.isfinite(p).sum()) for s in SPANS if np.isfinite(p := x[:s]).any()]
+  return float(max(means, key=lambda m: m[0] ** 2 * m[1], default=(0.0, 0))[0])
+
+
+def _lasts(x: np.ndarray) -> int:
+  """Samples for which a shift of x (T,) lasts: to where the cumulative sum of x less half of it is
+  highest; all where that is near the end.
   """
+  shift = _shift(x)
+  rise = np.cumsum(np.nan_to_num(x) * np.sign(shift) - abs(shift) / 2)
+  last = max(SPANS[0], int(np.argmax(rise)) + 1)
+  return last if last <= LASTING * len(x) else len(x)
+
+
+def _followed(own: Watch, since: int, rows: int) -> float:
+  """Mean share of a shift that a drifting column's residual still shows, in `rows` rows from the
+  one `since` rows after it: its average (`healthy.standard`) follows it.
+  """
+  keep, k = 1 - 2 / (own.model.slow + 1), np.arange(since, since + rows) + 1
+  return max(0.1, float((keep**k * (1 - k * (1 - keep))).mean()))
+
+
+def _mean(own: Watch, names: list[str], c: int, by: float) -> dict[str, Any]:
+  """A column whose mean moved by so many deviations."""
+  amount = float(by * own.model.spread[c])
+  return {"column": names[c], "how": "mean", "by": amount, "deviations": float(by)}
+
+
+def _where(
+  own: Watch, found: Found, since: int, begin: int, end: int, chart: str, c: int, names: list[str]
+) -> list[dict[str, Any]]:
+  """Columns that an event is in: those whose mean moved by more than what scatters more besides,
+  else the one whose error explains most.
+
+  Args:
+    own: the watch.
+    found: by it.
+    since: first sample of the event.
+    begin: its first alarm.
+    end: of the samples that are looked at.
+    chart: that was the first to be sure.
+    c: its column.
+    names: of all columns.
+  """
+  whole = _whole(own, found, begin, end)
+  x, rows = np.nan_to_num(whole[0]), end - begin
+  if chart != "spread":
+    rows = _lasts(x[:, c if chart == "level" else int(np.argmax(np.abs(x.mean(0))))])
+  x, share = x[:rows], np.sqrt(rows / (end - begin))
+  scatter = x.std(0)
+  scatter[scatter < NOISY] = 1.0
+  shift = x.mean(0) * share * min(1.0, (end - begin) / SPANS[1])
   columns = []
-  shift = np.nan_to_num(_whole(own, found, begin, end)).mean(0)
-  shift *= min(1.0, (end - begin) / SPANS[1])
-  for c, by in _moved(own, shift):
-    columns.append(
-      {"column": names[c], "how": "mean", "by": by * float(own.model.spread[c]), "deviations": by}
-    )
+  for k, by in blame.moved(own.model, own.means / np.outer(scatter, scatter), shift):
+    by /= share * (_followed(own, begin - since, rows) if own.model.drifts[k] else 1.0)
+    columns.append(_mean(own, names, k, by))
   if columns:
     return columns
   excess = found.scores["spread"][begin:end].max(0) / own.thresholds["spread"]
-  for c in np.argsort(-excess)[:MOST]:
-    if excess[c] < 1 or excess[c] < 0.5 * excess.max():
-      break
-    columns.append({"column": names[c]} | _how(own, found, int(c), slice(begin, end)))
+  order = [int(k) for k in np.argsort(-excess)]
+  if excess[order[0]] < 1:
+    by = float(x[:, c].mean() * own.model.scale[0, c])
+    return [_mean(own, names, c, by)] if chart == "level" else []
+  logs = charts.logs(whole[0, :, order[0]])
+  if np.nanmean(logs) < own.scales.spread[0, 0, -1, order[0]]:  # less is going on there
+    named = [k for k in order[: blame.MOST] if excess[k] >= max(1.0, 0.5 * excess[order[0]])]
+  else:
+    named = [blame.erring(own.model, whole[0], order[: blame.TRIED])]
+  columns = [{"column": names[k]} | _how(own, whole[:, :, k], k) for k in named]
   clear = [column for column in columns if column["how"] != "course"]
   return clear or columns[:1]
 
 
-def _how(own: Watch, found: Found, c: int, within: slice) -> dict[str, Any]:
-  """What happened to a column whose spread was noticed: a factor of what others or its past do not
-  foretell, or else a shift, or else another course in time.
+def _how(own: Watch, whole: np.ndarray, c: int) -> dict[str, Any]:
+  """What happened to a column whose spread was noticed, by its residuals (2, T): a factor of what
+  others or its past do not foretell, or else a shift, or else another course in time.
   """
   factors, shift = [1.0, 1.0], 0.0
-  for k, (before, now) in enumerate(zip(own.unseen[:, :, c], found.residuals[:, within, c])):
+  for k, (before, now) in enumerate(zip(own.unseen[:, :, c], whole)):
     if np.isfinite(now).sum() > 1:
-      factors[k] = float(np.nanstd(now.astype(float)) / np.nanstd(before))
-      shift = float(np.nanmean(now.astype(float))) if k == 0 else shift
+      factors[k] = float(np.nanstd(now) / np.nanstd(before))
+      shift = float(np.nanmean(now)) if k == 0 else shift
   clear = [not 1 / FACTOR < factor < FACTOR for factor in factors]
   longest = charts.used(own.unseen.shape[1]) - 1
   if not clear[0] and abs(shift) > SHIFT * own.scales.level[longest, c]:
@@ -265,6 +287,26 @@ def _how(own: Watch, found: Found, c: int, within: slice) -> dict[str, Any]:
   if any(clear):
     return {"how": "spread", "by": factors[clear.index(True)], "deviations": None}
   return {"how": "course", "by": None, "deviations": None}
+
+
+def _sure(
+  own: Watch, found: Found, within: slice, strongest: tuple[str, int], samples: int
+) -> tuple[int, str, int]:
+  """(sample of the event, chart, column) from which on an event is believed: the first score that
+  is enough by itself; that of the `strongest` chart if it follows soon.
+  """
+  hits = []
+  for name in CHARTS:
+    enough = own.tails[name].threshold(len(CHARTS) * samples / DOUBT)
+    ratio = found.scores[name][within] / enough
+    if (over := (ratio > 1).any(1)).any():
+      at = int(np.argmax(over))
+      hits.append((at, name, int(np.argmax(ratio[at]))))
+  if not hits:
+    chart, c = strongest
+    return int(np.argmax(found.scores[chart][within, c])), chart, c
+  first = min(hits)
+  return next((h for h in hits if h[1] == strongest[0] and h[0] <= first[0] + SPANS[1]), first)
 
 
 def judge(own: Watch, found: Found, names: list[str], refractory: int) -> list[dict[str, Any]]:
@@ -284,10 +326,8 @@ def judge(own: Watch, found: Found, names: list[str], refractory: int) -> list[d
       rates = own.tails[name].expected(highest, samples)
       if rates.min() < expected:
         expected, strongest = float(rates.min()), (name, int(rates.argmin()))
-    chart, c = strongest
-    score = found.scores[chart][within, c]
-    peak = int(np.argmax(score))  # the event is what led to it
-    below = np.flatnonzero(score[:peak] <= own.thresholds[chart][c])
+    peak, chart, c = _sure(own, found, within, strongest, samples)
+    below = np.flatnonzero(found.scores[chart][within, c][:peak] <= own.thresholds[chart][c])
     first = int(at[0]) + (int(below[-1]) + 1 if len(below) else 0)
     begin = _begin(_series(own, found, chart, c, first), first)
     end = min(samples, first + SPANS[-1])
@@ -299,7 +339,7 @@ def judge(own: Watch, found: Found, names: list[str], refractory: int) -> list[d
         "charts": [name for name in CHARTS if found.fired[name][within].any()],
         "expected": expected * len(CHARTS),
         "believed": expected * len(CHARTS) < DOUBT,
-        "columns": _where(own, found, first, end, names),
+        "columns": _where(own, found, begin, first, end, chart, c, names),
       }
     )
   return events
