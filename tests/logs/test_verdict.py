@@ -586,6 +586,19 @@ def test_faults_by_hand():
   assert put("noise", 0.0) == x.tolist() and x.tolist() == [0, 1, 2, 3, 4, 5]
 
 
+def test_faults_are_put_into_a_log_of_sensors_with_several_rates():
+  """A knee at 10 Hz, a temperature at 1 Hz: residuals stand between their samples, as in a log."""
+  past = gait(6000, 3)
+  for column, every in ((1, 5), (6, 50)):
+    past[np.arange(6000) % every > 0, column] = np.nan
+  own = verdict.calibrated(past, 10_000)
+  whole = healthy.completed(own.model, past)
+  since = healthy.since(own.model, past)
+  assert since[:52, [1, 6]].max(0).tolist() == [4, 49] and not since[:, 0].any()
+  rows, places = inject.smallest(own, whole, NAMES[:2], 100, since)
+  assert places >= 8 and all(r["severity"] for r in rows if r["kind"] in ("bias", "freeze"))
+
+
 def test_the_smallest_fault_that_is_seen(watched):
   """Seen are the severities from the smallest on; a bias much below it gives no alarm in a log."""
   past, own = watched
