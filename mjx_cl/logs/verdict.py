@@ -260,8 +260,8 @@ def _where(
   if excess[order[0]] < 1:
     by = float(x[:, c].mean() * own.model.scale[0, c])
     return [_mean(own, names, c, by)] if chart == "level" else []
-  logs = charts.logs(whole[0, :, order[0]])
-  if np.nanmean(logs) < own.scales.spread[0, 0, -1, order[0]]:  # less is going on there
+  logs = charts.logs(whole[0, np.isfinite(whole[0, :, order[0]]), order[0]])
+  if len(logs) and logs.mean() < own.scales.spread[0, 0, -1, order[0]]:  # less is going on there
     named = [k for k in order[: blame.MOST] if excess[k] >= max(1.0, 0.5 * excess[order[0]])]
   else:
     named = [blame.erring(own.model, whole[0], order[: blame.TRIED])]
