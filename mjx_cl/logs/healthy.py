@@ -348,7 +348,7 @@ def unseen(model: Healthy, z: np.ndarray, error: np.ndarray | None = None) -> np
 
 def drifting(x: np.ndarray) -> np.ndarray:
   """Bool (C,): columns of (N, C) whose means of DRIFT_BLOCKS shares hold DRIFTS of their variance,
-  or lie on a line (R^2 above STRAIGHT) and hold a twentieth of DRIFTS and twenty times what they do
+  or lie on a line (R^2 above STRAIGHT) and hold a twentieth of DRIFTS and five times what they do
   where nothing moves slowly, some DRIFT_BLOCKS / N: a short log shows little of a slow drift.
   """
   usable = len(x) // DRIFT_BLOCKS * DRIFT_BLOCKS
@@ -357,7 +357,7 @@ def drifting(x: np.ndarray) -> np.ndarray:
   time = np.arange(DRIFT_BLOCKS) - (DRIFT_BLOCKS - 1) / 2
   along = (time @ means) ** 2 / (time @ time) / DRIFT_BLOCKS
   straight = along > STRAIGHT * np.maximum(means.var(0), 1e-300)
-  return (share > DRIFTS) | straight & (share > max(DRIFTS / 20, 20 * DRIFT_BLOCKS / len(x)))
+  return (share > DRIFTS) | straight & (share > max(DRIFTS / 20, 5 * DRIFT_BLOCKS / len(x)))
 
 
 def _before(watched: int, z: np.ndarray) -> tuple[int, ...]:
