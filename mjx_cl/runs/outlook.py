@@ -25,19 +25,19 @@ from mjx_cl.runs.work import Spell
 # PROMPT, LATENCY [control steps] and LATE [per control step] of the published runs (results/*/
 # runs.parquet, events.parquet), by robot at the start; tests check them against these files
 NOTICES = {
-  "walker": (0.60, 270, 7.4e-6),
-  "quadruped": (0.56, 270, 20e-6),
-  "car": (0.80, 45, 21e-6),
+  "walker": (0.60, 270, 6.9e-6),
+  "quadruped": (0.72, 226, 26e-6),
+  "car": (0.64, 61, 16e-6),
 }
 ANY = (0.65, 200, 14e-6)  # of any other robot
 # control steps that a finetuning with a stop rule lasts, of the robot that it goes on with: mean,
 # and the middle of each tenth
-ADAPTS = {"walker": 7_900, "quadruped": 9_200, "car": 8_100, "car_real": 15_000}
+ADAPTS = {"walker": 8_200, "quadruped": 9_000, "car": 7_300, "car_real": 13_600}
 ADAPT = 9_000  # of any other robot
 LENGTHS = {
-  "walker": (5800, 6000, 6000, 6000, 6100, 6500, 7000, 8600, 12_000, 13_800),
-  "quadruped": (6000, 6400, 6900, 7700, 9000, 11_300, 12_000, 12_400, 13_200, 15_200),
-  "car": (2100, 6100, 6200, 6800, 7100, 7300, 8900, 10_000, 10_800, 15_000),
+  "walker": (5900, 6000, 6000, 6100, 6200, 6700, 7500, 12_000, 12_000, 13_800),
+  "quadruped": (4700, 6000, 6400, 6900, 7500, 8400, 10_600, 12_000, 13_000, 14_900),
+  "car": (6000, 6100, 6500, 6700, 6800, 6900, 7400, 7900, 8900, 10_100),
   "car_real": (4400, 7100, 7700, 8700, 9900, 11_200, 13_400, 18_500, 25_700, 29_200),
 }
 
