@@ -25,7 +25,7 @@ GRACE_S = 10.0  # from Ctrl-C to the end of a process
 # where long work begins: module -> its functions
 WORK = {
   "mjx_cl.runs.run": ("live",),
-  "mjx_cl.runs.calibrate": ("healthy",),
+  "mjx_cl.runs.calibrate": ("watched",),
   "mjx_cl.training.trainer": ("run",),
   "mjx_cl.training.demonstrator": ("train",),
   "mjx_cl.training.evaluate": ("evaluate",),

@@ -288,7 +288,7 @@ def _said_of(
   if drifts := [name for name, yes in zip(names, own.model.drifts) if yes]:
     notes.append(
       f"{', '.join(drifts)}: drifting while healthy, so only changes quicker than "
-      f"{own.model.slow} samples are seen there, and less in the first of a log"
+      f"{own.model.slow} samples are seen there, and only large ones in a log's first rows"
     )
   notes += [
     f"{name} has {why}; there the other columns are judged without it"

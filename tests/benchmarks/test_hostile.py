@@ -2,6 +2,7 @@
 is finished is not run again.
 """
 
+import importlib
 import json
 import os
 import sys
@@ -181,3 +182,10 @@ def test_finished_cases_are_not_run_again(tmp_path, monkeypatch, capsys):
   assert campaign.table(found.values()).splitlines()[1].split() == ["all", "4", "3", "0", "1"]
   shares = [program.names(["input"], f"{k}/3", False, None) for k in range(3)]
   assert sorted(sum(shares, [])) == sorted(names) and len(names) == 4
+
+
+def test_where_long_work_begins_is_there():
+  """A renamed function would let a fork go on into it."""
+  for module, names in processes.WORK.items():
+    for name in names:
+      assert callable(getattr(importlib.import_module(module), name)), f"{module}.{name}"

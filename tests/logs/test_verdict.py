@@ -86,7 +86,7 @@ def test_what_changed_when_and_where(logs):
   assert any("drifting while healthy" in note for note in said["notes"])
 
 
-@pytest.mark.parametrize("memory", [np.float64, np.float16])
+@pytest.mark.parametrize("kept", [np.float64, np.float16])
 @pytest.mark.parametrize(
   ("column", "now", "by"),
   [
@@ -97,11 +97,11 @@ def test_what_changed_when_and_where(logs):
     (5, 0.0, -50.4),
   ],
 )
-def test_a_large_fault_names_its_own_column(watched, monkeypatch, column, now, by, memory):
+def test_a_large_fault_names_its_own_column(watched, monkeypatch, column, now, by, kept):
   """A saturated encoder, a sentinel value, a dead supply: residuals are cut for the charts, so
   those that the column foretells are cut too, and would be named in its place.
   """
-  if memory is np.float16:
+  if kept is np.float16:
     monkeypatch.setattr(verdict, "LARGE", 0)
   x = gait(6000, 1)
   x[3000:, column] = x[3000:, column] + by if now is None else now
