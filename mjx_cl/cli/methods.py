@@ -31,10 +31,7 @@ def do_methods(args: Leaderboard) -> None:
   require(out.is_dir() or not out.exists(), f"--out {args.out} is a file")
   require(not (args.beside and args.arm), "--beside is of lives that are there; leave out --arm")
   robots = tuple(args.robot)
-  beside: list[dict] = []
-  for theirs in args.beside:
-    beside = methods.joined(beside, methods.of_folder(theirs, robots))
-  published = beside if args.beside else methods.shipped()
+  published = methods.together(args.beside, robots) if args.beside else methods.shipped()
   lived = (out / "suite.json").exists()
   require(
     args.overwrite or (args.arm and lived) or not (out / methods.FILES[-1]).exists(),

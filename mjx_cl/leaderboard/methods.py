@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import pathlib
+from collections.abc import Sequence
 from typing import Any
 
 from mjx_cl import BENCHMARK
@@ -136,13 +137,17 @@ def _part(setting: str, config: dict, rows: list[dict]) -> list[dict]:
   ]
 
 
-def joined(published: list[dict], own: list[dict], name: str | None = None) -> list[dict]:
-  """Lives of one's own beside the published ones of the same settings.
+def joined(
+  published: list[dict], own: list[dict], name: str | None = None, apart: bool = True
+) -> list[dict]:
+  """Lives of one's own, marked by `own`, beside the published ones of the same settings.
 
   A method that is a file's function goes by the function's name, unless the board has one of that
   name; `name` is that of the only method of one's own. A life that is published already, by method,
-  setting, agent and seed, stays as published. Of an agent that no published life of the setting has
-  the severity may be another: what costs one agent half may cost another nothing.
+  setting, agent and seed, stays as published; of arm `none` one's own stays too, which one's own
+  lives are measured against (`adaptation.paired`). Of an agent that no published life of the
+  setting has the severity may be another: what costs one agent half may cost another nothing. Lives
+  of another suite stand by themselves. Without `apart` all count as published, of whatever suite.
 
   Raises:
     UserError: a setting of the same name differs; `name` where there are more methods, or it is
@@ -177,11 +182,25 @@ def joined(published: list[dict], own: list[dict], name: str | None = None) -> l
         f"the published one: it takes suite {SUITE!r} as it ships"
       )
   mine = [life | {"method": called.get(life["method"], life["method"])} for life in own]
-  if mine and there and not there.keys() & {setting(life) for life in mine}:
-    return mine  # another suite: it stands by itself
+  if apart and mine and there and not there.keys() & {setting(life) for life in mine}:
+    published = []
+  mine = [life | {"own": apart} for life in mine]
   unit = lambda life: tuple(life[k] for k in adaptation.KEYS)
   held = {unit(life) for life in published}
-  return [*published, *(life for life in mine if unit(life) not in held)]
+  kept = (x for x in mine if unit(x) not in held or apart and x["method"] == adaptation.NOTHING)
+  return [*(life | {"own": False} for life in published), *kept]
+
+
+def together(folders: Sequence[pathlib.Path | str], robots: tuple[str, ...] = ()) -> list[dict]:
+  """Lives of several folders, see `of_folder`; of those that two folders hold the first's.
+
+  Raises:
+    UserError: as `of_folder`; a setting that differs between two.
+  """
+  out: list[dict] = []
+  for folder in folders:
+    out = joined(out, of_folder(folder, robots), apart=False)
+  return out
 
 
 def free(name: str | None, known: set[str]) -> None:

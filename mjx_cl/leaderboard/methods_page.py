@@ -197,16 +197,16 @@ def section(
   return (
     f'<section class="setting" id="{link(*of)}"><h2>{text(" ".join(of))}</h2>'
     f'<p class="sub">{text(what)}. Share of the return lost after the fault, a dot for each life, '
-    f"a bar for the mean.</p>{plot(own, rows, [m for m in methods if m in rows])}</section>"
+    f"a bar for the mean.</p>{plot(own, of, rows, [m for m in methods if m in rows])}</section>"
   )
 
 
-def plot(lives: list[dict], rows: dict[str, dict], methods: list[str]) -> str:
+def plot(
+  lives: list[dict], of: tuple[str, str], rows: dict[str, dict], methods: list[str]
+) -> str:
   """Shares of return lost, a line for each method."""
-  unit = lambda x: (x["agent"], x["seed"])
-  none = {unit(x): x for x in lives if x["method"] == adaptation.NOTHING}
-  of = lambda name: [x for x in lives if x["method"] == name and unit(x) in none]
-  lost = {m: [adaptation.share_lost(x, none[unit(x)]) for x in of(m)] for m in methods}
+  pairs = adaptation.paired(lives)[of]
+  lost = {m: [pair.lost for pair in pairs[m].values()] for m in methods}
   every = [x for own in lost.values() for x in own if np.isfinite(x)] or [0.0]
   low, high = min(0.0, *every), max(0.1, *every)
   step = next(s for s in (0.05, 0.1, 0.2, 0.5, 1, 2, 5, 1e9) if (high - low) / s <= 9)

@@ -38,6 +38,66 @@ class Board(NamedTuple):
   friedman_p: float | None
 
 
+class Pair(NamedTuple):
+  """A life of a method, and that of arm `none` with the same agent and seed."""
+
+  life: dict
+  nothing: dict
+
+  @property
+  def lost(self) -> float:
+    """Share lost."""
+    return share_lost(self.life, self.nothing)
+
+  @property
+  def lost_none(self) -> float:
+    """Share lost by doing nothing."""
+    return share_lost(self.nothing, self.nothing)
+
+  @property
+  def known(self) -> bool:
+    """Whether both are known."""
+    return bool(np.isfinite(self.lost) and np.isfinite(self.lost_none))
+
+
+Pairs = dict[tuple[str, int], Pair]  # by agent and seed
+
+
+def paired(lives: list[dict]) -> dict[tuple[str, str], dict[str, Pairs]]:
+  """(robot, setting) -> method -> its lives beside those of arm `none`, without those of which that
+  was not lived.
+
+  The lives of one's own (key `own`) stand beside one's own `none`, where that was lived, since
+  another machine lives another life; the others beside the published one, if there is one.
+
+  Raises:
+    UserError: two lives of one method, setting, agent and seed, or a setting without `none`.
+  """
+  none: dict[tuple, dict[bool, dict]] = {}
+  held: dict[tuple[str, str], dict[str, Pairs]] = {}
+  place = lambda life: (life["robot"], life["setting"])
+  unit = lambda life: (life["agent"], life["seed"])
+  for life in lives:
+    if life["method"] == NOTHING:
+      of = none.setdefault((*place(life), *unit(life)), {})
+      if bool(life.get("own")) in of:
+        raise UserError(f"two lives of {', '.join(str(life[k]) for k in KEYS)}")
+      of[bool(life.get("own"))] = life
+  for life in lives:
+    pairs = held.setdefault(place(life), {}).setdefault(life["method"], {})
+    of = none.get((*place(life), *unit(life)), {})
+    own = bool(life.get("own"))
+    if not of or (life["method"] == NOTHING and own and False in of):
+      continue
+    if unit(life) in pairs:
+      raise UserError(f"two lives of {', '.join(str(life[k]) for k in KEYS)}")
+    pairs[unit(life)] = Pair(life, of[own] if own in of else of[not own])
+  for (robot, setting), methods in held.items():
+    if NOTHING not in methods:
+      raise UserError(f"setting {setting} of {robot} has no arm {NOTHING!r} to compare with")
+  return held
+
+
 def share_lost(life: dict, nothing: dict) -> float:
   """Return lost after the onset, of what the reward before the fault would have brought; that
   reward is of arm `none` of the same agent and seed, which no false alarm cuts short. nan where it
@@ -83,26 +143,17 @@ def board(lives: list[dict]) -> Board:
     have there.
 
   Raises:
-    UserError: two lives of one method, setting, agent and seed, or a setting without `none`.
+    UserError: as `paired`.
   Reference: Agarwal et al. 2021, NeurIPS 34 (score normalised by two references, bootstrap over
   runs); Holm 1979, Scandinavian Journal of Statistics 6, 65-70; Demsar 2006, Journal of Machine
   Learning Research 7, 1-30.
   """
-  held: dict[tuple[str, str], dict[str, dict[tuple, dict]]] = {}
-  for life in lives:
-    of = held.setdefault((life["robot"], life["setting"]), {}).setdefault(life["method"], {})
-    unit = (life["agent"], life["seed"])
-    if unit in of:
-      raise UserError(f"two lives of {', '.join(str(life[k]) for k in KEYS)}")
-    of[unit] = life
-  for (robot, setting), own in held.items():
-    if NOTHING not in own:
-      raise UserError(f"setting {setting} of {robot} has no arm {NOTHING!r} to compare with")
+  held = paired(lives)
   names = list(dict.fromkeys(life["method"] for life in lives))
   robots = dict.fromkeys(robot for robot, _ in held)
   drawn = {robot: _Draws(held, robot, seed) for seed, robot in enumerate(robots)}
   rows = [
-    {"robot": robot, "setting": setting, "method": name} | of_setting(own[name], own[NOTHING])
+    {"robot": robot, "setting": setting, "method": name} | of_setting(own[name])
     for (robot, setting), own in held.items()
     for name in names
     if name in own
@@ -115,9 +166,9 @@ def board(lives: list[dict]) -> Board:
   rivals = [name for name in names if name != NOTHING]
   full = []
   for own in held.values():
-    alike = [u for u in own[NOTHING] if all(_known(own, name, u) for name in rivals)]
-    some = {name: {u: of[u] for u in alike} for name, of in own.items() if alike}
-    scores = [of_setting(some[name], some[NOTHING])["score"] for name in rivals if some]
+    known = [{u for u, pair in own.get(name, {}).items() if pair.known} for name in rivals]
+    alike = set.intersection(*known) if known else set()
+    scores = [of_setting({u: own[name][u] for u in alike})["score"] for name in rivals if alike]
     if scores and None not in scores:
       full.append(scores)
   ranks, critical, p = comparison.ranked(np.array(full, float).reshape(len(full), len(rivals)))
@@ -131,8 +182,8 @@ def board(lives: list[dict]) -> Board:
   return Board(rows, overall, critical, p)
 
 
-def of_setting(lives: dict[tuple, dict], nothing: dict[tuple, dict]) -> dict[str, Any]:
-  """What one method does in one setting, beside `none`; both by agent and seed.
+def of_setting(pairs: Pairs) -> dict[str, Any]:
+  """What one method does in one setting, beside `none`.
 
   Returns:
     streams: pairs; known: those of which both losses are known; agents; score; lost, lost_none:
@@ -143,25 +194,22 @@ def of_setting(lives: dict[tuple, dict], nothing: dict[tuple, dict]) -> dict[str
     recovery up to the longest that could be seen, those that take longer counted as that, with
     recovery_steps_ci; falls, false_alarms, healthy_lost, updates, wall_s: as `board`.
   """
-  shared = [unit for unit in nothing if unit in lives]
-  own, other = [lives[u] for u in shared], [nothing[u] for u in shared]
-  lost, none = (
-    np.array([share_lost(life, ref) for life, ref in zip(of, other)]) for of in (own, other)
-  )
+  two = [pairs[unit] for unit in sorted(pairs)]
+  lost, none = np.array([(p.lost, p.lost_none) for p in two]).reshape(-1, 2).T
   beyond = lost - none
-  agents = {agent for agent, _ in shared}
-  apart = [beyond[[whose == agent for whose, _ in shared]] for agent in agents]
+  agents = [agent for agent, _ in sorted(pairs)]
+  apart = [beyond[[whose == agent for whose in agents]] for agent in dict.fromkeys(agents)]
   known = np.isfinite(beyond)
   lost, none, beyond = lost[known], none[known], beyond[known]
   mean = lambda x: float(np.mean(x)) if len(x) else None
-  # a run without arm `none` does not know whether its streams are affected, nor when they recover
-  hit = [life for life, ref in zip(own, other) if ref["affected"] and life["affected"] is not None]
+  # a run tells recovery by its own arm `none`, and only of streams that lose a tenth there
+  hit = [p.life for p in two if p.nothing["affected"] and p.life["affected"]]
   score = None if not len(none) or none.mean() <= 0 else 100 * (1 - lost.mean() / none.mean())
   before = lambda life: (life["reward_pre"] or 0.0) * life["onset"]
   return {
-    "streams": len(shared),
+    "streams": len(two),
     "known": len(beyond),
-    "agents": len(agents),
+    "agents": len(apart),
     "score": intervals.finite(score),
     "lost": mean(lost),
     "lost_none": mean(none),
@@ -172,24 +220,18 @@ def of_setting(lives: dict[tuple, dict], nothing: dict[tuple, dict]) -> dict[str
     "affected": len(hit),
     "recovered": sum(life["recovery_step"] is not None for life in hit),
     **_time(hit),
-    "falls": mean([a["terminations"] - b["terminations"] for a, b in zip(own, other)]),
-    "false_alarms": sum(life["false_alarms"] > 0 for life in own),
+    "falls": mean([a["terminations"] - b["terminations"] for a, b in two]),
+    "false_alarms": sum(p.life["false_alarms"] > 0 for p in two),
     "healthy_lost": mean(
       [
         (a["return_lost_healthy"] - b["return_lost_healthy"]) / before(b)
-        for a, b in zip(own, other)
+        for a, b in two
         if None not in (a["return_lost_healthy"], b["return_lost_healthy"]) and before(b) > 0
       ]
     ),
-    "updates": mean([life["updates"] for life in own]),
-    "wall_s": mean([life["wall_s"] for life in own if life["wall_s"] is not None]),
+    "updates": mean([p.life["updates"] for p in two]),
+    "wall_s": mean([p.life["wall_s"] for p in two if p.life["wall_s"] is not None]),
   }
-
-
-def _known(own: dict[str, dict[tuple, dict]], method: str, unit: tuple) -> bool:
-  """Whether a setting has the loss of a method and of `none` for an agent and seed."""
-  both = unit in own.get(method, {}) and unit in own[NOTHING]
-  return both and bool(np.isfinite(share_lost(own[method][unit], own[NOTHING][unit])))
 
 
 def _above_0(x: np.ndarray) -> bool:
@@ -272,36 +314,53 @@ class _Draws:
 
   @functools.cached_property
   def _lost(self) -> dict[tuple[str, str], np.ndarray]:
-    """(setting, method) -> share lost of each unit, nan where there is none."""
+    """(setting, method) -> shares lost by it and by doing nothing of each unit, (2, units), nan
+    where either is not known.
+    """
+    nowhere = (np.nan, np.nan)
     return {
       (setting, name): np.array(
         [
-          share_lost(of[u], own[NOTHING][u]) if u in of and u in own[NOTHING] else np.nan
-          for u in self.units
+          (of[u].lost, of[u].lost_none) if u in of and of[u].known else nowhere for u in self.units
         ]
-      )
+      ).T
       for setting, own in self.settings.items()
       for name, of in own.items()
     }
 
-  def scores(self, settings: list[str], method: str, beside: str = NOTHING) -> np.ndarray:
-    """Mean score over settings in every draw, (2, REPS), of the units that `beside` has too; nan
-    where a draw holds none, inf where these lose nothing.
+  def scores(self, settings: list[str], method: str) -> np.ndarray:
+    """Mean score over settings in every draw, (2, REPS)."""
+    return self._share(settings, NOTHING, method)
+
+  def gains(self, settings: list[str], method: str) -> np.ndarray:
+    """Mean over settings of the score less that of the paper's method in every draw, (2, REPS)."""
+    return self._share(settings, PAPER, method)
+
+  def _share(self, settings: list[str], first: str, second: str) -> np.ndarray:
+    """Mean over settings of the score of `second` less that of `first` in every draw, of the units
+    of both; nan where a draw holds no such unit, inf of the sign of what `second` spares where
+    nothing is lost by doing nothing.
     """
     out = []
     for setting in settings:
-      own, none = self._lost[setting, method], self._lost[setting, NOTHING]
-      known = np.isfinite(own) & np.isfinite(none) & np.isfinite(self._lost[setting, beside])
-      sums = [self.counts[..., known] @ x[known] for x in (own, none)]
+      both = np.stack([self._lost[setting, name] for name in (first, second)])
+      known = np.isfinite(both).all((0, 1))
+      held = self.counts[..., known]
+      (one, one_none), (other, other_none) = (
+        [held @ x for x in lost] for lost in both[..., known]
+      )
+      spared = (one - one_none) - (other - other_none)
       with np.errstate(divide="ignore", invalid="ignore"):
-        score = np.where(sums[1] > 0, 100 * (1 - sums[0] / sums[1]), np.inf)
-      score = np.where(sums[0] == sums[1], 0.0, score)
-      out.append(np.where(self.counts[..., known].any(-1), score, np.nan))
-    return np.mean(out, 0)
+        score = 100 * (one / one_none - other / other_none)
+        open_end = np.where(spared == 0, 0.0, np.sign(spared) * np.inf)
+      score = np.where((one_none > 0) & (other_none > 0), score, open_end)
+      out.append(np.where(held.any(-1), score, np.nan))
+    with np.errstate(invalid="ignore"):  # inf less inf
+      return np.mean(out, 0)
 
   def beyond(self, setting: str, method: str) -> np.ndarray:
     """Mean of what is lost beyond `none` in every draw, (2, REPS)."""
-    x = self._lost[setting, method] - self._lost[setting, NOTHING]
+    x = np.subtract(*self._lost[setting, method])
     known = np.isfinite(x)
     held = self.counts[..., known]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -310,7 +369,8 @@ class _Draws:
 
 def ends(drawn: np.ndarray, pairs: int) -> list[float | None] | None:
   """Interval of what was drawn of so many pairs, (2, REPS): the ends of the wider of both
-  bootstraps, without draws of agents that have no such pair; None of fewer than two pairs.
+  bootstraps, without draws of agents that have no such pair or in which one setting is infinitely
+  well and another infinitely badly off; None of fewer than two pairs.
   """
   drawn = drawn[:, ~np.isnan(drawn).any(0)]
   found = intervals.ends(drawn) if pairs > 1 and drawn.size else [None, None]
@@ -371,7 +431,8 @@ def _overall(name: str, rows: list[dict], held: dict, drawn: dict[str, _Draws]) 
 
 def _ends(of: list[np.ndarray], pairs: int) -> list[float | None] | None:
   """`ends` of a mean over robots."""
-  return ends(np.mean(of, 0), pairs) if of else None
+  with np.errstate(invalid="ignore"):  # inf less inf
+    return ends(np.mean(of, 0), pairs) if of else None
 
 
 def _gain(name: str, robots: dict, held: dict, drawn: dict[str, _Draws]) -> dict:
@@ -386,10 +447,10 @@ def _gain(name: str, robots: dict, held: dict, drawn: dict[str, _Draws]) -> dict
     scores, settings, pairs = [], [], []
     for row in of:
       own = held[robot, row["setting"]]
-      both = [u for u in own[name] if _known(own, name, u) and _known(own, PAPER, u)]
+      both = [u for u, pair in own[name].items() if pair.known and u in own.get(PAPER, {})]
+      both = [u for u in both if own[PAPER][u].known]
       two: list[Any] = [
-        of_setting({u: own[m][u] for u in both}, own[NOTHING])["score"] if both else None
-        for m in (name, PAPER)
+        of_setting({u: own[m][u] for u in both})["score"] if both else None for m in (name, PAPER)
       ]
       if None not in two:
         scores.append(two[0] - two[1])
@@ -398,9 +459,7 @@ def _gain(name: str, robots: dict, held: dict, drawn: dict[str, _Draws]) -> dict
     if settings:
       fewest.append(min(pairs))
       means.append(float(np.mean(scores)))
-      one, other = drawn[robot], (name, PAPER)
-      with np.errstate(invalid="ignore"):  # inf less inf
-        sampled.append(one.scores(settings, *other) - one.scores(settings, *other[::-1]))
+      sampled.append(drawn[robot].gains(settings, name))
       own_ends = _ends(sampled[-1:], fewest[-1])
       out |= {f"gain_{robot}": means[-1], f"gain_{robot}_ci": own_ends}
   if means:

@@ -140,7 +140,10 @@ def difference(
   if drawn[0] is None or drawn[1] is None:
     raise UserError(f"detectors {first!r} and {second!r}: the rows hold no streams to draw from")
   k = MEASURES.index(measure)
-  means = [np.mean([r[measure] for r in own.values()]) for own in (one, other)]
+  values = [[r[measure] for r in own.values()] for own in (one, other)]
+  if any(None in own for own in values):
+    raise UserError(f"{measure} is not known of every fault of {first!r} and {second!r}")
+  means = [np.mean(own) for own in values]
   return float(means[0] - means[1]), bootstrap.ends((drawn[0] - drawn[1])[k : k + 1])[0]
 
 

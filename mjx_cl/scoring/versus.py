@@ -37,7 +37,8 @@ class Variant(NamedTuple):
   Attributes:
     name: FOLDER:ARM.
     config: of the run.
-    rows: seed -> row of runs.parquet.
+    rows: seed -> row of runs.parquet, and lived: control steps from the change to the next one
+      or the end.
   """
 
   name: str
@@ -162,12 +163,16 @@ def variants(words: list[str], change: int = 0) -> list[Variant]:
       of = lambda row: int(row.get("change", 0))  # which the first runs did not write
       last = max(map(of, rows))
       require(0 <= change <= last, f"{home}: --change must lie in 0..{last}; got {change}")
-      own = {int(r["seed"]): r for r in rows if r["arm"] == name and of(r) == change}
+      config = tables.read_json(home / "config.json")
+      ends = {r.get("stream"): r.get("onset") for r in rows if of(r) == change + 1}
+      lived = lambda r: (ends.get(r.get("stream")) or config["steps"]) - (r.get("onset") or 0)
+      mine = [r for r in rows if r["arm"] == name and of(r) == change]
+      own = {int(r["seed"]): r | {"lived": lived(r)} for r in mine}
       label = name if len(words) == 1 else f"{home}:{name}"
       same = (home.resolve(), name)
       require(same not in seen, f"{label} is there twice; name another run or arm")
       seen.add(same)
-      found.append(Variant(label, tables.read_json(home / "config.json"), own))
+      found.append(Variant(label, config, own))
   if len(found) < 2:
     raise UserError(f"{words[0]} has one arm; name another run to compare it with")
   robots = {str(one.config.get("env")) for one in found}
@@ -204,8 +209,20 @@ def value(row: dict[str, Any], measure: str) -> float:
   return np.nan if row.get(measure) is None else float(row[measure])
 
 
+def _beside(row: dict[str, Any], first: dict[str, Any], measure: str) -> float:
+  """A measure of one stream, as it is compared with the first variant's of the same seed: return is
+  lost against one reward before the change, that of the first, as a false alarm cuts a stream's own
+  short.
+  """
+  found = value(row, measure)
+  if measure == "return_lost" and None not in (row["reward_pre"], first["reward_pre"]):
+    found += (first["reward_pre"] - row["reward_pre"]) * row["lived"]
+  return found
+
+
 def against(one: Variant, first: Variant, measure: str) -> dict[str, Any]:
-  """A variant's measure and its difference from the first variant's.
+  """A variant's measure and its difference from the first variant's, of `return_lost` that of the
+  return earned.
 
   Returns:
     streams (one a seed), iqm and iqm_ci of the variant, of SHARES mean and mean_ci; pairs (of the
@@ -215,7 +232,7 @@ def against(one: Variant, first: Variant, measure: str) -> dict[str, Any]:
   own = np.array([value(row, measure) for row in one.rows.values()])
   own = own[np.isfinite(own)]
   both = [
-    (value(one.rows[k], measure), value(first.rows[k], measure))
+    (_beside(one.rows[k], first.rows[k], measure), value(first.rows[k], measure))
     for k in one.rows.keys() & first.rows.keys()
   ]
   pairs = np.array(sorted(p for p in both if np.isfinite(p).all())).reshape(-1, 2)

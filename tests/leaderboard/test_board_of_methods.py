@@ -129,15 +129,42 @@ def test_what_is_published_stays_and_new_seeds_bring_their_own_none():
   own = [x | {"return_lost": 0.0} for x in lives if x["method"] == "none" and x["seed"] == 100]
   own += [x | {"seed": 300} for x in own]
   both = methods.joined(lives, own)
-  assert len(both) == len(lives) + 2 and sum(x["return_lost"] == 0.0 for x in both) == 2
+  # one's own `none` of a seed that is published stays for one's own lives alone
+  assert len(both) == len(lives) + 4 and sum(x["return_lost"] == 0.0 for x in both) == 4
+  rows = {r["setting"]: r for r in adaptation.board(both).rows if r["method"] == "none"}
+  assert {r["streams"] for r in rows.values()} == {7}
   kept, single = methods.paired([x | {"seed": 400} for x in lives if x["method"] != "none"] + both)
   assert len(kept) == len(both) and single == len(lives) - 12
+
+
+def test_folders_beside_each_other_in_any_order_hold_all_lives(called, tmp_path):
+  """Two suites: neither stands by itself."""
+  two = (RESULTS / "agents", STEADY)
+  apart = [methods.of_folder(folder) for folder in two]
+  for order in (two, two[::-1]):
+    lives = methods.together(order)
+    assert len(lives) == sum(map(len, apart)) and not any(x["own"] for x in lives)
+    assert {x["setting"] for x in lives} == {x["setting"] for own in apart for x in own}
+  code, out, err = called("--beside", *two, "--out", tmp_path / "board")
+  assert code == 0 and f"{len(lives)} lives" in out, err
+
+
+def test_another_machines_lives_are_measured_against_their_own_none():
+  """There every life loses 0.2 a step more."""
+  lives = methods.of_folder(STEADY)
+  own = [x | {"return_lost": x["return_lost"] + 0.2 * x["steps"]} for x in lives]
+  own = [x | {"method": x["method"].replace("oracle", "mine")} for x in own]
+  rows = adaptation.board(methods.joined(lives, own)).rows
+  beyond = {(r["setting"], r["method"]): r["beyond"] for r in rows}
+  for setting in ("steady", "mean"):
+    assert beyond[setting, "mine"] == pytest.approx(beyond[setting, "oracle"])
 
 
 def test_another_suite_stands_by_itself_and_other_settings_are_refused():
   lives = methods.of_folder(STEADY)
   other = [x | {"setting": "mine"} for x in lives]
-  assert methods.joined(lives, other) == other
+  alone = methods.joined(lives, other)
+  assert len(alone) == len(lives) and {x["setting"] for x in alone} == {"mine"}
   config = json.loads(lives[0]["settings"])
   config["severity"], config["adapt"]["ratio"] = 0.5, 64.0
   with pytest.raises(UserError, match="run with another adapt, severity than the published one"):

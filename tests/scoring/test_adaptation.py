@@ -35,9 +35,11 @@ def life(method, seed, lost, robot="walker", setting="gear", agent="walker", **o
 
 
 def lives(lost, **other):
-  """{method: shares lost, by seed} as lives."""
+  """{method: shares lost, by seed} as lives, affected where `none` loses more than a tenth."""
   return [
-    life(method, seed, x, **other) for method, of in lost.items() for seed, x in enumerate(of)
+    life(method, seed, x, **{"affected": lost.get("none", of)[seed] > 0.1} | other)
+    for method, of in lost.items()
+    for seed, x in enumerate(of)
   ]
 
 
@@ -193,10 +195,33 @@ def test_a_gain_is_of_the_lives_that_both_are_known_of():
 
 def test_draws_in_which_nothing_is_lost_leave_the_end_open():
   """Of `none` 0.3, -0.1, -0.1, -0.05 four draws in ten have a mean of 0 or less."""
-  board = adaptation.board(lives({"none": [0.3, -0.1, -0.1, -0.05], "mine": [0.02] * 4}))
+  lost = {"none": [0.3, -0.1, -0.1, -0.05], "detector": [-0.1] * 4, "mine": [-0.2] * 4}
+  lost["bad"] = [x + 0.2 for x in lost["none"]]
+  board = adaptation.board(lives(lost))
   low, high = of(board, "mine")["score_ci"]
   assert low <= of(board, "mine")["score"] and high is None
   assert of(board, "none")["score_ci"] == [0, 0]
+  # what loses more is as much worse as what loses less is better, and a gain has these draws too
+  low, high = of(board, "bad")["score_ci"]
+  assert low is None and of(board, "bad")["score"] <= high < 0
+  low, high = of(board, "mine")["gain_ci"]
+  assert 0 < low <= of(board, "mine")["gain"] and high is None
+
+
+def test_lives_of_ones_own_are_measured_against_ones_own_none():
+  """The same seeds on another machine: there `none` loses 0.6, here 0.3."""
+  published = lives({"none": [0.3] * 4, "detector": [0.15] * 4})
+  own = lives({"none": [0.6] * 4, "mine": [0.45] * 4}, own=True)
+  board = adaptation.board(published + own)
+  row = next(r for r in board.rows if r["method"] == "mine")
+  assert (row["score"], row["beyond"], row["worse"]) == (pytest.approx(25), pytest.approx(-0.15), 0)
+  assert of(board, "mine")["gain"] == pytest.approx(25 - 50)
+  assert of(board, "mine")["gain_ci"] == pytest.approx([-25, -25])
+  assert next(r for r in board.rows if r["method"] == "none")["lost"] == pytest.approx(0.3)
+  alone = adaptation.board(own)  # no published ones
+  assert of(alone, "mine")["score"] == pytest.approx(25) and of(alone, "none")["streams"] == 4
+  bare = adaptation.board(published + own[4:])  # lived without `none`
+  assert of(bare, "mine")["score"] == pytest.approx(-50)
 
 
 def test_draws_of_agents_that_a_method_has_no_life_of_do_not_count():
@@ -229,13 +254,17 @@ def test_what_it_costs():
   assert (row["falls"], row["false_alarms"], row["updates"], row["wall_s"]) == (3, 1, 10, 2)
   assert row["healthy_lost"] == pytest.approx(20 / (0.5 * 400))
   assert (row["affected"], row["recovered"]) == (2, 1)  # the third loses nothing without it
+  for x in own:  # nor was one affected where it was lived: when it recovers was not asked
+    x |= {"affected": False} if x["method"] == "mine" and x["seed"] == 1 else {}
+  row = next(r for r in adaptation.board(own).rows if r["method"] == "mine")
+  assert (row["affected"], row["recovered"]) == (1, 1)
 
 
 def test_time_to_recovery_is_a_restricted_mean():
   """Of two that take 500 and 1,500 steps and one that never does within 3,000 that can be seen."""
   own = [life("none", k, 0.3, steps=5_000) for k in range(3)]
   when = [900, 1_900, None]
-  own += [life("mine", k, 0.1, steps=5_000, recovery_step=when[k]) for k in range(3)]
+  own += [life("mine", k, 0.1, steps=5_000, affected=True, recovery_step=when[k]) for k in range(3)]
   row = next(r for r in adaptation.board(own).rows if r["method"] == "mine")
   assert row["recovery_steps"] == pytest.approx((500 + 1_500 + 3_000) / 3)
   own[-1]["steps"] = 2_000  # in which nobody can have been back for as long as it takes

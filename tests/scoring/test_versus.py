@@ -1,6 +1,7 @@
 """Runs against each other: differences by hand, intervals against another bootstrap, bad input."""
 
 import json
+import pathlib
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from mjx_cl.io import tables
 from mjx_cl.scoring import versus
 
 PRE = 2.0
+LOOP = pathlib.Path(__file__).parents[2] / "results" / "loop"
 
 
 def run_of(folder, arms, env="walker", steps=25_000):
@@ -51,6 +53,22 @@ def test_arms_of_one_run_by_hand(tmp_path):
   assert rows["none", "return_lost"]["better"] == 0.5  # ties
   same = rows["detector", "reward_final"]
   assert same["difference"] == 0 and same["difference_ci"] == [0, 0]
+
+
+def test_a_false_alarm_before_the_change_lowers_no_loss():
+  """`cusum@surprise` has alarmed on two walkers before the fault; what is earned after it is what
+  differs, 104 as results/loop says.
+  """
+  (part,) = (p for p in versus.by(str(LOOP), "detector") if p.name == "walker")
+  first = next(x for x in part.found if x.name == "detector=rolling_sigma")
+  one = next(x for x in part.found if x.name == "detector=cusum@surprise")
+  row = versus.against(one, first, "return_lost")
+  earned = lambda r: r["reward_pre"] * r["lived"] - r["return_lost"]
+  want = [earned(first.rows[k]) - earned(one.rows[k]) for k in sorted(first.rows)]
+  assert row["difference"] == pytest.approx(np.mean(want)) and round(row["difference"]) == -104
+  cut = [k for k in one.rows if one.rows[k]["reward_pre"] != first.rows[k]["reward_pre"]]
+  assert len(cut) == 2 and {one.rows[k]["false_alarms"] for k in cut} == {1}
+  assert {r["lived"] for r in one.rows.values()} == {20_000}
 
 
 def test_versions_of_the_benchmark_are_not_mixed(tmp_path, mjx):
