@@ -201,9 +201,7 @@ def section(
   )
 
 
-def plot(
-  lives: list[dict], of: tuple[str, str], rows: dict[str, dict], methods: list[str]
-) -> str:
+def plot(lives: list[dict], of: tuple[str, str], rows: dict[str, dict], methods: list[str]) -> str:
   """Shares of return lost, a line for each method."""
   pairs = adaptation.paired(lives)[of]
   lost = {m: [pair.lost for pair in pairs[m].values()] for m in methods}

@@ -320,9 +320,7 @@ class _Draws:
     nowhere = (np.nan, np.nan)
     return {
       (setting, name): np.array(
-        [
-          (of[u].lost, of[u].lost_none) if u in of and of[u].known else nowhere for u in self.units
-        ]
+        [(of[u].lost, of[u].lost_none) if u in of and of[u].known else nowhere for u in self.units]
       ).T
       for setting, own in self.settings.items()
       for name, of in own.items()
@@ -346,9 +344,7 @@ class _Draws:
       both = np.stack([self._lost[setting, name] for name in (first, second)])
       known = np.isfinite(both).all((0, 1))
       held = self.counts[..., known]
-      (one, one_none), (other, other_none) = (
-        [held @ x for x in lost] for lost in both[..., known]
-      )
+      (one, one_none), (other, other_none) = ([held @ x for x in lost] for lost in both[..., known])
       spared = (one - one_none) - (other - other_none)
       with np.errstate(divide="ignore", invalid="ignore"):
         score = 100 * (one / one_none - other / other_none)
@@ -389,12 +385,13 @@ def _overall(name: str, rows: list[dict], held: dict, drawn: dict[str, _Draws]) 
   }
   robots = {robot: of for robot, of in robots.items() if of}
 
-  def mean(key: str, of: list[dict] = own) -> float | None:
-    known = [r[key] for r in of if r[key] is not None]
-    return float(np.mean(known)) if known else None
+  def a_life(key: str) -> float | None:
+    known = [r for r in own if r[key] is not None]
+    of = [np.array([r[k] for r in known], float) for k in (key, "streams")]
+    return float(np.average(of[0], weights=of[1])) if known else None
 
   out: dict[str, Any] = {"method": name}
-  each = {robot: mean("score", of) for robot, of in robots.items()}
+  each = {robot: float(np.mean([r["score"] for r in of])) for robot, of in robots.items()}
   # of fewer robots than the board has no mean compares
   whole = set(each) == {robot for robot, _ in held}
   out["score"] = float(np.mean(list(each.values()))) if whole else None
@@ -421,11 +418,11 @@ def _overall(name: str, rows: list[dict], held: dict, drawn: dict[str, _Draws]) 
     "harm_streams": sum(r["worse"] for r in own) / streams if streams else None,
     "recovered": sum(r["recovered"] for r in own),
     "affected": sum(r["affected"] for r in own),
-    "falls": mean("falls"),
+    "falls": a_life("falls"),
     "false_alarms": sum(r["false_alarms"] for r in own) / streams if streams else None,
-    "healthy_lost": mean("healthy_lost"),
-    "updates": mean("updates"),
-    "wall_s": mean("wall_s"),
+    "healthy_lost": a_life("healthy_lost"),
+    "updates": a_life("updates"),
+    "wall_s": a_life("wall_s"),
   }
 
 

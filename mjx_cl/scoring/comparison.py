@@ -19,10 +19,10 @@ class Overall(NamedTuple):
 
   Attributes:
     rows: a dict for each detector, best `cost_standard` first.
-    critical_difference: mean ranks further apart differ at 5 % (Nemenyi); None for fewer than two
-      detectors or blocks.
+    critical_difference: mean ranks further apart differ at 5 %; None for fewer than two detectors
+      or blocks.
     friedman_p: chance of ranks this uneven if all detectors were alike (Friedman's chi-square, ties
-      corrected).
+      corrected, blocks taken as independent).
     blocks: robot x fault x severity in which every detector has a score; ranks are over these.
   """
 
@@ -36,15 +36,16 @@ def overall(rows: list[dict], reps: int = REPS) -> Overall:
   """Means of each detector over all of its robots x faults x severities, equal weight for each, and
   ranks.
 
-    mean rank: rank by cost_standard within a block, 1 = best, ties share; critical difference = q
-    sqrt(k (k + 1) / (6 n)), q = studentised range / sqrt(2), k detectors, n blocks; what a row
-    calls a reference takes no rank and makes none
+    mean rank: rank by cost_standard within a block, 1 = best, ties share; critical difference: the
+    95 % point, over seeds drawn anew, of how far apart two detectors' mean ranks move, or Nemenyi's
+    where that is larger: q sqrt(k (k + 1) / (6 n)), q = studentised range / sqrt(2), k detectors, n
+    blocks; what a row calls a reference takes no rank and makes none
 
   Intervals: bootstrap over seeds, stratified by robot. The faults of one robot share their seeds'
   healthy streams, so a seed is drawn with all of its faults; a share of 0 or 1 and a rate of 0 have
   Wilson's and Poisson's over the seeds of all robots. They say how far another set of seeds would
-  move the mean on these faults, not what other faults would do. Blocks that share seeds are not
-  independent either: the critical difference is somewhat too small.
+  move the mean on these faults, not what other faults would do. Nemenyi's difference takes
+  blocks as independent, which those of one robot are not: an alarm on a healthy stream moves all.
 
   Args:
     rows: of metrics.row, with detector, robot, fault, severity, and perhaps reference.
@@ -68,6 +69,9 @@ def overall(rows: list[dict], reps: int = REPS) -> Overall:
   shared = [b for b in blocks if all(scored(t, b) for t in rivals.values())]
   scores = np.array([[t[b]["cost_standard"] for t in rivals.values()] for b in shared], float)
   ranks, critical, p = ranked(scores.reshape(len(shared), len(rivals)))
+  if critical is not None:
+    by_block = [[t[b] for b in shared] for t in rivals.values()]
+    critical = max(critical, _spread(by_block, ranks, reps))
   mean = dict(zip(rivals, ranks))
   out = [
     {"detector": name, "blocks": len(own)}
@@ -166,6 +170,22 @@ def _drawn(rows: list[dict], reps: int) -> np.ndarray | None:
     sums: Any = sum(map(_values, mine))
     drawn = drawn + sums @ bootstrap.weights(sums.shape[1], reps, seed).T / len(rows)
   return drawn
+
+
+def _spread(rows: list[list[dict]], seen: np.ndarray, reps: int) -> float:
+  """95 % point, over seeds drawn anew, of the most that two mean ranks move against each other from
+  those `seen`; rows of each rival by block. 0 without streams.
+  """
+  every = [r for own in rows for r in own]
+  if not all("stream_latency_steps" in r and r["streams"] > 1 for r in every):
+    return 0.0
+  robots = {robot: seed for seed, robot in enumerate(sorted({r["robot"] for r in every}))}
+  k, ranks = MEASURES.index("cost_standard"), np.zeros((reps, len(rows)))
+  for block in zip(*rows):
+    drawn = bootstrap.weights(block[0]["streams"], reps, robots[block[0]["robot"]])
+    scores = np.stack([drawn @ _values(r)[k] for r in block], -1)
+    ranks += stats.rankdata(-scores.round(9), axis=-1) / len(rows[0])  # ties are ties
+  return float(np.quantile(np.ptp(ranks - seen, -1), 0.95))
 
 
 def _values(row: dict) -> np.ndarray:

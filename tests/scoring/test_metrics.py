@@ -572,6 +572,24 @@ def test_critical_difference_equals_demsars_table(detectors, q):
   }  # all equal
 
 
+def test_blocks_that_share_a_seed_are_no_evidence_of_their_own():
+  """`b` is `a` but for an alarm on one of six healthy streams, which lies below all of a robot's
+  faults: in a third of the draws that stream is missing, and the two are alike.
+  """
+  alarm, healthy = fired(STEPS, *[(ONSET + 20,)] * SEEDS), fired(HEALTHY, *[()] * SEEDS)
+  once = healthy.copy()
+  once[300, 0] = True
+  rows = [
+    row(alarm, quiet) | {"detector": d, "robot": "walker", "fault": f"f{k}", "severity": 0.5}
+    for d, quiet in (("a", healthy), ("b", once))
+    for k in range(30)
+  ]
+  got = comparison.overall(rows)
+  ranks = {r["detector"]: r["mean_rank"] for r in got.rows}
+  assert ranks == {"a": 1, "b": 2}
+  assert got.critical_difference >= 1 > 1.96 * (2 * 3 / 6 / 30) ** 0.5  # Nemenyi's
+
+
 def test_friedman_equals_scipy_with_ties():
   rng, rows = np.random.default_rng(0), []
   base = random_row()
