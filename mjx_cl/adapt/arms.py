@@ -151,7 +151,13 @@ class Arms(plugins.Registry):
           raise
         raise PluginError(f"arm {name!r} cannot be made: {plugins.line(e, 1)}") from e
       if not isinstance(arm, Arm):
-        raise PluginError(f"arm {name!r}: {found} must give a mjx_cl.adapt.arms.Arm; got {arm!r}")
+        raise PluginError(f"arm {name!r} must give a mjx_cl.adapt.arms.Arm; got {arm!r}")
+      for part, of in (("trigger", Trigger), ("end", End)):
+        if not isinstance(getattr(arm, part), of):
+          raise PluginError(
+            f"arm {name!r}: its {part} must be a mjx_cl.adapt.arms.{of.__name__}; got "
+            f"{getattr(arm, part)!r}"
+          )
       self.made[name, found] = arm
     return self.made[name, found]
 

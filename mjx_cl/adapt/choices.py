@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +14,7 @@ import numpy as np
 from mjx_cl.adapt import methods
 from mjx_cl.adapt.arms import ARMS
 from mjx_cl.config import FOREVER, AdaptConfig
-from mjx_cl.errors import choose
+from mjx_cl.errors import PluginError, choose
 
 # Choices.at is padded to a multiple of it: arms with up to eight starts share a program
 WIDTH = 8
@@ -58,7 +59,7 @@ class Choices(NamedTuple):
 
 
 def settings(own: Sequence[methods.Method], config: AdaptConfig) -> dict[str, jax.Array]:
-  """`Choices.settings` of streams with these methods: a method's own value where the run's is the
+  """`Choices.settings` of streams with these methods: a method's own value where the run's is a
   default, else the run's.
   """
   values = {}
@@ -67,6 +68,19 @@ def settings(own: Sequence[methods.Method], config: AdaptConfig) -> dict[str, ja
     if any(x != getattr(config, name) for x in each):
       values[name] = jnp.asarray(each, jnp.float32)
   return values
+
+
+def _due(arm: str, given: Any) -> tuple[int, ...]:
+  """The control steps that an arm's trigger gives."""
+  try:
+    due = tuple(operator.index(step) for step in given)
+  except TypeError:
+    due = (-1,)
+  if min(due, default=0) < 0:
+    raise PluginError(
+      f"arm {arm!r}: its trigger must give control steps, whole numbers from 0 on; got {given!r}"
+    )
+  return due
 
 
 def choices(
@@ -92,14 +106,14 @@ def choices(
   """
   arms = [choose("arm", arm, ARMS) for arm, _ in labels]
   onsets = [()] * len(arms) if onsets is None else onsets
-  at = [
-    arm.trigger.steps(config, own if arm.breaks else (), steps, seed)
-    for arm, own, (_, seed) in zip(arms, onsets, labels)
+  due = [
+    _due(name, arm.trigger.steps(config, own if arm.breaks else (), steps, seed))
+    for arm, own, (name, seed) in zip(arms, onsets, labels)
   ]
-  width = WIDTH * max(1, -(-max(map(len, at)) // WIDTH))
+  width = WIDTH * max(1, -(-max(map(len, due)) // WIDTH))
   padded = np.full((len(arms), width), FOREVER, np.int32)
-  for row, own in zip(padded, at):
-    row[: len(own)] = [step if step < steps else FOREVER for step in own]
+  for row, starts in zip(padded, due):
+    row[: len(starts)] = [step if step < steps else FOREVER for step in starts]
   own = methods.used(tuple(arm for arm, _ in labels))
   flags = lambda get: jnp.asarray([get(arm) for arm in arms], bool)
   limits = [

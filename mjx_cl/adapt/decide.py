@@ -174,16 +174,17 @@ def regained(
   """What the mean reward must reach before an adaptation may converge, float32 (groups,).
 
     max(acceptance, m - (1 - regain) |m|),  m = mean reward before the first adaptation
-    acceptance                              where regain = 0
+    acceptance                              where regain = 0, or m is not known
 
   Args:
     state: of the streams, leading (groups,).
     acceptance: float32 () or (groups,), level of the task.
     regain: float32 () or (groups,), in [0, 1].
   """
-  before = state.mean[:, SIGNALS.index("reward")]
+  k = SIGNALS.index("reward")
+  before, known = state.mean[:, k], state.number[:, k] > 0
   level = before - (1.0 - regain) * jnp.abs(before)
-  return jnp.maximum(acceptance, jnp.where(regain > 0, level, -jnp.inf))
+  return jnp.maximum(acceptance, jnp.where((regain > 0) & known, level, -jnp.inf))
 
 
 def give_up(

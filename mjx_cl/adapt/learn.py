@@ -197,4 +197,5 @@ def _update(
   for i, (method, own) in enumerate(zip(methods, memory)):
     if method.keep is not None:
       learnt = choose(which == i, method.keep(own, before, learnt), learnt)
-  return learnt, latents, bad
+  # whatever of the state a method takes up, an update has been made
+  return learnt._replace(updates=before.updates + (bad < 0)), latents, bad

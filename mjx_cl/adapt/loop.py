@@ -306,7 +306,9 @@ class Loop:
     replay = learn.fill(state.replay, rows, begins, begin.row, was == decide.ADAPTING)
     length, adapting = rows.reward.shape[0], phase.phase == decide.ADAPTING
     enough = setting("start_windows")
-    owed = learn.owing(agent, replay, adapting, state.owed, length, config.ratio, enough)
+    # a method's memory is of this adaptation from the next chunk on
+    due = adapting & ~begins
+    owed = learn.owing(agent, replay, due, state.owed, length, config.ratio, enough)
     if not all(method.learns for method in own):
       owed = jnp.where(jnp.array([m.learns for m in own])[choices.method], owed, 0.0)
     number = jnp.floor(owed + 1e-6).astype(jnp.int32)
@@ -332,7 +334,7 @@ class Loop:
       acting,
       train.params,
     )
-    acting, learner, memory, weighed = _act(own, choices.method, state.memory, view)
+    acting, learner, memory, weighed = _act(own, choices.method, state.memory, view, state.acting)
     # the robot keeps what it acts by when it is done
     train = train._replace(params=choose(over, learner, train.params))
     # a stream that is done watches again, its reference refitted on the latest rows
@@ -357,26 +359,34 @@ class Loop:
 
 
 def _act(
-  own: tuple[methods.Method, ...], which: jax.Array, memory: tuple[Any, ...], view: methods.View
+  own: tuple[methods.Method, ...],
+  which: jax.Array,
+  memory: tuple[Any, ...],
+  view: methods.View,
+  acted: Any,
 ) -> tuple[Any, Any, tuple[Any, ...], tuple[jax.Array, ...]]:
   """What acts in the chunk to come by each stream's method, what a learner that is done goes on
   from, the memories of all, and what was weighed where a method of the run weighs; leading
-  (groups,).
+  (groups,). Until its first adaptation begins a stream acts on by what `acted` in the chunk, and a
+  memory is what that gives.
   """
-  answers = []
-  for method, kept in zip(own, memory):
+  first = view.begins & (view.was == decide.NOMINAL)
+  begun = view.begins | (view.was != decide.NOMINAL)
+  none = jnp.full(begun.shape, jnp.nan, jnp.float32)
+  chosen: Any = methods.Acts(view.acted, (), jnp.zeros(begun.shape, bool), none, none, view.learner)
+  memories = []
+  for i, (method, kept) in enumerate(zip(own, memory)):
     act = lambda memory, view, method=method: _whole(method.act(memory, view))
+    kept = choose(first, jax.vmap(functools.partial(methods.remember, method))(acted), kept)
     said = jax.vmap(act)(kept, view)
     same = lambda new, old: jnp.asarray(new, old.dtype)
+    memories.append(choose(begun, jax.tree.map(same, said.memory, kept), kept))
     learner = said.params if said.learner is None else said.learner
-    answers.append(said._replace(memory=jax.tree.map(same, said.memory, kept), learner=learner))
-  chosen: Any = answers[0]._replace(memory=())
-  for i, said in enumerate(answers[1:], 1):
-    chosen = choose(which == i, said._replace(memory=()), chosen)
+    said = said._replace(memory=(), learner=learner)
+    chosen = choose(begun & (which == i), said, chosen)
   weighed = (chosen.back, chosen.earned, chosen.earns)
   weighs = any(method.weighs for method in own)
-  memories = tuple(a.memory for a in answers)
-  return chosen.params, chosen.learner, memories, weighed if weighs else ()
+  return chosen.params, chosen.learner, tuple(memories), weighed if weighs else ()
 
 
 def _whole(acts: methods.Acts) -> methods.Acts:

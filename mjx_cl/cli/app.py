@@ -91,6 +91,8 @@ def done_by(kind: type, module: str) -> Callable[[Any], None]:
   return do
 
 
+# what our code may raise where a user's gave something that it does not expect
+FOREIGN = (TypeError, ValueError, AttributeError, ArithmeticError, LookupError)
 DO = {kind: done_by(kind, module) for kind, module in COMMANDS.items()}
 
 
@@ -308,7 +310,7 @@ def ours(command: Any) -> Iterator[None]:
     raise
   except Exception as e:
     where = None if plugins.of_user(e) else plugins.place(e)
-    if where is None and isinstance(e, (TypeError, ValueError)) and not plugins.of_user(e):
+    if where is None and isinstance(e, FOREIGN) and not plugins.of_user(e):
       where = ", ".join(own_code(command)) or None
     if where is None:
       raise
@@ -339,7 +341,8 @@ def main(argv: list[str] | None = None) -> int:
 
   def again() -> str:
     if isinstance(command, (Run, Train)):
-      return "; what was saved can be resumed with --resume"
+      saved = os.path.isdir(command.out) and os.listdir(command.out)
+      return "; what was saved can be resumed with --resume" if saved else "; nothing was saved"
     return "; the same command goes on where it stopped" * isinstance(command, (Record, Bench))
 
   status = attempt(do, again)

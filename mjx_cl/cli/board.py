@@ -14,7 +14,7 @@ from mjx_cl.cli.output import clock, command_line, emit, say
 from mjx_cl.cli.tables import console, table
 from mjx_cl.config import settings
 from mjx_cl.detectors import python_class
-from mjx_cl.errors import require
+from mjx_cl.errors import choose, require
 from mjx_cl.io import folders, runtime
 from mjx_cl.leaderboard import record, score, spread, streams, submissions
 from mjx_cl.runs import cluster
@@ -146,6 +146,7 @@ def check_own(args: Leaderboard) -> None:
   ):
     more = " or --submit" if flag == "--name" else ""
     require(other or not given, f"{flag} belongs to a detector of one's own; give --add{more}")
+  choose("channel", args.channel, dict.fromkeys(streams.COLUMNS))
   require(
     not (args.name and args.add and args.submit),
     "--name names one detector; give --add and --submit in two commands, or leave it out",

@@ -184,6 +184,7 @@ class AdaptConfig:
       "period_steps",
       "random_steps",
     )
+    require(self.ratio <= 100_000, f"ratio must be at most 100,000; got {self.ratio:g}")
     whole(self, *given(self, "batch"), most=4096)
     require(
       self.acceptance is None or math.isfinite(self.acceptance),

@@ -35,7 +35,7 @@ class DreamerConfig:
     max_std: Greatest deviation of the policy's actions.
     warmup: Updates over which the learning rate rises linearly.
     agc: Adaptive gradient clipping: largest ratio of a gradient's norm to its weights'.
-    bins: Classes of the two-hot heads, odd.
+    bins: Classes of the two-hot heads, odd, at least 3.
     entropy: Weight of the policy's entropy.
     free_nats: Divergence below which dynamics and representation are not trained [nat].
     rep_scale: Weight of the representation loss.
@@ -100,11 +100,12 @@ class DreamerConfig:
       f"last_starts must be 0, or lie in 2..length={self.length}; got {self.last_starts}",
     )
     positive(self, "agc", "range_rate", "slow_rate")
+    fraction(self, "range_rate", "slow_rate")
     not_below_0(
       self, "anchor", "model_lr", "warmup", "entropy", "free_nats", "rep_scale", "repval_scale"
     )
     fraction(self, "lam")
-    require(self.bins % 2, f"bins must be odd; got {self.bins}")
+    require(self.bins % 2 and self.bins > 1, f"bins must be odd and 3 or more; got {self.bins}")
 
 
 @dataclass(frozen=True)

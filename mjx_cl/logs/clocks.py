@@ -2,7 +2,7 @@
 
 import datetime
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -79,6 +79,33 @@ def called_clock(label: str) -> bool:
   return not CLOCKS.isdisjoint(words) or words[:1] == ["t"] and UNITS.keys() >= set(words[1:])
 
 
+# last words of a name of the whole seconds of a split clock, and of their fraction -> its unit
+WHOLE = SECONDS
+FRACTIONS = {word: 1e-9 for word in ("nanosec", "nanosecs", "nsec", "nsecs", "nanoseconds", "ns")}
+FRACTIONS |= {word: 1e-6 for word in ("usec", "usecs", "microseconds", "us")}
+
+
+def split(columns: Mapping[str, np.ndarray]) -> dict[tuple[str, str], np.ndarray]:
+  """(column of whole seconds, column of their fraction) -> seconds since the first row, of clocks
+  in two columns such as `header.stamp.sec` and `header.stamp.nanosec`.
+  """
+  ends = {tuple(words): name for name in columns if (words := _words(name))}
+  found = {}
+  for (*rest, last), name in ends.items():
+    if last not in WHOLE:
+      continue
+    for word, size in FRACTIONS.items():
+      other = ends.get((*rest, word))
+      if other is None:
+        continue
+      whole, part = columns[name], columns[other]
+      if len(whole) and np.all((part >= 0) & (part * size < 1) & (whole == np.round(whole))):
+        at = whole - whole[0] + part * size
+        if never_falls(at - at[0]):
+          found[name, other] = at - at[0]
+  return found
+
+
 def throughout(x: np.ndarray) -> bool:
   """Whether x has no gap and rises at every row."""
   return len(x) > 0 and bool(np.isfinite(x).all() and (np.diff(x) > 0).all())
@@ -111,6 +138,8 @@ def guessed(x: np.ndarray) -> tuple[str, float] | None:
 # first value from which a number is taken for a time since 1970 -> seconds of its unit
 EPOCHS = {1e17: 1e-9, 1e14: 1e-6, 1e11: 1e-3, 1e8: 1.0}
 GAP = 1.5  # typical intervals above which there is a gap
+RARE = 0.1  # share of the intervals that may be wide in an even clock whose gaps are of any length
+WHOLLY = 0.2, 0.9  # how near to a whole number of intervals a gap is, and the share that must be
 
 
 def iso_seconds(cells: Sequence[str]) -> np.ndarray | None:
@@ -143,6 +172,20 @@ def never_falls(x: np.ndarray) -> bool:
   return len(x) > 1 and bool(np.isfinite(x).all() and (np.diff(x) >= 0).all() and x[-1] > x[0])
 
 
+def gaps(seconds: np.ndarray) -> np.ndarray:
+  """Which intervals (T - 1,) of times are gaps; none where the clock itself is uneven: wide ones
+  are not RARE, nor do they hold a whole number of usual ones.
+  """
+  steps = np.diff(seconds)
+  usual = float(np.median(steps)) if len(steps) else 0.0
+  wide = steps > GAP * max(usual, 1e-12)
+  if usual > 0 and wide.mean() >= RARE:
+    lengths = steps[wide] / usual
+    near, share = WHOLLY
+    wide &= bool((abs(lengths - np.rint(lengths)) < near).mean() >= share)
+  return wide & (usual > 0)
+
+
 def rate(seconds: np.ndarray) -> tuple[float, float] | None:
   """Rows per second by the median distance of two and by the mean one without gaps; None where that
   tells nothing.
@@ -159,9 +202,8 @@ def irregular(seconds: np.ndarray) -> list[str]:
     return []
   if same := int((steps == 0).sum()):
     notes.append(f"{same:,} times stand in more than one row")
-  usual = float(np.median(steps))
-  wide = np.flatnonzero(steps > GAP * max(usual, 1e-12))
-  if usual > 0 and len(wide) and len(wide) < len(steps) / 10:
+  wide = np.flatnonzero(gaps(seconds))
+  if len(wide):
     longest = wide[int(np.argmax(steps[wide]))]
     notes.append(
       f"{len(wide):,} gap{'s' * (len(wide) > 1)} in the times, the longest of "

@@ -8,11 +8,10 @@ import numpy as np
 
 from mjx_cl.logs import healthy, verdict
 from mjx_cl.logs.charts import CHARTS, SPANS
-from mjx_cl.logs.clocks import GAP
+from mjx_cl.logs.clocks import gaps
 
 LONG = SPANS[-1]  # samples for which a column is silent before it is named
 MOST = LONG  # rows that a gap is filled up by
-RARE = 0.1  # share of the rows before which a gap may lie; above, the clock itself is uneven
 HALF = 0.5  # of its samples that are not judged: of such a column nothing is said
 
 RARELY = "most of the samples are missing"
@@ -25,9 +24,8 @@ def places(seconds: np.ndarray | None) -> np.ndarray | None:
   if seconds is None or len(seconds) < 4:
     return None
   steps = np.diff(seconds)
-  usual = float(np.median(steps))
-  wide = steps > GAP * max(usual, 1e-12)
-  if usual <= 0 or not wide.any() or wide.mean() >= RARE:
+  usual, wide = float(np.median(steps)), gaps(seconds)
+  if not wide.any():
     return None
   beside = np.pad(np.minimum(steps, usual), 1, constant_values=usual)
   lacking = np.rint((steps + beside[:-2] + beside[2:]) / usual) - 3

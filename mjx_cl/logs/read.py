@@ -26,6 +26,7 @@ from mjx_cl.logs.clocks import (
   irregular,
   iso_seconds,
   never_falls,
+  split,
   throughout,
   told_by_name,
   unit,
@@ -74,7 +75,8 @@ def read(path: pathlib.Path | str) -> Log:
   rises throughout, at last one without (`t`, `timestamp`). Of a clock without a unit that follows
   from how far it rises; what was guessed is noted. A first column without a name, among others, is
   called `index`. Where nothing else tells times, a column of time stamps does: ISO 8601, or
-  seconds, ms, us or ns since 1970; gaps and repeated ones are noted.
+  seconds, ms, us or ns since 1970, or whole seconds beside a column of their fraction
+  (`stamp.sec`, `stamp.nanosec`); gaps and repeated ones are noted.
   """
   with contextlib.suppress(OSError):  # whoever opens it says what is wrong
     mode = os.stat(path).st_mode
@@ -185,6 +187,11 @@ def _timed(
   """The log of columns of numbers, with what tells its times; `stamps`: seconds of columns that
   hold time stamps.
   """
+  parts = split(columns)
+  for pair, seconds in parts.items():
+    stamps[pair[0]] = seconds
+    for name in pair:
+      del columns[name]
   clocks, told = tuple(name for name in columns if told_by_name(name, labels[name])), {}
   rows = len(next(iter([*columns.values(), *stamps.values()]), ()))
   for name in clocks:
@@ -218,7 +225,7 @@ def _timed(
         told["time"] = _in_seconds(name, columns[name], labels[name], notes)
       else:
         notes.append(f"column {name} tells no times, as its unit is unknown: give --rate")
-  clocks += tuple(stamps)
+  clocks += (*stamps, *(fraction for _, fraction in parts))
   if "time" in told:
     notes.extend(f"{path}: {text}" for text in irregular(told["time"]))
   return Log(columns, told.get("time"), told.get("step"), ignored, clocks, labels, tuple(notes))
@@ -346,7 +353,8 @@ def _cells(
       continue
     row = row or [""]  # in a file of one column an empty line is a missing sample
     if len(row) != len(names):
-      raise FileError(f"{path}, line {line}: {len(row)} cells under {len(names)} names")
+      why = "; a line that begins with # is no comment here" * names[0].startswith("#")
+      raise FileError(f"{path}, line {line}: {len(row)} cells under {len(names)} names{why}")
     cells.append((line, row))
   return cells
 

@@ -95,6 +95,11 @@ def doubts(config: RunConfig) -> list[str]:
       f"adapt.budget={adapt.budget:,} ends every finetuning before one may converge, after "
       f"{least:,} steps (adapt.least, {CHUNK} adapt.patience)"
     )
+  if adapt.start_windows >= config.steps and any(ARMS[arm].learns for arm in config.arms):
+    said.append(
+      f"adapt.start_windows={adapt.start_windows:,} is more than the replay of {config.steps:,} "
+      "steps ever holds: nothing is learnt"
+    )
   if warmup >= config.steps:
     said.append(
       f"the run ends at step {config.steps:,}, within adapt.warmup={warmup:,}: no alarm can "

@@ -14,6 +14,7 @@ from typing import NamedTuple
 from mjx_cl.adapt import methods
 from mjx_cl.adapt.arms import ARMS
 from mjx_cl.config import CHUNK, DreamerConfig, RunConfig
+from mjx_cl.errors import require
 from mjx_cl.io import memory, runtime
 from mjx_cl.runs.groups import HERD
 from mjx_cl.runs.lives import MANY
@@ -60,6 +61,23 @@ class Room(NamedTuple):
       else f"; of that the trace grows with the steps, {gib(self.trace)}"
     )
     return f"memory: at most about {gib(self.total)}{grows}, nothing else does"
+
+
+def check(room: Room, config: RunConfig) -> None:
+  """Refuses a run of more lives or a longer trace than fit into memory; what learners need is told
+  apart, see `training.needs`.
+
+  Raises:
+    UserError: one line.
+  """
+  space = int(memory.MARGIN * memory.free()) + memory.held()
+  least = memory.resident(room.lives) + room.trace
+  require(
+    least <= space,
+    f"{len(config.arms) * config.seeds:,} streams of {config.steps:,} control steps need "
+    f"{least / 2**30:,.1f} GiB, {space / 2**30:,.1f} GiB may be used; fewer --seeds, --arm or "
+    "--steps need less",
+  )
 
 
 def of(config: RunConfig, spec: Spec, trained: DreamerConfig, repeat: int = 1) -> Room:

@@ -117,7 +117,7 @@ def _begun(
   try:
     # refuses wrong names and broken agents before anything of an earlier run is removed
     runner = Runner(config, out, programs, healthy)
-  except UserError:
+  except (UserError, KeyboardInterrupt):
     if fresh and not any(out.iterdir()):
       out.rmdir()
     raise

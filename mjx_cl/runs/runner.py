@@ -20,7 +20,7 @@ from mjx_cl.adapt.loop import Choices, Digest, Programs, choices
 from mjx_cl.adapt.state import cut
 from mjx_cl.config import CHUNK, RunConfig
 from mjx_cl.dreamer.agent import CAUSES, EXPLODED
-from mjx_cl.errors import FileError
+from mjx_cl.errors import FileError, PluginError
 from mjx_cl.faults.presets import becomes, changes
 from mjx_cl.io import arrays, checkpoints, runtime
 from mjx_cl.keys import OfSeed
@@ -108,6 +108,9 @@ class Runner:
     self.stops = stop_rule.told(config)
     self.faults, plan, target = faults.build(self.changes, self.robots[-1], config.onset)
     # the streams
+    learner = (self.env.spec, self.trained.agent.config, self.repeat)
+    self.room = room.of(config, *learner)
+    room.check(self.room, config)
     seeds = range(config.first_seed, config.first_seed + config.seeds)
     self.labels = list(itertools.product(config.arms, seeds))
     self.groups = len(self.labels)
@@ -121,10 +124,8 @@ class Runner:
     self.chunks = -(-config.steps // self.chunk_steps)
     self._begin(plan, target)
     self.choices = self._choices()
-    learner = (self.env.spec, self.trained.agent.config, self.repeat)
     self.clock = clock_of(config, *learner, self.stops)
     self.clock.joined = not self.lives.herds
-    self.room = room.of(config, *learner)
     self.healthy = healthy
     cards = [self.trained.card, *(other.card for other in self.others.values())]
     owned = {leaf.removeprefix("mj.") for fault in self.faults for leaf in fault.owns}
@@ -317,6 +318,11 @@ class Runner:
     c, own = self.config, self.labels[g : g + 1]
     at = choices(own, c.adapt, c.steps, [(enter, *self._onsets())], self.stops).at
     room = self.choices[g].at.shape[1] - at.shape[1]  # an arm with more starts makes it wider
+    if room < 0:
+      raise PluginError(
+        f"arm {own[0][0]!r}: told an onset at step {enter:,} it starts more adaptations than the "
+        f"{self.choices[g].at.shape[1]} that a run has room for whose onset may be {c.onset:,}"
+      )
     return jnp.pad(at, ((0, 0), (0, room)), constant_values=FOREVER)
 
   def _choices(self) -> list[Choices]:
@@ -325,7 +331,13 @@ class Runner:
     """
     c = self.config
     known = [(() if self.other is None else (FOREVER,)) + self._onsets()] * self.groups
+    room = 0
+    if self.other is not None:  # as many starts as there are where the onset comes at once
+      soon = [(c.onset, *self._onsets())] * self.groups
+      room = choices(self.labels, c.adapt, c.steps, soon, self.stops).at.shape[1]
     whole = choices(self.labels, c.adapt, c.steps, known, self.stops)
+    more = ((0, 0), (0, max(0, room - whole.at.shape[1])))
+    whole = whole._replace(at=jnp.pad(whole.at, more, constant_values=FOREVER))
     return [cut(whole, slice(g, g + 1), 0) for g in range(self.groups)]
 
   def onsets(self) -> list[int | None]:

@@ -2,7 +2,6 @@
 1 as good as a reference.
 """
 
-from mjx_cl.adapt.arms import ARMS, NEVER
 from mjx_cl.scoring import intervals
 
 # share of reward_pre that must lie between the reference and no adaptation; as `affected` asks for
@@ -49,9 +48,7 @@ def rows(runs: list[dict], expert: list[dict] | None = None, least: float = LEAS
     not live are left out.
   """
   first = [r for r in runs if not r.get("change")]
-  none = {
-    r["seed"]: r for r in first if ARMS[r["arm"]].trigger is NEVER and not ARMS[r["arm"]].agent
-  }
+  none = {r["seed"]: r for r in first if r["arm"] == "none"}
   word, reference = "reward_pre", {seed: r["reward_pre"] for seed, r in none.items()}
   if expert is not None:
     word = "expert"

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mjx_cl.config import own_agent
-from mjx_cl.errors import FileError, UserError, require
+from mjx_cl.errors import UserError, require
 from mjx_cl.io import tables
 from mjx_cl.scoring import intervals, stop_rule
 
@@ -153,7 +153,8 @@ def variants(words: list[str], change: int = 0) -> list[Variant]:
   seen: set[tuple[pathlib.Path, str]] = set()
   for home, arm in map(_split, words):
     if not (home / "runs.parquet").is_file() or not (home / "config.json").is_file():
-      raise FileError(f"{home} holds no finished run (no runs.parquet)")
+      board = "; it holds a board: `mjx-cl query`" if (home / "methods.json").is_file() else ""
+      raise UserError(f"{home} holds no finished run (no runs.parquet){board}")
     rows = tables.read_rows(home / "runs.parquet")
     arms = list(dict.fromkeys(str(row["arm"]) for row in rows))
     chosen = [arm] if arm else arms if len(words) == 1 or len(arms) == 1 else ["detector"]

@@ -16,11 +16,12 @@ from test_arms import EAGER, STEPS, hand_rows, scripted
 
 from benchmarks import methods as told
 from mjx_cl.adapt import decide, methods
-from mjx_cl.adapt.arms import ALARM, ARMS, RULE, Arm
+from mjx_cl.adapt.arms import ALARM, ARMS, NEVER, NO_END, RULE, Arm
 from mjx_cl.adapt.choices import settings as settings_of
 from mjx_cl.adapt.loop import Loop, choices
-from mjx_cl.adapt.methods import Acts, Method, Settings, staged
+from mjx_cl.adapt.methods import Acts, Method, Settings, quiet, staged
 from mjx_cl.config import PRESETS, AdaptConfig, RunConfig
+from mjx_cl.config import quick as quick_settings
 from mjx_cl.dreamer.agent import Agent
 from mjx_cl.errors import PluginError, UserError
 from mjx_cl.rollout.monitor import Monitor
@@ -265,6 +266,62 @@ def test_an_update_of_ones_own_takes_the_place_of_dreamers(same):
   assert digests[-1].updates[0] == digests[-1].updates[1] > 0
 
 
+def test_an_update_counts_whatever_of_it_is_taken_up():
+  """From the state before, the dynamics alone replaced: the counter is the loop's."""
+  part = lambda before, after: before._replace(params={**before.params, "dyn": after.params["dyn"]})
+  method = Method(keep=lambda memory, before, after: part(before, after))
+  ARMS.members["part"] = lambda: Arm("", ALARM, RULE, method=method)
+  try:
+    _, digests = live(three("part"))
+  finally:
+    del ARMS.members["part"]
+  for digest in digests:
+    assert digest.updates[0] == digest.updates[1]
+  assert digests[-1].updates[0] > 0
+
+
+def test_a_method_waits_for_the_first_adaptation(same):
+  """Where all streams share a program, as on an accelerator: one that never adapts acts by what it
+  came with, and its method remembers nothing; another's begins with what acted then.
+  """
+  counts = Method(
+    init=lambda params: (jnp.int32(0), params["pol"]["std"]["bias"]),
+    act=lambda memory, view: Acts(quiet.still(view.acted), (memory[0] + 1, memory[1])),
+    learns=False,
+  )
+  ARMS.members["never"] = lambda: Arm("", NEVER, NO_END, method=counts)
+  ARMS.members["later"] = lambda: Arm("", ALARM, RULE, method=counts)
+  try:
+    states, digests = live(("later", "never", "none"))
+    own = methods.used(("later", "never", "none")).index(counts)
+  finally:
+    del ARMS.members["never"], ARMS.members["later"]
+  number, bias = states[-1].memory[own]
+  assert number.tolist() == [len(digests), 0, 0]
+  assert same(stream(states[-1].acting, 1), stream(states[0].acting, 1))
+  assert (stream(states[-1].acting, 0)["pol"]["std"]["bias"] == quiet.LOW).all()
+  assert (bias[0] == states[0].acting["pol"]["std"]["bias"][0]).all()
+
+
+def test_a_quiet_robot_of_new_weights_has_their_deviations():
+  """A second adaptation that begins with weights drawn anew, and one that does not."""
+  own, new = (jax.jit(AGENT.init)(jax.random.key(k)).params for k in range(2))
+  std = lambda params, level: {
+    **params, "pol": {**params["pol"], "std": jax.tree.map(lambda x: x + level, params["pol"]["std"])}
+  }  # fmt: skip
+  own, new = std(own, 1.0), std(new, 2.0)
+  none, memory = jnp.float32(jnp.nan), quiet.Quiet((), own, jnp.bool_(True))
+  after = lambda acted: quiet.METHOD.act(
+    memory,
+    methods.View(
+      *(jnp.int32(decide.CONVERGED), jnp.int32(decide.ADAPTING), jnp.bool_(True), jnp.bool_(False)),
+      *(none, none, jnp.full(6, jnp.nan), jnp.int32(0), jnp.float32(0.0), acted, own),
+    ),
+  ).memory.params["pol"]["std"]["bias"]
+  assert (after(new) == new["pol"]["std"]["bias"]).all()
+  assert (after(quiet.still(new)) == own["pol"]["std"]["bias"]).all()
+
+
 def test_the_rule_reads_nothing_of_a_chunk_that_a_method_hides():
   counts = Method(
     init=lambda params: jnp.int32(0),
@@ -318,6 +375,16 @@ def test_an_update_is_tried_on_what_the_learner_draws():
     methods.check("mine", Method(update=update), AGENT)
 
 
+@dataclasses.dataclass
+class Unhashed:
+  """A callable of a plain dataclass has no hash."""
+
+  rate: float = 0.1
+
+  def __call__(self, memory, view):
+    return methods.average(memory, view)
+
+
 BROKEN = {
   "init of its method fails: KeyError": Method(init=lambda params: params["policy"]),
   "act of its method fails: AttributeError": Method(act=lambda memory, view: view.weights),
@@ -349,6 +416,14 @@ BROKEN = {
   "hides of its method must keep structure, shapes and types of one bool": Method(
     hides=lambda memory: 1.0
   ),
+  "earned of its method's Acts must be one value of a stream": Method(
+    act=lambda memory, view: Acts(view.acted, memory, earned=jnp.zeros(2), earns=jnp.zeros(2))
+  ),
+  "the functions of its method need a hash: unhashable type: 'Unhashed'": Method(act=Unhashed()),
+  "copies of its method must be 0 or more; got -5": Method(copies=-5),
+  "the memory of its method holds a key; keep jax.random.key_data of it": Method(
+    init=lambda params: jax.random.key(0)
+  ),
 }
 
 
@@ -361,14 +436,24 @@ def test_a_broken_method_is_refused_in_a_line(said):
 
 def test_what_is_no_arm_is_refused_in_a_line(tmp_path):
   file = tmp_path / "mine.py"
-  file.write_text("def fails():\n  raise ValueError('no luck')\ndef other():\n  return 3\n")
+  file.write_text(
+    "from mjx_cl.adapt.arms import ALARM, RULE, Arm, Trigger\n"
+    "def fails():\n  raise ValueError('no luck')\ndef other():\n  return 3\n"
+    "def word():\n  return Arm('', 'ALARM', RULE)\n"
+    "def past():\n  return Arm('', Trigger('', lambda *_: (-2**40,)), RULE)\n"
+    "def nothing():\n  return Arm('', Trigger('', lambda *_: None), RULE)\n"
+  )
   for name, said in (
+    ("word", "its trigger must be a mjx_cl.adapt.arms.Trigger; got 'ALARM'"),
     ("fails", "cannot be made: ValueError: no luck"),
     ("other", "must give a mjx_cl.adapt.arms.Arm; got 3"),
     ("othr", "has nothing of the name 'othr' that can be called; did you mean 'other'"),
   ):
     with pytest.raises((PluginError, UserError), match=re.escape(said)):
       settings.check(RunConfig("walker", arms=(f"{file}:{name}",)))
+  for name in ("past", "nothing"):
+    with pytest.raises(PluginError, match="trigger must give control steps, whole numbers from 0"):
+      choices([(f"{file}:{name}", 0)], AdaptConfig(), 1000, [(500,)])
 
 
 def test_a_run_knows_the_file_of_its_arm(example):
@@ -387,6 +472,8 @@ def test_settings_of_a_method_stand_above_defaults_alone():
     "regain": [0.0, np.float32(0.9)],
   }
   assert set(settings_of(own, AdaptConfig(start_windows=512))) == {"regain"}
+  swift = [methods.METHODS["swift"]]  # what --quick asks for is a default too
+  assert settings_of(swift, quick_settings.ADAPT)["start_windows"].tolist() == [64.0]
   assert settings_of([methods.PAPER] * 2, AdaptConfig()) == {}
   with pytest.raises(UserError, match="start_windows must be above 0"):
     Settings(start_windows=0)
@@ -410,7 +497,8 @@ def test_a_loop_lives_by_the_settings_of_a_method():
 
 
 def test_what_must_be_back_by_hand():
-  state = decide.init(LASTING)._replace(mean=jnp.array([0, 0, 0.75, 0, 0, 0.0]))
+  known = {"mean": jnp.array([0, 0, 0.75, 0, 0, 0.0]), "number": jnp.ones(6)}
+  state = decide.init(LASTING)._replace(**known)
   poor = state._replace(mean=state.mean.at[2].set(-2.0))
   both = jax.tree.map(lambda *x: jnp.stack(x), state, poor)
   level = lambda accepted, regain: decide.regained(both, accepted, regain).tolist()
@@ -418,3 +506,5 @@ def test_what_must_be_back_by_hand():
   assert level(0.48, 0.9) == pytest.approx([0.675, 0.48])
   assert level(-9.0, 0.9) == pytest.approx([0.675, -2.2])
   assert level(-9.0, jnp.array([0.0, 1.0])) == pytest.approx([-9.0, -2.0])
+  fresh = jax.tree.map(lambda x: x[None], decide.init(LASTING))  # it alarmed in its first chunk
+  assert decide.regained(fresh, -5.0, 0.9).tolist() == [-5.0]

@@ -274,6 +274,8 @@ def test_what_a_run_takes_with_a_doubt_and_what_it_refuses(capsys, tmp_path):
     0
   ] and not doubts.doubts(config(warmup=500))
   assert "the run ends at step 1,500, within" in doubts.doubts(config(warmup=5000))[0]
+  [late] = doubts.doubts(config(warmup=500, start_windows=1500))
+  assert "adapt.start_windows=1,500 is more than the replay of 1,500 steps ever holds" in late
   [deaf] = doubts.doubts(replace(config(), arms=("none",)))  # nobody listens
   assert "no stream counts as affected" in deaf and "alarm" not in deaf
   assert "before its fault at 1,500" in doubts.doubts(replace(config(), onset=1500))[

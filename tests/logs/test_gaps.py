@@ -161,6 +161,20 @@ def test_rows_that_are_missing_are_put_back(tmp_path, nominal, mjx):  # noqa: F8
   assert all(len(score) == keep.sum() for score in found.scores.values())
 
 
+def test_a_seventh_of_the_rows_may_be_missing_from_an_even_clock(tmp_path, nominal):
+  """More than a tenth of the intervals are wide, all of whole samples."""
+  keep = np.random.default_rng(3).random(2000) > 0.15
+  t = np.arange(2000) / 50
+  assert (np.diff(t[keep]) > 0.03).mean() > 0.1
+  assert gaps.places(t[keep]).tolist() == (np.flatnonzero(keep) - np.flatnonzero(keep)[0]).tolist()
+  for since in (None, 1000):
+    rows = np.c_[t, leg(2000, 1001, since)][keep]
+    head = ",".join(["time", *NAMES])
+    np.savetxt(tmp_path / "log.csv", rows, "%.7g", ",", header=head, comments="")
+    found = detect.detect(tmp_path / "log.csv", nominal).summary["verdict"]
+    assert found["changed"] == (since is not None)
+
+
 def test_what_is_no_missing_row():
   t = np.arange(200) * 0.02
   late = t.copy()

@@ -681,6 +681,27 @@ def test_time_stamps_tell_times(tmp_path):
     assert list(log.columns) == ["x"]
 
 
+@pytest.mark.parametrize(
+  "whole, part, size",
+  (
+    ("header.stamp.sec", "header.stamp.nanosec", 1e-9),
+    ("header.stamp.secs", "header.stamp.nsecs", 1e-9),
+    ("tv_sec", "tv_usec", 1e-6),
+  ),
+)
+def test_a_clock_in_two_columns_is_one(tmp_path, whole, part, size):
+  """ROS 2, ROS 1 and timeval. A fraction that exceeds its second is none."""
+  at = [divmod(t * 20_000_000, 10**9) for t in range(200)]
+  row = lambda s, ns, k: f"{1_700_000_000 + s},{round(ns * 1e-9 / size)},{k % 7}\n"
+  path, head = tmp_path / "ros.csv", f"{whole},{part},x\n"
+  path.write_text(head + "".join(row(*one, k) for k, one in enumerate(at)))
+  log = read(path)
+  np.testing.assert_allclose(log.time, np.arange(200) / 50, atol=1e-6)
+  assert set(log.clocks) == {whole, part} and list(log.columns) == ["x"] and not log.notes
+  path.write_text(head + "".join(row(s, ns + 10**9, k) for k, (s, ns) in enumerate(at)))
+  assert any("times stand in more than one row" in note for note in read(path).notes)
+
+
 def clocked(path, name, at):
   path.write_text(f"{name},x\n" + "".join(f"{t:.20g},{k % 7}\n" for k, t in enumerate(at)))
   return path

@@ -67,6 +67,14 @@ def test_by_hand_against_reward_pre():
   ) == (0.4, 0.3, 0.8, 0.8, "reward_pre")
 
 
+def test_a_healthy_robot_that_never_adapts_is_no_floor():
+  """An arm of one's own, told after `none`: the highest there is."""
+  healthy = [
+    r | {"arm": "mine", "reward_final": 9.0, "onset": None} for r in run() if r["arm"] == "none"
+  ]
+  assert by(normalised_recovery.rows(run() + healthy)) == by(normalised_recovery.rows(run()))
+
+
 def test_by_hand_against_an_expert():
   expert = [{"arm": "oracle", "seed": s, "reward_final": x} for s, x in EXPERT.items()]
   scored = by(normalised_recovery.rows(run(), expert))

@@ -129,13 +129,26 @@ def check(name: str, method: Method, agent: Agent) -> None:
   signals: Any = jax.ShapeDtypeStruct((len(SIGNALS),), jnp.float32)
   params = train.params
   view = View(whole, whole, flag, flag, real, real, signals, whole, real, params, params)
+  try:
+    hash(method)
+  except TypeError as e:
+    raise PluginError(f"arm {name!r}: the functions of its method need a hash: {e}") from e
+  if not isinstance(method.copies, int) or method.copies < 0:
+    raise PluginError(f"arm {name!r}: copies of its method must be 0 or more; got {method.copies}")
   memory = tried("init", lambda p: remember(method, p), params)
+  if any(jnp.issubdtype(x.dtype, jax.dtypes.prng_key) for x in jax.tree.leaves(memory)):
+    raise PluginError(
+      f"arm {name!r}: the memory of its method holds a key; keep jax.random.key_data of it"
+    )
   acts = tried("act", method.act, memory, view)
   if not isinstance(acts, Acts):
     raise PluginError(f"arm {name!r}: act of its method must give an Acts")
   like("act", acts.params, params, "the parameters")
   if acts.learner is not None:
     like("what act gives the learner", acts.learner, params, "the parameters")
+  for what in ("back", "earned", "earns"):
+    if jnp.shape(getattr(acts, what)) != ():
+      raise PluginError(f"arm {name!r}: {what} of its method's Acts must be one value of a stream")
   shapes = lambda tree: [x.shape for x in jax.tree.leaves(tree)]
   if form(acts.memory) != form(memory) or shapes(acts.memory) != shapes(memory):
     raise PluginError(f"arm {name!r}: act of its method must keep structure and shapes of memory")

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from mjx_cl.config import AdaptConfig
+from mjx_cl.config import AdaptConfig, quick
 from mjx_cl.dreamer.agent import Agent, TrainState
 from mjx_cl.dreamer.state import Record
 
@@ -87,7 +87,7 @@ def average(memory: Any, view: View) -> Acts:
 @dataclass(frozen=True)
 class Settings:
   """What a method wants otherwise than AdaptConfig's default, see there; None: the run's. A value
-  that a run is given and that is not the default stands above it.
+  that a run is given and that is neither the default nor that of --quick stands above it.
 
   Attributes:
     start_windows: Windows that the replay must hold before the first update.
@@ -105,7 +105,8 @@ class Settings:
   def of(self, name: str, config: AdaptConfig) -> Any:
     """The value that a run of `config` takes."""
     run, wanted = getattr(config, name), getattr(self, name)
-    return run if wanted is None or run != getattr(AdaptConfig, name) else wanted
+    defaults = getattr(AdaptConfig, name), getattr(quick.ADAPT, name)
+    return run if wanted is None or run not in defaults else wanted
 
 
 @dataclass(frozen=True)

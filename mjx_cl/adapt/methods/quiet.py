@@ -49,9 +49,10 @@ def quiet(method: Method) -> Method:
     return Quiet(method.init(params), params, jnp.bool_(False))
 
   def act(memory: Quiet, view: View) -> Acts:
-    # of what acted the deviations are its own no more; an adaptation may begin with new weights
+    # of what acted the deviations are its own no more, but where it begins with new weights
     loud = view.acted["pol"] | {"std": memory.params["pol"]["std"]}
-    new = choose(memory.begun, {**view.acted, "pol": loud}, view.acted)
+    quieted = memory.begun & jnp.all(view.acted["pol"]["std"]["bias"] == LOW)
+    new = choose(quieted, {**view.acted, "pol": loud}, view.acted)
     params = choose(view.begins, new, memory.params)
     said = method.act(memory.own, view._replace(acted=params))
     learner = said.params if said.learner is None else said.learner
