@@ -17,7 +17,7 @@ from mjx_cl.config import CHUNK, FOREVER, PRESETS, AdaptConfig, RunConfig
 from mjx_cl.dreamer.agent import Agent
 from mjx_cl.envs.car import Car
 from mjx_cl.envs.car_real import CarReal
-from mjx_cl.errors import UserError
+from mjx_cl.errors import PluginError, UserError
 from mjx_cl.faults import certificate, presets
 from mjx_cl.faults.presets import SOCKS, SOCKS_GRIP, Change, Preset
 from mjx_cl.io import tables
@@ -597,6 +597,30 @@ def test_starts_are_as_wide_for_every_arm_of_a_run(short, saved, tmp_path):
   assert list(told[0][1][0][:10]) == [*range(40, 400, 40), FOREVER]
   assert sorted(told[1][1][0].tolist())[:3] == [97, ONSET + SECOND, FOREVER]
   assert sorted(told[1][0][0].tolist())[:2] == [ONSET + SECOND, FOREVER]
+
+
+def test_starts_that_follow_from_the_onset_have_room(short, saved, tmp_path):
+  """A trigger that starts the more often the sooner the robot changes, and one that starts more
+  often later than at once, which is refused in a line.
+  """
+  own = tmp_path / "own.py"
+  own.write_text(
+    "from mjx_cl.adapt.arms import BUDGET, Arm, Trigger\n"
+    "every = lambda onsets, steps, by: tuple(s for o in onsets for s in range(o, steps, by))\n"
+    "def often():\n"
+    "  return Arm('', Trigger('', lambda adapt, on, steps, seed: every(on, steps, 20)), BUDGET)\n"
+    "def late():\n"
+    "  count = lambda on: 20 if 75 < on[0] < 2**30 else 1\n"
+    "  return Arm('', Trigger('', lambda adapt, on, steps, seed: (200,) * count(on)), BUDGET)\n"
+  )
+  whole = run.Runner(asked(saved, arms=(f"{own}:often", "none")), tmp_path / "a")
+  at = whole._at(0, ONSET + 10)
+  assert at.shape == whole.choices[0].at.shape and at.shape[1] >= (STEPS - ONSET) // 20
+  steps = list(range(ONSET + 10, STEPS, 20)) + list(range(ONSET + SECOND, STEPS, 20))
+  assert at[0, : len(steps)].tolist() == steps and (at[0, len(steps) :] == FOREVER).all()
+  late = run.Runner(asked(saved, arms=(f"{own}:late", "none")), tmp_path / "b")
+  with pytest.raises(PluginError, match="told an onset at step 80 it starts more adaptations"):
+    late._at(0, 80)
 
 
 def test_the_replay_holds_what_the_stream_lived(whole):

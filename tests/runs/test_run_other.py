@@ -18,6 +18,7 @@ from mjx_cl import envs
 from mjx_cl import physics as physics_lib
 from mjx_cl.config import CHUNK, PRESETS, AdaptConfig, RunConfig, replace
 from mjx_cl.dreamer.agent import Agent
+from mjx_cl.errors import UserError
 from mjx_cl.io import tables
 from mjx_cl.runs import run
 from mjx_cl.training import agents
@@ -234,3 +235,13 @@ def test_training_on_mjx_is_read_back_to_the_bit(tmp_path):
   assert any(x.size == 0 for x in jax.tree.leaves(trainer.state)) and bits(trainer.state) == bits(
     again.state
   )
+
+
+def test_more_lives_than_memory_are_refused_before_anything_is_made(tmp_path):
+  """A million seeds: no key of theirs is drawn, no folder stays."""
+  out = tmp_path / "out"
+  with pytest.raises(
+    UserError, match=r"streams of 25,000 control steps need [\d,.]+ GiB, .* --see"
+  ):
+    run.execute(RunConfig("walker", seeds=1_000_000), out)
+  assert not out.exists()
