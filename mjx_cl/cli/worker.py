@@ -60,7 +60,7 @@ def runs(folder: pathlib.Path) -> Do:
       run.execute(
         suite.config(name, values),
         folder / name,
-        resume=(folder / name / "config.json").exists(),
+        resume=(folder / name).exists(),
         progress=shown,
         programs=programs,
         healthy=healthy,

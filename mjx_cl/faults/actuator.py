@@ -1,14 +1,16 @@
 """Faults of motors, transmissions and the line that brings them their commands.
 
-Commands are in the agent's own units, [-1, 1] of the range. A target is one actuator, a group (one
-leg) or all. Where a fault remembers, an episode's start fills its memory anew with the first
-command.
+Commands are in the agent's own units, [-1, 1] of the range, and faults act on them as the policy
+gives them, before the environment clips them: one far beyond the range hides a small change. A
+target is one actuator, a group (one leg) or all. Where a fault remembers, an episode's start fills
+its memory anew with the first command.
 """
 
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
@@ -29,7 +31,23 @@ def dofs(env: Any, name: str) -> Float[np.ndarray, "act nv"]:
     raise UserError(
       f"fault {name!r} needs a robot with one motor per joint, which {env.spec.name!r} is not"
     )
+  joint = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+  if not np.isin(model.actuator_trntype, joint).all():
+    raise UserError(
+      f"fault {name!r} needs motors that act on joints, not on tendons, sites or bodies as in "
+      f"robot {env.spec.name!r}"
+    )
   return np.eye(model.nv, dtype=np.float32)[model.jnt_dofadr[model.actuator_trnid[:, 0]]]
+
+
+def check_motors(env: Any, name: str) -> None:
+  """Raises UserError where a scaled gear would move a servo's target instead of weakening it."""
+  model = getattr(env, "mj_model", None)
+  if model is not None and (model.actuator_biastype != mujoco.mjtBias.mjBIAS_NONE).any():
+    raise UserError(
+      f"fault {name!r} needs motors that give a torque; those of robot {env.spec.name!r} are "
+      "servos, whose target a scaled gear would move"
+    )
 
 
 def gear(env: Any) -> Fault:
@@ -41,6 +59,7 @@ def gear(env: Any) -> Fault:
   Target: a joint (drawn), a leg or all. Owns `mj.actuator_gear` [ratio], (nu, 6). Not visible to: a
   robot that does not load the joint. Source: the paper's walker experiment.
   """
+  check_motors(env, "gear")
   return scaled(
     "gear", env, "mj.actuator_gear", lambda severity: 1.0 - severity, actuator_targets(env)
   )
@@ -58,6 +77,8 @@ def torque_loss(env: Any) -> Fault:
   (Nagabandi et al. 2019).
   """
   inner = "strength" in env.model.task
+  if not inner:
+    check_motors(env, "torque_loss")
   return scaled(
     "torque_loss",
     env,

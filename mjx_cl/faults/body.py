@@ -118,11 +118,16 @@ def joint_friction(env: Any) -> Fault:
   names, mask, single = actuator_targets(env)
   which = dofs(env, "joint_friction")
   model = env.mj_model
-  torque = np.abs(model.actuator_gear[:, 0] * model.actuator_ctrlrange[:, 1]).astype(np.float32)
+  gain, gear = model.actuator_gainprm[:, 0], model.actuator_gear[:, 0]
+  motor = model.actuator_biastype == mujoco.mjtBias.mjBIAS_NONE
+  told = np.where(motor, np.abs(gain) * np.abs(model.actuator_ctrlrange).max(1), 0.0)
+  limit = np.abs(model.actuator_forcerange).max(1)
+  most = np.where(model.actuator_forcelimited.astype(bool), limit, told)
+  torque = np.abs(gear * most).astype(np.float32)
   if not (torque > 0).all():
     raise UserError(
-      "fault 'joint_friction' needs motors with a greatest torque (ctrlrange), which robot "
-      f"{env.spec.name!r} does not state"
+      "fault 'joint_friction' needs motors with a greatest torque (ctrlrange of a motor, or "
+      f"forcerange), which robot {env.spec.name!r} does not state"
     )
   if env.physics.name == "mjx" and not (model.dof_frictionloss > 0).any():
     raise UserError(
@@ -141,8 +146,8 @@ def range_loss(env: Any) -> Fault:
   """A joint's range shrinks towards the angle at which the robot stands.   low' = low + 0.95
     severity (q0 - low), high alike
 
-  Severity: 1 leaves 5 % of the range [rad]. Target: a joint (drawn), a leg or all, of those that
-  have limits. Owns `mj.jnt_range`. Not visible to: a gait that does not come near the limits.
+  Severity: 1 leaves 5 % of the range [rad]. Target: a joint (drawn), a leg or all; every joint
+  needs limits. Owns `mj.jnt_range`. Not visible to: a gait that does not come near the limits.
   Source: none; fault and range are this project's own choice.
   """
   names, mask, single = actuator_targets(env)
@@ -197,14 +202,15 @@ def force_map(env: Any) -> Float[np.ndarray, "3 nv"]:
   if model is None:
     size = 0 if env.model.force is None else env.model.force.shape[0]
     return np.eye(3, size, dtype=np.float32) * np.array([[1], [1], [0]], np.float32)
-  out = np.zeros((3, model.nv), np.float32)
+  out, data = np.zeros((3, model.nv), np.float32), mujoco.MjData(model)
+  mujoco.mj_kinematics(model, data)  # at qpos0; an axis of a model is the body's own
   trunk = int(env.spec.bodies[0][1][0]) if env.spec.bodies else 1
   for j in range(model.body_jntadr[trunk], model.body_jntadr[trunk] + model.body_jntnum[trunk]):
     at = model.jnt_dofadr[j]
     if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE:
       out[:, at : at + 3] = np.eye(3)
     elif model.jnt_type[j] == mujoco.mjtJoint.mjJNT_SLIDE:
-      out[:, at] = model.jnt_axis[j]
+      out[:, at] = data.xaxis[j].round(9)  # a turn by 90 degrees is one
   return out
 
 

@@ -51,7 +51,9 @@ def friction(env: Any) -> Fault:
 def check_priority(env: Any, geoms: Iterable[int]) -> None:
   """Raises UserError where a foot's friction is masked by what it stands on."""
   model = env.mj_model
-  floor = [g for g in range(model.ngeom) if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_PLANE]
+  ground = model.body_weldid[model.geom_bodyid] == 0
+  ground &= (model.geom_contype | model.geom_conaffinity) != 0
+  floor = np.flatnonzero(ground)
   masked = [
     mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, g) or str(g)
     for g in geoms

@@ -122,6 +122,10 @@ class Checkpoints:
     """Number of the newest complete checkpoint."""
     return self._manager.latest_step()
 
+  def numbers(self) -> list[int]:
+    """Of all complete checkpoints."""
+    return sorted(self._manager.all_steps())
+
   def save(self, number: int, tree: Any, meta: dict) -> None:
     """Writes one; a kill at any moment leaves the earlier ones whole.
 

@@ -2,6 +2,7 @@
 or out of a file, path/to/file.py:Name.
 """
 
+import ast
 import collections
 import contextlib
 import difflib
@@ -16,7 +17,7 @@ import pathlib
 import sys
 import traceback
 import types
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from mjx_cl.errors import FileError, PluginError, UserError
@@ -224,12 +225,62 @@ def _file(path: pathlib.Path, changed: int) -> types.ModuleType:
   spec: Any = importlib.util.spec_from_file_location(inner, path)
   module = importlib.util.module_from_spec(spec)
   sys.modules[inner] = module  # dataclasses look their module up there
-  sys.path.append(str(path.parent))  # what lies beside it can be imported
-  try:
-    spec.loader.exec_module(module)
-  except BaseException:
-    del sys.modules[inner]
-    raise
-  finally:
-    sys.path.remove(str(path.parent))
+  with _importable(path.parent):
+    try:
+      spec.loader.exec_module(module)
+    except BaseException:
+      del sys.modules[inner]
+      raise
   return module
+
+
+_FOLDERS: set[pathlib.Path] = set()  # of files of the user
+
+
+def _beside(folder: pathlib.Path, name: str) -> pathlib.Path | None:
+  """The file of the module or package of that name in a folder; None where there is none."""
+  top = folder / name.partition(".")[0]
+  return next((f for f in (top.with_suffix(".py"), top / "__init__.py") if f.is_file()), None)
+
+
+@contextlib.contextmanager
+def _importable(folder: pathlib.Path) -> Iterator[None]:
+  """What lies in the folder can be imported, also where another file's folder has a module of that
+  name, which is put back in the end.
+  """
+  _FOLDERS.add(folder)
+  others = [f"{other}{os.sep}" for other in _FOLDERS - {folder}]
+  foreign = lambda file: not file.startswith(f"{folder}{os.sep}") and file.startswith(tuple(others))
+  aside = {
+    name: module
+    for name, module in list(sys.modules.items())
+    if foreign(str(getattr(module, "__file__", None) or "")) and _beside(folder, name)
+  }
+  for name in aside:
+    del sys.modules[name]
+  sys.path.insert(0, str(folder))
+  try:
+    yield
+  finally:
+    sys.path.remove(str(folder))
+    sys.modules.update(aside)
+
+
+def files(path: pathlib.Path) -> list[pathlib.Path]:
+  """A user's file and the modules beside it that it imports, and so on."""
+  found, new = [], [path]
+  while new:
+    found.append(here := new.pop())
+    try:
+      tree = ast.parse(here.read_bytes())
+    except (OSError, SyntaxError, ValueError):
+      continue
+    names = []
+    for node in ast.walk(tree):
+      if isinstance(node, ast.Import):
+        names += [alias.name for alias in node.names]
+      elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+        names.append(node.module)
+    more = {file for name in names if (file := _beside(path.parent, name))}
+    new += sorted(more - {*found, *new})
+  return [path, *sorted(set(found) - {path})]

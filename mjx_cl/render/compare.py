@@ -91,9 +91,15 @@ def live(
 
 
 def page(
-  panes: Sequence[Pane], images: Sequence[np.ndarray], shares: Sequence[float], time_s: float
+  panes: Sequence[Pane],
+  images: Sequence[np.ndarray],
+  shares: Sequence[float],
+  time_s: float,
+  whole: bool = True,
 ) -> np.ndarray:
-  """One picture of the film, uint8 (height, width, 3)."""
+  """One picture of the film, uint8 (height, width, 3); `shares` of the first robot's reward, or
+  without a `whole` the rewards themselves.
+  """
   font = ImageFont.load_default
   height, width = images[0].shape[:2]
   foot = TOP + height + 8
@@ -108,14 +114,17 @@ def page(
     draw.text((x + 2, 26), pane.words, fill=INK, font=fits(pane.words, 14))
     image.paste(Image.fromarray(images[k]), (x, TOP))
     draw.rectangle((x, TOP, x + width - 1, TOP + height - 1), outline=colour, width=3)
-    draw.text((x + 2, foot), f"{100 * shares[k]:.0f} %", fill=colour, font=font(22))
-    draw.rectangle((x + 70, foot + 6, x + 70 + room, foot + 20), fill=TRACK)
-    filled = round(room * min(1.0, max(0.0, shares[k])))
-    draw.rectangle((x + 70, foot + 6, x + 70 + filled, foot + 20), fill=colour)
+    said = f"{100 * shares[k]:.0f} %" if whole else f"{shares[k]:.3g}"
+    draw.text((x + 2, foot), said, fill=colour, font=font(22))
+    if whole:
+      draw.rectangle((x + 70, foot + 6, x + 70 + room, foot + 20), fill=TRACK)
+      filled = round(room * min(1.0, max(0.0, shares[k])))
+      draw.rectangle((x + 70, foot + 6, x + 70 + filled, foot + 20), fill=colour)
   clock, size = f"{time_s:.1f} s", font(13)
   right = image.width - 2 - draw.textlength(clock, size)
   draw.text((right, foot + 27), clock, fill=FAINT, font=size)
-  text = "reward of the last second, in % of the first robot's mean"
+  text = f"reward {'of' if whole else 'a decision, mean of'} the last second"
+  text += ", in % of the first robot's mean" * whole
   draw.text((2, foot + 27), text, fill=FAINT, font=fits(text, 13, right - 12))
   return np.asarray(image)
 
@@ -176,13 +185,14 @@ def film(
         paint = functools.partial(tint, model, parts) if model else lambda acts: None
         lately = max(1, round(1.0 / paces[0]))
         lives.append(live(pane, shown, before, every, lately, scene, paint, **acting))
-    whole = lives[0][2] or 1.0
+    whole = lives[0][2]  # of a reward below 0 there are no shares
     pages = (
       page(
         panes,
         [images[i] for images, _, _ in lives],
-        [means[i] / whole for _, means, _ in lives],
+        [means[i] / (whole if whole > 0 else 1.0) for _, means, _ in lives],
         i * every * paces[0],
+        whole > 0,
       )
       for i in range(len(lives[0][0]))
     )

@@ -140,9 +140,11 @@ def _spans(axis: Axes, events: dict, streams: list[int], steps: int, color: str)
   rows = {g: k for k, g in enumerate(streams)}
   marks: dict[str, list[tuple[int, int]]] = {"alarm": [], "stop": [], "abort": [], "end": []}
   begun: dict[int, int] = {}
-  for step, kind, g in sorted(zip(events["step"], events["kind"], events["stream"])):
+  told = zip(*(events[k] for k in ("step", "kind", "stream", "decision")))
+  for step, kind, g, decision in sorted(told, key=lambda x: x[:3]):
     if g not in rows:
       continue
+    kind = "end" if decision == "end" else kind
     if kind == "start":
       begun[g] = step
     elif kind in ("stop", "abort", "end") and g in begun:

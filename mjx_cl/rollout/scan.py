@@ -309,7 +309,9 @@ class Rollout:
       over = out.terminated | out.truncated
       later, new, severity = control(streams, action)
       rest = lambda old, new: jax.tree.map(lambda a, b: jnp.where(expand(over, b), a, b), old, new)
-      streams, out = rest(streams, later)._replace(t=later.t), rest(out, new)
+      walk, resting = later.injection.walk, rest(streams, later)
+      injection = resting.injection._replace(walk=walk)  # which knows of no episodes
+      streams, out = resting._replace(t=later.t, injection=injection), rest(out, new)
       rewards.append(jnp.where(over, 0.0, new.reward))
       severities.append(severity)
     return streams, out, rewards, severities

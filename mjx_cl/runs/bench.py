@@ -119,14 +119,18 @@ def _take(folder: pathlib.Path, config: RunConfig, sources: list[pathlib.Path]) 
   """A part's folder, of finished runs that have its seeds."""
   tmp = folder.with_name(folder.name + ".tmp")
   shutil.rmtree(tmp, ignore_errors=True)
-  tmp.mkdir(parents=True)
-  if len(sources) == 1:
-    for name in MERGED:
-      if (sources[0] / name).exists():
-        shutil.copyfile(sources[0] / name, tmp / name)
-    merge.copy_agents(sources[0], tmp)
-  else:
-    merge.join(sources, tmp, config)
+  try:
+    tmp.mkdir(parents=True)
+    if len(sources) == 1:
+      for name in MERGED:
+        if (sources[0] / name).exists():
+          shutil.copyfile(sources[0] / name, tmp / name)
+      merge.copy_agents(sources[0], tmp)
+    else:
+      merge.join(sources, tmp, config)
+  except BaseException:
+    shutil.rmtree(tmp, ignore_errors=True)
+    raise
   shutil.rmtree(folder, ignore_errors=True)
   os.replace(tmp, folder)
 
@@ -230,7 +234,7 @@ def execute(
       run.execute(
         part.config,
         folder,
-        resume=(folder / "config.json").exists(),
+        resume=folder.exists(),
         progress=progress,
         save_every_s=save_every_s,
         programs=programs,

@@ -155,7 +155,9 @@ def run_part(
     return told
   folder = out / name
   paths = [path for path in sorted(folder.rglob("*")) if path.is_file() and not path.is_symlink()]
-  return told._replace(files={str(p.relative_to(folder)): p.read_bytes() for p in paths})
+  files = {str(p.relative_to(folder)): p.read_bytes() for p in paths}
+  shutil.rmtree(folder, ignore_errors=True)  # they are the driver's from here on
+  return told._replace(files=files)
 
 
 def _process(

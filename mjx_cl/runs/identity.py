@@ -96,7 +96,7 @@ def identity(config: RunConfig) -> dict:
   """What makes a run what it is, as config.json holds it: its settings, `changes`, what a preset's
   name stood for when it began, the `threshold` that its detector takes from the board,
   `oracle_stops` that its arms are told, the SHA-256 of the `files` that robot, fault, detector or
-  arm stand in, and the version of the `benchmark`.
+  arm stand in, with the modules beside them that they import, and the version of the `benchmark`.
   """
   config = check(config)  # one that was built by hand may lack what follows from the others
   found, told = threshold_of(config), stop_rule.told(config)
@@ -110,7 +110,7 @@ def identity(config: RunConfig) -> dict:
     )
   }
   files = {
-    name: hashlib.sha256(path.read_bytes()).hexdigest()
+    name: hashlib.sha256(b"".join(p.read_bytes() for p in plugins.files(path))).hexdigest()
     for name, path in sources.items()
     if path is not None and path.is_file()
   }

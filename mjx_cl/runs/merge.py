@@ -25,6 +25,7 @@ from mjx_cl.errors import FileError, UserError, require
 from mjx_cl.io import arrays
 from mjx_cl.io import folders as folder_lib
 from mjx_cl.io import tables as store
+from mjx_cl.physics import PURE_JAX
 from mjx_cl.render import figures
 from mjx_cl.runs import summary
 from mjx_cl.runs.identity import arm_agents, departure, differing, identity
@@ -83,6 +84,10 @@ def differs(folder: pathlib.Path | str, config: RunConfig, but: tuple[str, ...] 
     own = _seeds(folder, old)
     values["oracle_stops"] = {k: v for k, v in values["oracle_stops"].items() if int(k) in own}
   changed = differing(old, values)
+  # as the folder holds it, of one robot or of two; pure JAX is the same by any
+  lived = {*str(old.get("physics") or "").split("+")} - {PURE_JAX.name, ""}
+  if config.physics != "auto" and lived and config.physics not in lived:
+    changed.append("physics")
   for name, today in cards(config).items():
     if name in old and (keys := folder_lib.differing(today, old[name], deep=True)):
       changed.append(f"{name} ({', '.join(keys)})")

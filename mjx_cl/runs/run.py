@@ -109,7 +109,7 @@ def _begun(
     raise
   out = pathlib.Path(out)  # not before: it would make the current folder of an empty name
   if state == "done":
-    # `auto` physics is resolved there
+    # physics is resolved there, see `differs`
     check_same(out, {k: v for k, v in identity(config).items() if k != "physics"})
     text = merge.differs(out, config)  # its agents' cards
     require(not text, f"--resume: {out} {text}; --overwrite begins anew")

@@ -393,8 +393,10 @@ class Runner:
     }
     self.checkpoints.save(number, tree, meta)
     runtime.give_back()
-    for old in sorted(self.work.glob("trace-*.npz"))[:-2]:
-      old.unlink()
+    kept = {f"trace-{n:06d}.npz" for n in self.checkpoints.numbers()}
+    for old in self.work.glob("trace-*.npz"):  # a save that failed leaves one without a checkpoint
+      if old.name not in kept:
+        old.unlink()
 
   def trace(self) -> dict[str, np.ndarray]:
     """Everything that has been logged, (control steps, groups) or (chunks, groups)."""

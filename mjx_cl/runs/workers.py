@@ -99,7 +99,7 @@ class Worker:
 
     def wait() -> None:
       for line in self.process.stdout:
-        if line.strip() == f"finished {self.name}":
+        if line.rstrip("\r\n") == f"finished {self.name}":
           self._over.set()
 
     self.listeners = [threading.Thread(target=own, daemon=True) for own in (listen, wait)]

@@ -187,18 +187,19 @@ def export(trainer: Trainer, count: int = 20) -> dict[str, Any]:
   """
   sound = sorted(set(range(trainer.seeds)) - set(trainer.failed))
   about = _told(trainer)
-  cards = []
+  cards: list[dict[str, Any]] = []
+  first: Any = None
   for g in sound:
     train = jax.tree.map(lambda x: jax.device_put(x[g], jax.devices()[0]), trainer.state.train)
     scores = evaluate.evaluate(
       trainer.env, trainer.plain, train.params, count, 0, trainer.config.repeat
     )
     cards.append(about | {"eval": {"first_seed": 0, **scores}, **runtime.provenance()})
-    if g == sound[0]:
-      agents.save(trainer.out / "agent", train, cards[0])
+    first = train if g == sound[0] else first
     if trainer.seeds > 1:
       own = cards[-1] | {"group": g}
       agents.save(trainer.out / f"seed-{about['seed'] + g}" / "agent", train, own)
+  agents.save(trainer.out / "agent", first, cards[0])  # the last, since it says that all is done
   return cards[0]
 
 

@@ -56,9 +56,8 @@ class BraxEnv(base.Env):
     renewed, _ = faults.sense(
       rollout.fault, stream.injection, stream.t, now, rollout.model, state.obs, True
     )
-    injection = jax.tree.map(
-      lambda new, old: jnp.where(first, new, old), renewed, stream.injection
-    )  # brax's autoreset renews no memory
+    anew = first & (stream.t > 0)  # the first episode's is new; brax's autoreset renews none
+    injection = jax.tree.map(lambda new, old: jnp.where(anew, new, old), renewed, stream.injection)
     stream, out, severity = rollout._control(stream._replace(injection=injection), action)
     return stream.env, out, state.info | _info(stream, worst(severity))
 
