@@ -683,6 +683,19 @@ def test_a_file_imports_what_lies_beside_it(tmp_path):
   assert sys.path == before
 
 
+def test_files_of_two_folders_have_helpers_of_one_name(tmp_path):
+  """Each its own, at once and when one is loaded anew; what is imported belongs to the identity."""
+  for name, level in (("a", 1), ("b", 2)):
+    (tmp_path / name).mkdir()
+    (tmp_path / name / "common.py").write_text(f"import deeper\nLEVEL = {level}\n")
+    (tmp_path / name / "deeper.py").write_text("")
+    (tmp_path / name / "own.py").write_text("import common\ndef level(): return common.LEVEL\n")
+  find = lambda name: plugins.find(f"{tmp_path}/{name}/own.py:level", "detector")
+  assert [find("a")(), find("b")(), find("a")()] == [1, 2, 1]
+  names = [path.name for path in plugins.files(tmp_path / "a" / "own.py")]
+  assert names == ["own.py", "common.py", "deeper.py"]
+
+
 def test_a_fault_that_fails_its_certificate_fails_the_command(tmp_path, capsys):
   (tmp_path / "noop.py").write_text(
     "from mjx_cl.faults.base import fault\n"

@@ -13,7 +13,8 @@ import types
 import mujoco
 import numpy as np
 import pytest
-from PIL import Image, ImageSequence
+from matplotlib.figure import Figure
+from PIL import Image, ImageColor, ImageSequence
 from test_cli import mjx, refused  # noqa: F401  fixtures
 
 from mjx_cl import envs
@@ -21,7 +22,7 @@ from mjx_cl.cli import app, robots
 from mjx_cl.envs import adapters
 from mjx_cl.envs.course import Course
 from mjx_cl.errors import FileError, UserError
-from mjx_cl.render import compare, files, offscreen, outlines
+from mjx_cl.render import compare, figures, files, offscreen, outlines
 from mjx_cl.render import pictures as render
 from mjx_cl.render import scene as scenes
 from mjx_cl.types import EnvState
@@ -418,6 +419,32 @@ def test_robots_side_by_side_are_those_that_act_alone(short_walker, tmp_path, mo
   plain = lambda x: np.where((x[..., 0] - x[..., 1] > 40)[..., None], 0, x)
   apart = np.abs(plain(bodies[0]) - plain(bodies[1])).sum((1, 2, 3))
   assert apart[-1] > 3 * apart[0]
+
+
+def test_rewards_below_0_are_no_shares(short_walker):
+  """Twice the loss is no bar that is full: the page shows rewards, and no bar."""
+  two = panes(short_walker)
+  images = [np.zeros((HEIGHT, 160, 3), np.uint8)] * 2
+  foot = slice(compare.TOP + HEIGHT + 14, compare.TOP + HEIGHT + 28)
+  track = lambda page: (page[foot] == ImageColor.getrgb(compare.TRACK)).all(-1).any()
+  assert not track(compare.page(two, images, [-0.5, -1.0], 1.0, whole=False))
+  assert track(compare.page(two, images, [1.0, 0.3], 1.0))
+
+
+@pytest.mark.parametrize(
+  "kind, decision, said",
+  (
+    ("stop", "stop", "converged"),
+    ("stop", "end", "time over"),
+    ("abort", "abort_budget", "given up"),
+  ),
+)
+def test_a_figure_says_how_learning_ended(kind, decision, said):
+  """What ends by its budget has not converged."""
+  axis = Figure().subplots()
+  events = {"step": [100, 500], "kind": ["start", kind], "stream": [0, 0]}
+  figures._spans(axis, events | {"decision": ["start", decision]}, [0], 1000, "k")
+  assert [text.get_text() for text in axis.get_legend().get_texts()] == [said]
 
 
 def test_which_parts_an_actuator_moves(short_walker):
