@@ -703,7 +703,7 @@ def test_old_and_new_weights_act_by_turns(same):
       acted=acting,
       learner={"w": held + 1.0},
     )
-    acting, _, memory, (back, earned, earns) = loop_lib._act(own, which, memory, view)
+    acting, _, memory, (back, earned, earns) = loop_lib._act(own, which, memory, view, weights(7.0))
     for g in range(groups):
       if c and (not learnt or age[g] % guarded.TURN >= guarded.SKIP):
         heard[int(learnt and not bool(guard_acts[g]))][g].append(reward[g])
