@@ -245,7 +245,7 @@ def test_a_setting_that_a_suite_varies_is_compared_over_its_parts(tmp_path, mjx)
   "argv, code, words",
   [
     ((), 2, ()),
-    (("{a}", "{nothing}"), 1, ("nothing", "no finished run")),
+    (("{a}", "{nothing}"), 2, ("nothing", "no finished run")),
     (("{a}:rollbcak", "{a}"), 2, ("rollbcak", "detector, none")),
     (("{one}",), 2, ("one arm",)),
     (("{a}", "{car}"), 2, ("different robots", "car, walker")),
