@@ -584,7 +584,7 @@ def test_settings_without_a_detector_are_refused(refused, small, tmp_path):  # n
     2, "leaderboard", folder, "--channel", "nope"
   )
   said = refused(2, "leaderboard", "--add", "x.py:X", "--channel", "variable_0")
-  assert "unknown channel 'variable_0'; choose from: opr, rpr" in said
+  assert "unknown channel 'variable_0'; choose from: group_0, group_1" in said
   assert "--log belongs to a detector of one's own; give --add" in refused(
     2, "leaderboard", folder, "--log"
   )
