@@ -136,8 +136,8 @@ def test_physics_that_is_asked_for_is_no_other(tmp_path):
   said = []
   assert not bench.offers(tmp_path, [asked("mjx")], [PAPER], said.append)
   assert len(said) == 1 and "physics" in said[0]
-  car = suite.resolved(plan["car-transfer"])  # of pure JAX, and C MuJoCo after the move
-  asked = lambda physics: suite.Part("car-transfer", dataclasses.replace(car, physics=physics))
+  car = suite.resolved(plan["car"])  # of pure JAX, and C MuJoCo after the move
+  asked = lambda physics: suite.Part("car", dataclasses.replace(car, physics=physics))
   assert suite.finished(PAPER, asked("native"))
   with pytest.raises(Exception, match="physics"):
     suite.finished(PAPER, asked("mjx"))
