@@ -337,8 +337,12 @@ def leaderboard(results: pathlib.Path) -> str:
       {joined([f"{number(asked[r], 1)} ({r})" for r in robots])} false alarms an hour; they rest on {alarms} alarms for most detectors{", so the rates are orders of magnitude" if alarms < 50 else ""},
       and the table holds what the scoring seeds gave. Score: 0 for never alarming, 100 for alarming at the onset and at no other time; mean over all faults of all robots,
       intervals over seeds; *costly faults*: over the {overall[0]["blocks_costly"]} settings that take a tenth of the reward or more from a robot that does not adapt. Best on each robot: {best(rows)}. {lead(rows, overall)} Mean ranks closer than {number(meta["critical_difference"], 1)} are not
-      told apart (seeds drawn anew, at least Nemenyi's difference; oracles and dummies take no rank). {number(meta["stream_steps"] / 1e6, 1)} million stream-steps in {number(minutes, 1)} minutes on
-      {meta["machine"]["cores"]} core{"s" if meta["machine"]["cores"] > 1 else ""} (goal 4 minutes{", missed" if minutes > 4 else ""}). The page, sortable, one view per fault:
+      told apart (seeds drawn anew, at least Nemenyi's difference; oracles and dummies take no
+      rank). {number(meta["stream_steps"] / 1e6, 1)} million stream-steps in
+      {number(minutes, 1)} minutes on {meta["machine"]["cores"]}
+      core{"s" if meta["machine"]["cores"] > 1 else ""}
+      (goal 4 minutes{", missed" if minutes > 4 else ""}).
+      The page, sortable, one view per fault:
       [results/leaderboard.html](results/leaderboard.html).""")
   score = {r["detector"]: r["cost_standard"] for r in overall}
   plain = lambda name: (

@@ -46,7 +46,7 @@ def do_methods(args: Leaderboard) -> None:
   require(published or own, "no lives ship; give a folder of `mjx-cl bench methods`")
   lives = methods.chosen(methods.joined(published, own, args.name), robots)
   methods.whole(lives)
-  lives, single = methods.paired(lives)
+  lives, single = methods.counted(lives)
   if single:
     say(f"note: {single} lives do not count, since arm `none` was not lived with their seeds")
   board = adaptation.board(lives)

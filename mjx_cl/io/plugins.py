@@ -2,7 +2,6 @@
 or out of a file, path/to/file.py:Name.
 """
 
-import ast
 import collections
 import contextlib
 import difflib
@@ -12,6 +11,7 @@ import importlib
 import importlib.metadata
 import importlib.util
 import io
+import modulefinder
 import os
 import pathlib
 import sys
@@ -268,19 +268,8 @@ def _importable(folder: pathlib.Path) -> Iterator[None]:
 
 def files(path: pathlib.Path) -> list[pathlib.Path]:
   """A user's file and the modules beside it that it imports, and so on."""
-  found, new = [], [path]
-  while new:
-    found.append(here := new.pop())
-    try:
-      tree = ast.parse(here.read_bytes())
-    except (OSError, SyntaxError, ValueError):
-      continue
-    names = []
-    for node in ast.walk(tree):
-      if isinstance(node, ast.Import):
-        names += [alias.name for alias in node.names]
-      elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
-        names.append(node.module)
-    more = {file for name in names if (file := _beside(path.parent, name))}
-    new += sorted(more - {*found, *new})
-  return [path, *sorted(set(found) - {path})]
+  finder = modulefinder.ModuleFinder([str(path.parent)])
+  with contextlib.suppress(OSError, SyntaxError, ValueError):  # whoever loads it says what is wrong
+    finder.run_script(str(path))
+  own = (getattr(module, "__file__", None) for module in finder.modules.values())
+  return [path, *sorted({pathlib.Path(file) for file in own if file} - {path})]

@@ -247,7 +247,7 @@ def write_lives(lives: list[dict], path: pathlib.Path | str) -> None:
   tables.write_table(path, {k: [life[k] for life in lives] for k in lives[0]})
 
 
-def paired(lives: list[dict]) -> tuple[list[dict], int]:
+def counted(lives: list[dict]) -> tuple[list[dict], int]:
   """The lives of which arm `none` has the agent and seed, and how many others there are."""
   unit = lambda x: (x["robot"], x["setting"], x["agent"], x["seed"])
   none = {unit(x) for x in lives if x["method"] == adaptation.NOTHING}

@@ -79,8 +79,7 @@ def called_clock(label: str) -> bool:
   return not CLOCKS.isdisjoint(words) or words[:1] == ["t"] and UNITS.keys() >= set(words[1:])
 
 
-# last words of a name of the whole seconds of a split clock, and of their fraction -> its unit
-WHOLE = SECONDS
+# last words of a name of a split clock's fraction of a second -> its unit
 FRACTIONS = {word: 1e-9 for word in ("nanosec", "nanosecs", "nsec", "nsecs", "nanoseconds", "ns")}
 FRACTIONS |= {word: 1e-6 for word in ("usec", "usecs", "microseconds", "us")}
 
@@ -92,7 +91,7 @@ def split(columns: Mapping[str, np.ndarray]) -> dict[tuple[str, str], np.ndarray
   ends = {tuple(words): name for name in columns if (words := _words(name))}
   found = {}
   for (*rest, last), name in ends.items():
-    if last not in WHOLE:
+    if last not in SECONDS:
       continue
     for word, size in FRACTIONS.items():
       other = ends.get((*rest, word))
@@ -139,7 +138,7 @@ def guessed(x: np.ndarray) -> tuple[str, float] | None:
 EPOCHS = {1e17: 1e-9, 1e14: 1e-6, 1e11: 1e-3, 1e8: 1.0}
 GAP = 1.5  # typical intervals above which there is a gap
 RARE = 0.1  # share of the intervals that may be wide in an even clock whose gaps are of any length
-WHOLLY = 0.2, 0.9  # how near to a whole number of intervals a gap is, and the share that must be
+NEAR, MOSTLY = 0.2, 0.9  # to a whole number of intervals; share of the gaps that must be so near
 
 
 def iso_seconds(cells: Sequence[str]) -> np.ndarray | None:
@@ -181,8 +180,7 @@ def gaps(seconds: np.ndarray) -> np.ndarray:
   wide = steps > GAP * max(usual, 1e-12)
   if usual > 0 and wide.mean() >= RARE:
     lengths = steps[wide] / usual
-    near, share = WHOLLY
-    wide &= bool((abs(lengths - np.rint(lengths)) < near).mean() >= share)
+    wide &= bool((abs(lengths - np.rint(lengths)) < NEAR).mean() >= MOSTLY)
   return wide & (usual > 0)
 
 

@@ -95,10 +95,10 @@ def page(
   images: Sequence[np.ndarray],
   shares: Sequence[float],
   time_s: float,
-  whole: bool = True,
+  in_percent: bool = True,
 ) -> np.ndarray:
   """One picture of the film, uint8 (height, width, 3); `shares` of the first robot's reward, or
-  without a `whole` the rewards themselves.
+  unless `in_percent` the rewards themselves.
   """
   font = ImageFont.load_default
   height, width = images[0].shape[:2]
@@ -114,17 +114,17 @@ def page(
     draw.text((x + 2, 26), pane.words, fill=INK, font=fits(pane.words, 14))
     image.paste(Image.fromarray(images[k]), (x, TOP))
     draw.rectangle((x, TOP, x + width - 1, TOP + height - 1), outline=colour, width=3)
-    said = f"{100 * shares[k]:.0f} %" if whole else f"{shares[k]:.3g}"
+    said = f"{100 * shares[k]:.0f} %" if in_percent else f"{shares[k]:.3g}"
     draw.text((x + 2, foot), said, fill=colour, font=font(22))
-    if whole:
+    if in_percent:
       draw.rectangle((x + 70, foot + 6, x + 70 + room, foot + 20), fill=TRACK)
       filled = round(room * min(1.0, max(0.0, shares[k])))
       draw.rectangle((x + 70, foot + 6, x + 70 + filled, foot + 20), fill=colour)
   clock, size = f"{time_s:.1f} s", font(13)
   right = image.width - 2 - draw.textlength(clock, size)
   draw.text((right, foot + 27), clock, fill=FAINT, font=size)
-  text = f"reward {'of' if whole else 'a decision, mean of'} the last second"
-  text += ", in % of the first robot's mean" * whole
+  text = f"reward {'of' if in_percent else 'a decision, mean of'} the last second"
+  text += ", in % of the first robot's mean" * in_percent
   draw.text((2, foot + 27), text, fill=FAINT, font=fits(text, 13, right - 12))
   return np.asarray(image)
 

@@ -444,8 +444,8 @@ def _gain(name: str, robots: dict, held: dict, drawn: dict[str, _Draws]) -> dict
     scores, settings, pairs = [], [], []
     for row in of:
       own = held[robot, row["setting"]]
-      both = [u for u, pair in own[name].items() if pair.known and u in own.get(PAPER, {})]
-      both = [u for u in both if own[PAPER][u].known]
+      known = [{u for u, pair in own.get(m, {}).items() if pair.known} for m in (name, PAPER)]
+      both = set.intersection(*known)
       two: list[Any] = [
         of_setting({u: own[m][u] for u in both})["score"] if both else None for m in (name, PAPER)
       ]

@@ -307,9 +307,11 @@ def test_a_method_waits_for_the_first_adaptation(same):
 def test_a_quiet_robot_of_new_weights_has_their_deviations():
   """A second adaptation that begins with weights drawn anew, and one that does not."""
   own, new = (jax.jit(AGENT.init)(jax.random.key(k)).params for k in range(2))
+  raised = lambda tree, level: jax.tree.map(lambda x: x + level, tree)
   std = lambda params, level: {
-    **params, "pol": {**params["pol"], "std": jax.tree.map(lambda x: x + level, params["pol"]["std"])}
-  }  # fmt: skip
+    **params,
+    "pol": {**params["pol"], "std": raised(params["pol"]["std"], level)},
+  }
   own, new = std(own, 1.0), std(new, 2.0)
   none, memory = jnp.float32(jnp.nan), quiet.Quiet((), own, jnp.bool_(True))
   after = lambda acted: quiet.METHOD.act(

@@ -1,4 +1,4 @@
-"""Faults on robots of one's own whose motors, floors and joints are others than the shipped ones'."""
+"""Faults on robots of one's own, whose motors, floors and joints are unlike the shipped ones'."""
 
 import jax
 import jax.numpy as jnp

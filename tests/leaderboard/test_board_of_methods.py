@@ -133,7 +133,7 @@ def test_what_is_published_stays_and_new_seeds_bring_their_own_none():
   assert len(both) == len(lives) + 4 and sum(x["return_lost"] == 0.0 for x in both) == 4
   rows = {r["setting"]: r for r in adaptation.board(both).rows if r["method"] == "none"}
   assert {r["streams"] for r in rows.values()} == {7}
-  kept, single = methods.paired([x | {"seed": 400} for x in lives if x["method"] != "none"] + both)
+  kept, single = methods.counted([x | {"seed": 400} for x in lives if x["method"] != "none"] + both)
   assert len(kept) == len(both) and single == len(lives) - 12
 
 

@@ -427,7 +427,7 @@ def test_rewards_below_0_are_no_shares(short_walker):
   images = [np.zeros((HEIGHT, 160, 3), np.uint8)] * 2
   foot = slice(compare.TOP + HEIGHT + 14, compare.TOP + HEIGHT + 28)
   track = lambda page: (page[foot] == ImageColor.getrgb(compare.TRACK)).all(-1).any()
-  assert not track(compare.page(two, images, [-0.5, -1.0], 1.0, whole=False))
+  assert not track(compare.page(two, images, [-0.5, -1.0], 1.0, in_percent=False))
   assert track(compare.page(two, images, [1.0, 0.3], 1.0))
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mjx_cl.config import RunConfig
-from mjx_cl.errors import FileError
+from mjx_cl.errors import FileError, UserError
 from mjx_cl.io import checkpoints, folders, tables
 from mjx_cl.runs import bench, packing, run, runner, suite
 from mjx_cl.training import files
@@ -131,7 +131,7 @@ def test_physics_that_is_asked_for_is_no_other(tmp_path):
   native = suite.resolved(plan["walker"])
   asked = lambda physics: suite.Part("walker", dataclasses.replace(native, physics=physics))
   assert suite.finished(PAPER, asked("auto")) and suite.finished(PAPER, asked("native"))
-  with pytest.raises(Exception, match="physics"):
+  with pytest.raises(UserError, match="physics"):
     suite.finished(PAPER, asked("mjx"))
   said = []
   assert not bench.offers(tmp_path, [asked("mjx")], [PAPER], said.append)
@@ -139,7 +139,7 @@ def test_physics_that_is_asked_for_is_no_other(tmp_path):
   car = suite.resolved(plan["car"])  # of pure JAX, and C MuJoCo after the move
   asked = lambda physics: suite.Part("car", dataclasses.replace(car, physics=physics))
   assert suite.finished(PAPER, asked("native"))
-  with pytest.raises(Exception, match="physics"):
+  with pytest.raises(UserError, match="physics"):
     suite.finished(PAPER, asked("mjx"))
 
 
