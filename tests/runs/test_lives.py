@@ -28,7 +28,7 @@ ADAPT = AdaptConfig(
   batch=4,
   patience=4,
   period=200,
-  period_steps=60,
+  period_steps=130,
   random_steps=60,
   refit=60,
 )

@@ -637,6 +637,7 @@ def test_figure_of_a_run_in_which_little_happened(tmp_path, starts):
   events = {
     "step": [40] + starts + [80],
     "kind": ["onset"] + ["start"] * len(starts) + ["abort" if starts else "alarm"],
+    "decision": [None] + ["start"] * len(starts) + ["abort_budget" if starts else None],
     "arm": ["detector"] * (2 + len(starts)),
     "stream": [0] * (2 + len(starts)),
   }
