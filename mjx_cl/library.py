@@ -111,7 +111,7 @@ def score(
       have update(x) -> bool; the latter runs as it is, at a rate of false alarms of its own.
     robots: of the set, or one; all where empty.
     streams: folder of `mjx-cl record`; None: the set that ships.
-    channel: what a class watches.
+    channel: what a class watches; of a name NAME@CHANNEL says it.
 
   Returns:
     Rows of the leaderboard, one for each robot, fault and severity.
@@ -122,6 +122,7 @@ def score(
   held = StreamSet(streams)
   chosen = held.choose((robots,) if isinstance(robots, str) else tuple(robots))
   if isinstance(detector, str):
+    require(channel == "opr", f"channel is of a class; a name takes its own: {detector}@{channel}")
     entries, _ = board.able(board.chosen((detector,), chosen[0]), held, chosen, (detector,))
     extra = []
   elif callable(detector):
@@ -130,5 +131,5 @@ def score(
     entries, extra = [], [(name, submissions.from_host(host, None))]
   else:
     raise UserError(f"detector is a name or a class with update(x); got {type(detector).__name__}")
-  rows = board.score(held, entries, chosen, extra).rows
-  return [row for row in rows if not row["reference"]] or list(rows)
+  asked = {entry.name for entry in entries} | {name for name, _ in extra}
+  return [r for r in board.score(held, entries, chosen, extra).rows if r["detector"] in asked]

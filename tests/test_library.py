@@ -75,6 +75,10 @@ def test_a_score_is_a_row_for_each_fault_and_severity():
   for robots in (("cart",), "cart"):
     with pytest.raises(UserError, match="no robot 'cart'; choose from: walker, car"):
       mjx_cl.score("cusum", robots=robots)
+  chance = mjx_cl.score("random", robots="car")  # a reference that is asked for, and no other
+  assert {row["detector"] for row in chance} == {"random"} and len(chance) == len(own)
+  with pytest.raises(UserError, match="cusum@rpr"):
+    mjx_cl.score("cusum", channel="rpr")
   with pytest.raises(UserError, match="unknown detector 'cusun'"):
     mjx_cl.score("cusun")
   with pytest.raises(UserError, match="a name or a class with update"):

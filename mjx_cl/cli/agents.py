@@ -37,10 +37,10 @@ def do_train(args: Train) -> None:
   dreamer, config = chosen(args)
   env = envs.make(args.env, args.physics)
   # whatever can be refused is refused before an earlier training is touched
-  if args.demonstrator not in (None, "ppo"):
-    premises.expert(env, args.demonstrator)
+  shown = files.shown(config, args.out, args.demonstrator)
+  if shown.demonstrator and args.demonstrator != "ppo":
+    premises.expert(env, shown.demonstrator)
   premises.faults_of(env, config)
-  files.shown(config, args.out, args.demonstrator)
   premises.check(env, dreamer, config, args.agent)
   if on:
     cards = trainings.spread(args, env, dreamer, config, command_line("train"), on)
@@ -69,8 +69,9 @@ def trained(
     )
     say(f"{args.out}: this training is finished")
     return None
+  trainer.fits(env, premises.scaled(env, dreamer), config, args.seeds)
   if state == "new" and args.overwrite:
-    clear(args)
+    clear(args, config)
   training = files.build(
     env,
     dreamer,
@@ -123,7 +124,7 @@ def chosen(args: Train) -> tuple[DreamerConfig, TrainConfig]:
   return dreamer, config
 
 
-def clear(args: Train) -> None:
+def clear(args: Train, config: TrainConfig) -> None:
   """Removes an earlier training in --out.
 
   Raises:
@@ -131,7 +132,10 @@ def clear(args: Train) -> None:
   """
   out = pathlib.Path(args.out)
   own = [out / name for name in ("agent", "agents", "demonstrator", "checkpoints", "work")]
-  for name, given in (("agent", args.agent), ("demonstrator", args.demonstrator)):
+  for name, given in (
+    ("agent", args.agent),
+    ("demonstrator", args.demonstrator or config.demonstrator),
+  ):
     require(
       not given or not any(pathlib.Path(given).resolve().is_relative_to(x.resolve()) for x in own),
       f"--overwrite removes --{name} {given} with {out}; give another --out",

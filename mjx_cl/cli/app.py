@@ -121,7 +121,8 @@ def check_lists(command: Any, argv: list[str]) -> None:
   """Refuses a flag of several values that is given twice, of which the last alone would count, or
   without any, as with a shell's variable that is not set.
   """
-  several = {f.name for f in dataclasses.fields(command) if isinstance(f.default, tuple)}
+  several = {"set", "compare"}  # of every command that has them; the others by their default
+  several |= {f.name for f in dataclasses.fields(command) if isinstance(f.default, tuple)}
   seen: set[str] = set()
   for k, word in enumerate(argv):
     flag, given, _ = word.partition("=")

@@ -422,7 +422,7 @@ class Detect:
       or less is refused.
     out: Folder for the results; default: only the table.
     overwrite: Replace an earlier detection in --out.
-    fail_on_change: Exit with code 3 where the log has changed.
+    fail_on_change: Exit with code 3 where the log has changed, or a column ends without samples.
   """
 
   file: Positional[str]

@@ -22,7 +22,7 @@ GROUPS = ("mjx_cl.envs", "mjx_cl.faults", "mjx_cl.detectors", "mjx_cl.methods") 
 ABOUT = {
   "envs": " (or brax:NAME, playground:NAME, FILE.py:NAME of your own, docs/extending.md)",
   "arms": " (or FILE.py:NAME of your own, docs/extending.md)",
-  "suites": " (of recorded streams, for leaderboard and record)",
+  "suites": " (of recorded streams, for record)",
   "benches": " (suites of runs, for bench)",
 }
 

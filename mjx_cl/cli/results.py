@@ -6,6 +6,7 @@ import decimal
 import importlib
 import itertools
 import math
+import os
 import pathlib
 import sys
 import types
@@ -34,7 +35,7 @@ def do_plot(args: Plot) -> None:
 def do_query(args: Query) -> None:
   """Answers SQL, or names the views."""
   folder, sql = list(args.words[:-1]), args.words[-1] if args.words else None
-  if sql is not None and not folder and pathlib.Path(sql).is_dir():
+  if sql is not None and not folder and os.path.isdir(sql):
     folder, sql = [sql], None
   require(
     len(folder) <= 1, f"query takes [FOLDER] [SQL], the SQL in quotes; got {len(args.words)} words"

@@ -76,10 +76,11 @@ def multichart(
   if len(set(names)) < len(names):
     raise UserError(f"detector 'multichart': a chart is named twice in {charts!r}")
 
-  def chart(name: str) -> Detector:
+  def chart(name: str) -> list[Detector]:
+    """Each part that starts afresh by itself."""
     settings, unit = dict(known[name]["settings"]), known[name]["threshold"]
     use = settings.pop("use")
     built = make(use, threshold=threshold * unit, robot=robot, agent=agent, **settings)
-    return in_units(built, unit, threshold)
+    return [in_units(part, unit, threshold) for part in built.members or (built,)]
 
-  return any_of(*map(chart, names))
+  return any_of(*(part for name in names for part in chart(name)))

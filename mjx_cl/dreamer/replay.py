@@ -109,9 +109,9 @@ def sample(
 ) -> tuple[Replay, Record, Address]:
   """Draws windows: first those waiting in the online queue, then uniformly over all windows.
 
-  The queue holds every non-overlapping window of each stream once, oldest first, so each fresh
-  sequence is seen once promptly. `first` is forced at index 0, `last` where the next record is a
-  first one.
+  The queue holds every non-overlapping window of each stream once, oldest first, those of a stream
+  that has waited longest before others, so each fresh sequence is seen once promptly. `first` is
+  forced at index 0, `last` where the next record is a first one.
 
   Args:
     replay: to draw from.
@@ -129,13 +129,17 @@ def sample(
   oldest = jnp.maximum(0, replay.count - capacity)
   queue = jnp.where(mine, jnp.maximum(replay.queue, oldest), replay.queue)
   waiting = jnp.where(mine, jnp.maximum(0, (replay.count - queue) // length), 0)
-  ends = jnp.cumsum(waiting)
+  # a train ratio below 1 leaves windows behind: none of a stream's may wait for ever
+  since = jnp.where(waiting > 0, (replay.count - replay.queue) // length, 0)
+  order = jnp.argsort(-since, stable=True) if only is None else jnp.arange(len(waiting))
+  ends = jnp.cumsum(waiting[order])
   slot = jnp.arange(batch)
   from_queue = slot < ends[-1]
-  q_stream = jnp.minimum(jnp.searchsorted(ends, slot, side="right"), len(ends) - 1)
-  rank = slot - (ends - waiting)[q_stream]
-  q_start = queue[q_stream] + rank * length
-  taken = jnp.clip(batch - (ends - waiting), 0, waiting)
+  turn = jnp.minimum(jnp.searchsorted(ends, slot, side="right"), len(ends) - 1)
+  begin = ends - waiting[order]
+  q_stream = order[turn]
+  q_start = queue[q_stream] + (slot - begin[turn]) * length
+  taken = jnp.zeros_like(waiting).at[order].set(jnp.clip(batch - begin, 0, waiting[order]))
 
   valid = jnp.where(mine, jnp.maximum(0, replay.count - oldest - length + 1), 0)
   valid_ends = jnp.cumsum(valid)
@@ -150,6 +154,7 @@ def sample(
   last = out.last.at[:, :-1].set(out.last[:, :-1] | out.first[:, 1:])
   first = out.first.at[:, 0].set(True)
   drawn = out._replace(first=first, last=last, stoch=out.stoch.astype(jnp.int32))
+  queue = queue if only is not None else jnp.where(taken > 0, queue, replay.queue)
   return replay._replace(queue=queue + taken * length), drawn, (stream, start)
 
 

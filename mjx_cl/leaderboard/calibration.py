@@ -116,9 +116,9 @@ def at_rate(
   """Alarms at the asked rate where the threshold gives fewer: all detectors are compared at one
   rate, and none gains by a rarer one.
 
-  With a alarms at the threshold, b at the next lower one that was tried and has too many, and n
-  asked for, each alarm of the lower one counts with probability (n - a) / (b - a), a randomised
-  test between two operating points. Where there is no such lower one, alarms are added at random,
+  With a alarms at the threshold, b more at other steps at the next lower one that was tried and has
+  too many, and n asked for, each of these b counts with probability (n - a) / b, a randomised test
+  between two operating points. Where there is no such lower one, alarms are added at random,
   n - a on the healthy steps that were counted. On those steps n - a are drawn, no more and no
   fewer. Draws follow from the robot's name.
 
@@ -139,25 +139,24 @@ def at_rate(
     return healthy[0], fault[0], None
   random = np.random.default_rng(zlib.crc32(data.robot.encode()))
   lower = [t for t, alarms in tried.items() if t < threshold and alarms > wanted]
+  tune = data.tune.residual.opr.shape[1]
+  seen = thresholds.seeing(healthy[1][:, :tune], data.count_from)
+  block = np.zeros(healthy[0].shape, bool)  # the steps that were counted
+  block[data.count_from :, :tune] = seen
+  more = at(max(lower)) if lower else (np.isfinite(healthy[1]), np.isfinite(fault[1]))
+  could = np.flatnonzero(block & more[0] & ~healthy[0])
   if lower:
-    share = (wanted - have) / (tried[max(lower)] - have)
-    more = at(max(lower))
+    share = min(1.0, (wanted - have) / max(1, len(could)))
     note = (
       f"no threshold gives the asked rate: {have} alarms, or {tried[max(lower)]}, of {wanted}; "
       f"those of the lower one count with probability {share:.3g}"
     )
   else:
     share = (wanted - have) / counted
-    more = np.isfinite(healthy[1]), np.isfinite(fault[1])
     note = f"{have} alarms of {wanted} asked for: the others were drawn at random"
   added, late = (
     m & ~x & (random.random(m.shape) < share) for m, (x, _) in zip(more, (healthy, fault))
   )
-  tune = data.tune.residual.opr.shape[1]
-  seen = thresholds.seeing(healthy[1][:, :tune], data.count_from)
-  block = np.zeros(added.shape, bool)  # the steps that were counted
-  block[data.count_from :, :tune] = seen
-  could = np.flatnonzero(block & more[0] & ~healthy[0])
   added[block] = False
   added.flat[random.choice(could, int(min(wanted - have, len(could))), replace=False)] = True
   return healthy[0] | added, fault[0] | late, note

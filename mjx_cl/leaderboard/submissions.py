@@ -165,13 +165,15 @@ def _differ(whole: np.ndarray, cut: np.ndarray) -> int | None:
   """First step at which two scores differ by more than sums in another order do, None without such
   a step.
 
-  That is a thousandth of the width of the scores' middle half, and 1e-5 of how far a score lies
+  That is a thousandth of the width of the scores' middle half (where it is one value, of the median
+  distance of the others from it), and 1e-5 of how far a score lies
   from their middle; what the middle itself, a mere offset, costs in float32 is granted up to a
   twentieth of the width.
   """
   known = whole[np.isfinite(whole)]
   low, middle, high = np.quantile(known, [0.25, 0.5, 0.75]) if len(known) else (0.0, 0.0, 0.0)
-  width = high - low
+  others = np.abs(known - middle)
+  width = high - low or (np.median(others[others > 0]) if others.any() else 0.0)
   allowed = 1e-3 * width + min(1e-5 * abs(middle), 0.05 * width) + 1e-5 * np.abs(whole - middle)
   differ = ~(np.abs(whole - cut) <= allowed) & ~(np.isnan(whole) & np.isnan(cut))
   return int(np.flatnonzero(differ)[0]) if differ.any() else None

@@ -124,6 +124,9 @@ def detect(
   names = [*table(), *(n for n in names if n != "all")] if "all" in names else names
   names = list(dict.fromkeys(names))
   hosts = _hosts(arl0, rate, names, settings)
+  alone = {"inject": inject, "refractory": refractory, "model": None if model == "ar" else model}
+  if names and (idle := [f"--{name}" for name, value in alone.items() if value is not None]):
+    raise UserError(f"{', '.join(idle)}: of the charts; leave it out beside --detector")
   log, nominal = read(path), read(nominal_path)
   if commands and (names or model == "none"):
     raise UserError(

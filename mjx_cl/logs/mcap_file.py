@@ -64,7 +64,6 @@ def read_mcap(path: pathlib.Path | str) -> tuple[np.ndarray, dict[str, np.ndarra
     FileError: it is no MCAP file, or holds no numbers.
   """
   try:
-    from mcap.exceptions import McapError
     from mcap.reader import make_reader
     from mcap_ros2.decoder import DecoderFactory
   except ImportError as e:
@@ -89,7 +88,9 @@ def read_mcap(path: pathlib.Path | str) -> tuple[np.ndarray, dict[str, np.ndarra
         rows.append(dict(numbers(decode(message.data))))
   except OSError as e:
     raise FileError(f"cannot read {path}: {e.strerror}") from None
-  except (McapError, ValueError, EOFError) as e:
+  except MemoryError:
+    raise
+  except Exception as e:  # of the file's bytes: each decoder and decompressor has errors of its own
     raise FileError(f"{path} is no MCAP file, or a broken one: {str(e)[:200]}") from None
   topics = {topic: found for topic, found in topics.items() if any(found[1])}
   if not topics:

@@ -161,7 +161,6 @@ def figure(result: Detection, file: pathlib.Path | str | BinaryIO, panels: int =
   import matplotlib.pyplot as plt
 
   names, (steps, _) = result.summary["columns"], result.xs.shape
-  step = _step(result)
   hits = sum(fired.sum(0) for fired in result.fired.values())
   shown = sorted(sorted(range(len(names)), key=lambda c: -hits[c])[:panels])
   height = [1.5] * len(shown) + [0.35 + 0.22 * len(result.fired)]
@@ -176,19 +175,21 @@ def figure(result: Detection, file: pathlib.Path | str | BinaryIO, panels: int =
   for axis, c in zip(axes, shown):
     for x, begin, color in ((result.past, -len(result.past), "0.6"), (result.xs, 0, "#1f5fa8")):
       at, line = _envelope(x[:, c], begin)
-      axis.plot(at * step, line, color=color, lw=0.7)
+      axis.plot(_time(result, at), line, color=color, lw=0.7)
     axis.set_ylabel(f"ln {names[c]}" if result.summary["logarithm"] else names[c], fontsize=8)
     axis.tick_params(labelsize=8)
   for event in result.summary.get("events", ()):
     named = {column["column"] for column in event["columns"]} if event["believed"] else ()
     for axis, c in zip(axes, shown):
       if names[c] in named:
-        axis.axvspan(event["begin"] * step, event["end"] * step, color="#c4472b", alpha=0.2, lw=0)
+        span = _time(result, np.array([event["begin"], event["end"]]))
+        axis.axvspan(*span, color="#c4472b", alpha=0.2, lw=0)
   _marks(result, axes[-1])
   for axis in axes:
     axis.axvline(0, color="k", lw=0.8)
     # the log that is judged keeps half of the width at least
-    axis.set_xlim(-min(len(result.past), steps) * step, steps * step)
+    end = float(_time(result, np.array([steps]))[0])
+    axis.set_xlim(max(-end, -len(result.past) * _step(result)), end)
   hidden = f"; {len(names) - len(shown)} more columns watched" if len(names) > len(shown) else ""
   axes[0].set_title(
     f"{pathlib.Path(result.summary['log']).name}: alarms per detector (marks); nominal log in "
@@ -201,10 +202,9 @@ def figure(result: Detection, file: pathlib.Path | str | BinaryIO, panels: int =
 
 def _marks(result: Detection, axis: Axes) -> None:
   """Alarms of each detector as marks."""
-  step = _step(result)
   for k, (name, fired) in enumerate(result.fired.items()):
-    at = np.flatnonzero(fired.any(1)) * step
-    early = (np.flatnonzero(result.before[name]) - len(result.past)) * step
+    at = _time(result, np.flatnonzero(fired.any(1)))
+    early = _time(result, np.flatnonzero(result.before[name]) - len(result.past))
     axis.plot(early, np.full(len(early), k), "|", color="0.6", ms=8, mew=1.2)
     axis.plot(at, np.full(len(at), k), "|", color="#c4472b", ms=8, mew=1.2)
   unsure = {r["detector"] for r in result.summary["detectors"] if r["calibrated"] is False}
@@ -222,6 +222,17 @@ def _step(result: Detection) -> float:
   """Of the axis between two samples: in seconds where the log has a clock."""
   rate = result.summary["rate_hz"]
   return 1.0 if rate is None else 1 / rate
+
+
+def _time(result: Detection, at: np.ndarray) -> np.ndarray:
+  """Of samples on the axis: their own times, which may have gaps; the nominal log's, below 0, in
+  even steps.
+  """
+  step = _step(result)
+  if result.seconds is None or result.summary["rate_hz"] is None:
+    return at * step
+  known = np.append(result.seconds, result.seconds[-1] + step)
+  return np.where(at < 0, at * step, known[np.clip(at, 0, len(known) - 1)])
 
 
 def _axis(result: Detection) -> str:

@@ -67,7 +67,9 @@ def _saved(drawn: Figure, path: pathlib.Path, dpi: int = 110) -> pathlib.Path:
 def _figure(trace: dict, events: dict, rows: list[dict], config: dict, width: int) -> Figure:
   steps, control_s = int(trace["step"].max()) + 1, config["control_s"]
   arms = list(dict.fromkeys(trace["arm"]))
-  main = next((arm for arm in ("detector", *arms) if arm in arms and arm != "none"), "none")
+  learns = set(events["arm"][i] for i, kind in enumerate(events["kind"]) if kind == "start")
+  likely = ["detector", *(arm for arm in arms if arm in learns), *arms]
+  main = next((arm for arm in likely if arm in arms and arm != "none"), "none")
   shown, which = _affected(trace, rows)
   drawn = Figure(figsize=(9, 6.4), layout="constrained")
   axes = drawn.subplots(3, 1, sharex=True, height_ratios=(3, 1.1, 1.7))

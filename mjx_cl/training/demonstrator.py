@@ -40,6 +40,11 @@ class Policy(NamedTuple):
   std: jax.Array
   layers: tuple[tuple[jax.Array, jax.Array], ...]
 
+  @property
+  def sizes(self) -> tuple[int, int]:
+    """Variables of an observation, and actions."""
+    return self.mean.shape[0], self.layers[-1][0].shape[1] // 2
+
   def __call__(self, obs: jax.Array) -> jax.Array:
     """Action in [-1, 1], (..., act), for obs (..., obs): the mode of the squashed normal."""
     x = (obs - self.mean) / self.std
@@ -63,8 +68,11 @@ def load(path: str | os.PathLike) -> Policy:
     z = {k: jnp.asarray(v) for k, v in arrays.read(path).items()}
     count = sum(k.startswith("kernel") for k in z)
     layers = tuple((z[f"kernel{i}"], z[f"bias{i}"]) for i in range(count))
-    return Policy(z["mean"], z["std"], layers)
-  except (FileError, KeyError, TypeError) as e:
+    policy = Policy(z["mean"], z["std"], layers)
+    jax.eval_shape(policy.__call__, policy.mean + policy.std)
+    policy.sizes  # noqa: B018
+    return policy
+  except (FileError, IndexError, KeyError, TypeError, ValueError) as e:
     raise FileError(f"cannot read demonstrator {path}: {e}") from None
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from mjx_cl import faults
 from mjx_cl.config import CHUNK, DreamerConfig, TrainConfig
-from mjx_cl.errors import UserError
+from mjx_cl.errors import FileError, UserError
 from mjx_cl.faults import presets
 from mjx_cl.rollout.scan import Stream
 from mjx_cl.training import agents, demonstrator
@@ -22,7 +22,7 @@ from mjx_cl.training import agents, demonstrator
 
 def expert(env: Any, name: str) -> Callable[[Stream], jax.Array]:
   """A demonstrator, Stream -> action: `reference`, the environment's own driver that knows its
-  state, or a policy's .npz.
+  state, or a policy's .npz of as many observations and actions.
 
   A policy sees the observation without its noise where the robot can give it (`noiseless`): labels
   then follow from what a latent can know.
@@ -34,6 +34,12 @@ def expert(env: Any, name: str) -> Callable[[Stream], jax.Array]:
       )
     return lambda stream: env.reference(stream.env)
   policy = demonstrator.load(name)
+  sizes, has = (len(env.spec.obs), len(env.spec.act)), policy.sizes
+  if has != sizes:
+    raise FileError(
+      f"demonstrator {name} takes {has[0]} observations and gives {has[1]} actions; robot "
+      f"{env.spec.name!r} has {sizes[0]} and {sizes[1]}"
+    )
   if hasattr(env, "noiseless"):
     return lambda stream: policy(env.noiseless(env.model, stream.env))
   return lambda stream: policy(stream.obs)
@@ -81,6 +87,8 @@ def faults_of(
   Raises:
     UserError: what is unknown, belongs to another robot, or turns the robot into another one.
   """
+  if config.fault is None and config.severity != 1.0:
+    raise UserError("severity is of a fault; give --set fault=NAME too, or leave severity out")
   if config.fault is None or not presets.named(config.fault):
     names = presets.joined(config.fault or "none")
     return tuple(faults.make(name, env) for name in names), None, -1

@@ -51,6 +51,33 @@ def mean(values: Sequence[float]) -> float | None:
   return float(np.mean(values)) if values else None
 
 
+def fits(env: Any, dreamer: DreamerConfig, config: TrainConfig, seeds: int = 1) -> None:
+  """Refuses, before anything is allocated or removed, what a Trainer of these would refuse.
+
+  Raises:
+    UserError: one line.
+  """
+  check(env, dreamer, config)
+  shaped(eased(env, config.penalties), config.shaping)
+  if dreamer.anchor and config.shake:
+    raise UserError(
+      "anchor holds the policy to the actions taken; shake puts random ones among them: set it to 0"
+    )
+  sizes = len(env.spec.obs), len(env.spec.act)
+  Agent(dreamer, *sizes)
+  mesh = seeds_mesh(seeds)
+  needs.check(
+    dreamer.size,
+    *sizes,
+    config.envs * config.capacity,
+    seeds,
+    ("capacity", lambda n: n * config.envs),
+    dreamer.bins,
+    # devices of a CPU share its memory
+    1 if mesh is None or jax.default_backend() == "cpu" else mesh.size,
+  )
+
+
 class Trainer:
   """Pretrains `seeds` agents on one environment.
 
@@ -71,7 +98,7 @@ class Trainer:
     seed: int = 0,
     seeds: int = 1,
   ) -> None:
-    check(env, dreamer, config)
+    fits(env, dreamer, config, seeds)
     self.env, self.dreamer, self.config, self.out = env, dreamer, config, pathlib.Path(out)
     self.seed, self.seeds, self.mesh = seed, seeds, seeds_mesh(seeds)
     env = shaped(eased(env, config.penalties), config.shaping)
@@ -83,23 +110,13 @@ class Trainer:
     self.rows: list[dict] = []
     self.own: list[float] = []
     self.failed: dict[int, str] = {}  # seed, from 0 -> the term that was not finite, and when
-    sizes = len(env.spec.obs), len(env.spec.act)
-    self.plain = Agent(dreamer, *sizes)
-    needs.check(
-      dreamer.size,
-      *sizes,
-      config.envs * config.capacity,
-      seeds,
-      ("capacity", lambda n: n * config.envs),
-      dreamer.bins,
-      # devices of a CPU share its memory
-      1 if self.mesh is None or jax.default_backend() == "cpu" else self.mesh.size,
-    )
+    self.plain = Agent(dreamer, len(env.spec.obs), len(env.spec.act))
     fault, self.plan, self.target = faults_of(env, config)
     self.fault: Any = fault if config.fault else None
     self._programs(env, fault)
     self.state = self._place(self._begun(env, fault, seed))
     self.returns = episodes.Returns((seeds, config.envs))
+    self.shown = self._drive()  # robots whose running episode the demonstrator drove, if in part
     self._add = jax.jit(jax.vmap(replay_lib.add), donate_argnums=0)
     self._redraw = jax.jit(nest(self._new_fault, 0, 0))
     self.checkpoints = checkpoints.Checkpoints(self.out / "checkpoints")
@@ -108,11 +125,6 @@ class Trainer:
     """`collect` and `learn`, the programs of each phase."""
     dreamer, config = self.dreamer, self.config
     self.collect = {"pure": Rollout(env, self.plain, fault, config.repeat)}
-    if dreamer.anchor and config.shake:
-      raise UserError(
-        "anchor holds the policy to the actions taken; shake puts random ones among them: set it "
-        "to 0"
-      )
     self.learn = {"pure": make_learn(self.plain, dreamer.batch, dreamer.length, self.mesh)}
     if self.expert:
       sizes = len(env.spec.obs), len(env.spec.act)
@@ -178,7 +190,9 @@ class Trainer:
     if self.phase == "clone":
       return Weights(c.clone_weight, 0.0, lr)
     if self.phase == "fade":
-      return Weights(c.clone_weight * max(0.0, 1.0 - (done - self.phase_start) / c.fade), 1.0, lr)
+      return Weights(
+        c.clone_weight * max(0.0, 1.0 - (done - self.phase_start) / max(1, c.fade)), 1.0, lr
+      )
     return Weights(0.0, float(done - self.phase_start >= c.hold), lr)
 
   def _advance_phase(self) -> None:
@@ -247,9 +261,14 @@ class Trainer:
     drive, shake = self._drive(), self._shake()
     rows = self._collect(drive, shake)
     counts = ~drive if shake is None else ~drive & (shake == 0)  # those that act as the agent would
-    ended = self.returns.add(rows)
-    expert_returns = [value for at, value in ended if drive[at]]
-    own = [(seed, value) for (seed, member), value in ended if counts[seed, member]]
+    self.shown |= drive
+    expert_returns, own = [], []
+    for at, value in self.returns.add(rows):
+      if drive[at]:
+        expert_returns.append(value)
+      elif counts[at] and not self.shown[at]:
+        own.append((at[0], value))
+      self.shown[at] = drive[at]  # of the episode that begins
     returns = [value for _, value in own]
     self.own = (self.own + returns)[-200:]
     if expert_returns:
@@ -320,15 +339,15 @@ class Trainer:
         f"{int(np.asarray(self.state.train.updates)[g]) + 1}"
       )
       print(
-        f"mjx-cl: numeric failure of seed {self.seed + g}: {self.failed[int(g)]}; it stops here, "
-        "its last sound weights are kept",
+        f"mjx-cl: numeric failure of seed {self.seed + g}: {self.failed[int(g)]}; it stops here",
         file=sys.stderr,
         flush=True,
       )
     if len(self.failed) == self.seeds:
       raise FileError(
         f"numeric failure of every seed: {self.failed[self.seeds - 1]}; the last checkpoint is "
-        "intact, --resume goes on from it"
+        f"intact: --resume --set updates={max(1, self.updates)} ends sound, or give another --out "
+        "and a lower lr"
       )
 
   @property
@@ -347,6 +366,7 @@ class Trainer:
     if self.checkpoints.latest() != self.chunks:
       meta = {name: getattr(self, name) for name in COUNTERS} | {
         "sums": self.returns.sums.tolist(),
+        "shown": self.shown.tolist(),
         "failed": {str(g): why for g, why in self.failed.items()},
       }
       self.checkpoints.save(self.chunks, self.state, meta)
@@ -366,7 +386,9 @@ class Trainer:
       failed = {int(g): str(why) for g, why in meta.get("failed", {}).items()}
       counters = {name: read(meta[name]) for name, read in COUNTERS.items()}
       sums = np.asarray(meta["sums"], float)
-      if counters["phase"] not in self.collect or sums.shape != self.returns.sums.shape:
+      shown = np.asarray(meta.get("shown", self.shown), bool)
+      robots = self.returns.sums.shape
+      if counters["phase"] not in self.collect or not robots == sums.shape == shown.shape:
         raise ValueError(f"phase {counters['phase']!r}, returns of {sums.shape}")
     except (AttributeError, KeyError, TypeError, ValueError) as e:
       why = f"no {e}" if isinstance(e, KeyError) else e
@@ -375,7 +397,7 @@ class Trainer:
         "--overwrite begins anew"
       ) from None
     vars(self).update(counters, chunks=chunks, rows=rows[:chunks], failed=failed)
-    self.state, self.returns.sums = self._place(state), sums
+    self.state, self.returns.sums, self.shown = self._place(state), sums, shown.copy()
 
 
 def run(

@@ -168,6 +168,19 @@ def test_queue_serves_each_fresh_window_once(chunks):
   )  # the check notices a queue that is off
 
 
+def test_no_stream_of_the_queue_waits_for_ever():
+  """Half of what each chunk adds is drawn: a train ratio below 1."""
+  rng, replay, drawn = np.random.default_rng(0), empty(), []
+  for i in range(20):
+    numbers = np.broadcast_to(i * CHUNK + np.arange(CHUNK), (ENVS, CHUNK))
+    records = jax.tree.map(jnp.asarray, make_records(rng, numbers))
+    replay = add(replay, records, jnp.ones((ENVS, CHUNK), bool))
+    replay, _, address = replay_lib.sample(replay, jax.random.key(i), 2, LENGTH)
+    drawn += starts(address)
+  share = np.bincount([stream for stream, _ in drawn], minlength=ENVS) / len(drawn)
+  assert (share > 0.25).all(), share  # a third each
+
+
 def test_queue_goes_on_where_it_stopped():
   replay, model, count = filled(2, keep=1.0)
   replay, first = drawn_in_order(replay, 4)

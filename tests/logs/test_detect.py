@@ -1060,6 +1060,22 @@ def test_a_spike_survives_the_drawing():
   )
 
 
+def test_the_axis_of_a_figure_shows_a_gap(tmp_path):
+  at = np.arange(200.0) + 100 * (np.arange(200) >= 100)
+  files = [save(tmp_path / "t.csv", x=noise(200, 1), time=0.02 * at + 3)]
+  files += [save(tmp_path / "n.csv", x=noise(300), time=0.02 * np.arange(300.0))]
+  found = detect.detect(*files, detectors=("z_score",), arl0=50)
+  on_axis = results._time(found, np.array([-10, 0, 99, 100, 199, 200]))
+  np.testing.assert_allclose(on_axis, [-0.2, 0.0, 1.98, 4.0, 5.98, 6.0], atol=1e-6)
+
+
+@pytest.mark.parametrize("given", [{"inject": 2.0}, {"refractory": 1.0}, {"model": "none"}])
+def test_what_the_charts_alone_take_is_refused_beside_a_detector(tmp_path, given):
+  files = [save(tmp_path / f"{name}.csv", x=noise(300)) for name in "tn"]
+  with pytest.raises(UserError, match=f"--{next(iter(given))}: of the charts"):
+    detect.detect(*files, detectors=("z_score",), arl0=50, **given)
+
+
 def test_defaults_of_the_command_are_those_of_the_function():
   parameters = inspect.signature(detect.detect).parameters
   fields = app.Detect.__dataclass_fields__

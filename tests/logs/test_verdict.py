@@ -892,6 +892,14 @@ def test_a_bag_is_read_at_the_times_of_the_fastest_topic(tmp_path):
   (tmp_path / "no.mcap").write_bytes(b"nothing of the kind")
   with pytest.raises(FileError, match="no.mcap is no MCAP file"):
     read(tmp_path / "no.mcap")
+  whole, broken = (tmp_path / "walk.mcap").read_bytes(), 0
+  for place in range(100, len(whole), len(whole) // 40):  # wherever its bytes are damaged
+    (tmp_path / "no.mcap").write_bytes(whole[:place] + bytes(30) + whole[place + 30 :])
+    try:
+      read(tmp_path / "no.mcap")
+    except FileError as e:
+      broken += "a broken one" in str(e)
+  assert broken > 5
 
 
 def test_numbers_of_a_message():

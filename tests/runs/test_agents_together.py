@@ -240,6 +240,7 @@ def test_parts_are_named_after_what_differs():
     (("--agent", "all", "--resume", "--overwrite"), "exclude each other"),
     (("--agent", "all", "--stops", "x"), "--stops is of one run"),
     (("--fault", "bias"), "--fault is there twice"),
+    (("--set", "slack=1", "--set", "threshold=9"), "--set is there twice"),
     (("--severity", "0.5", "0.50"), "name each severity once; got 0.5 twice"),
     (("--severity", "0.5", "2"), "severity"),
     (("--severity",), "--severity got no value"),

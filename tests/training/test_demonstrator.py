@@ -11,7 +11,7 @@ from brax.training.agents.ppo import networks
 
 from mjx_cl import envs
 from mjx_cl.errors import FileError
-from mjx_cl.training import demonstrator
+from mjx_cl.training import demonstrator, premises
 
 
 def brax_policy(obs_size, act_size):
@@ -58,6 +58,17 @@ def test_round_trip(tmp_path):
   (tmp_path / "p.npz").write_bytes((tmp_path / "p.npz").read_bytes()[:100])
   with pytest.raises(FileError, match="cannot read demonstrator"):
     demonstrator.load(tmp_path / "p.npz")
+
+
+def test_a_policy_of_another_robot_is_one_line(tmp_path, short_walker):
+  path = tmp_path / "p.npz"
+  demonstrator.save(path, demonstrator._to_policy(brax_policy(5, 2)[0]))
+  with pytest.raises(FileError, match="takes 5 observations and gives 2 actions.* has 24 and 6"):
+    premises.expert(short_walker, str(path))
+  for layers in ((), ((jnp.ones((4, 4)), jnp.ones(4)),)):
+    demonstrator.save(path, demonstrator.Policy(jnp.zeros(5), jnp.ones(5), layers))
+    with pytest.raises(FileError, match="cannot read demonstrator"):
+      demonstrator.load(path)
 
 
 def test_adapter_steps_like_the_environment():

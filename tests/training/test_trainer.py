@@ -306,6 +306,27 @@ def test_what_a_demonstrator_asks_for_is_said_before_an_earlier_training_is_gone
   )
 
 
+@pytest.mark.parametrize(
+  "given, said",
+  [
+    (["capacity=50000000"], "would fit"),
+    (["anchor=0.1", "shake=0.1"], "shake puts random ones"),
+    (["shaping=1"], "has no shaping terms"),
+    (["severity=0.5"], "severity is of a fault"),
+    (["demonstrator=ppo", "clone=10", "fade=10", "pure=10"], "cannot read demonstrator"),
+  ],
+)
+def test_what_a_trainer_refuses_costs_no_earlier_training(begun, capsys, given, said):
+  argv, out = begun
+  (out / "agent").mkdir()
+  (out / "agent/agent.npz").write_text("old")
+  before = (out / "config.json").read_text()
+  assert app.main([*argv, "--overwrite", "--set", *given]) in (1, 2)
+  error = capsys.readouterr().err
+  assert said in error and error.count("\n") == 1
+  assert (out / "agent/agent.npz").exists() and (out / "config.json").read_text() == before
+
+
 def test_a_shipped_agent_does_not_lie_in_the_folder_of_the_command(begun, monkeypatch, capsys):
   argv, out = begun
   monkeypatch.chdir(out)
@@ -639,6 +660,36 @@ def test_phases_follow_one_another(short_walker, tmp_path, expert_path):
   np.testing.assert_allclose(clone, [0.4, 0.4, 0.4, 0.2, 0, 0, 0, 0])
   assert policy == [0, 0, 1, 1, 1, 1, 1, 1]
   assert sum(n for (n, _), name in zip(learn.calls, names) if name == "pure") >= 32
+
+
+def test_a_fade_of_no_updates_lasts_a_chunk(short_walker, tmp_path, expert_path):
+  trainer, learn = phases(
+    short_walker, tmp_path, expert_path, updates=48, clone=16, fade=0, pure=16
+  )
+  while not trainer.done:
+    trainer.step()
+  assert "fade" in (names := [row["phase"] for row in trainer.rows]) and names[-1] == "pure"
+  assert learn.calls[-1][1].clone == 0.0
+
+
+def test_a_return_that_the_demonstrator_began_is_not_the_agents(
+  short_walker, tmp_path, expert_path
+):
+  """Robots that it drove until the last phase begin it in mid-episode; resumed alike."""
+  trainer, _ = phases(short_walker, tmp_path, expert_path, updates=64, clone=16, fade=16, pure=32)
+  while trainer.phase != "pure":
+    trainer.step()
+  trainer.save()
+  trainer.checkpoints.close()
+  again = phases(short_walker, tmp_path, expert_path, updates=64, clone=16, fade=16, pure=32)[0]
+  again.resume()
+  driven = np.arange(ENVS) < 2
+  for one in (trainer, again):
+    assert (one.shown == driven).all()
+    row = one.step()
+    # of episodes of 12 steps: the driven robots' first is left out
+    ended = (np.asarray(one.state.streams.t)[0] // 12) - ((one.chunks - 1) * train.CHUNK // 12)
+    assert row["episodes"] == int((ended - driven).sum()) and not one.shown.any()
 
 
 def test_at_least_pure_updates_are_pure(short_walker, tmp_path, expert_path):
