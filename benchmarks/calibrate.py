@@ -3,6 +3,7 @@ logarithm for ARL0 = 100,000 control steps.
 
   python benchmarks/calibrate.py --out results/arl0.json
   python benchmarks/calibrate.py --robot quadruped --out results/arl0_quadruped-trot-2.json
+  python benchmarks/calibrate.py --agent walker-2 --out results/arl0_walker-2.json
   python benchmarks/calibrate.py --robot car --settled runs/car_tune --out results/arl0_car.json
 
 Nominal streams of seeds 100 to 109 give ARL0 = nominal steps / alarms, with restarts (every alarm
@@ -136,6 +137,7 @@ def main() -> None:
 
   runtime.setup()
   from mjx_cl import envs
+  from mjx_cl.detectors.paper_rule import calibrated_settings
   from mjx_cl.io import tables
   from mjx_cl.rollout.scan import stream_keys
   from mjx_cl.runs.calibrate import watched
@@ -248,13 +250,17 @@ def main() -> None:
   quiet = [r for r in rows if r["arl0"] is None or r["arl0"] >= args.goal]
   good = [r for r in quiet if r.get("settled_alarms", 0) <= np.ceil(settled_steps / args.goal)]
   best = max(good, key=finds)
+  own = calibrated_settings(args.robot, args.agent)
+  own = {"threshold_rpr": own["threshold"]} | own
   value = {
     "robot": args.robot,
+    "agent": args.agent,
     "fault": list(TUNE[args.robot]),
     "command": (
       f"python benchmarks/calibrate.py --robot {args.robot} --streams {args.streams} --steps "
       f"{args.steps} --goal {args.goal:g}"
     )
+    + (f" --agent {args.agent}" if args.agent else "")
     + (f" --settled {args.settled}" if done else ""),
     "seeds": [100, 109],
     "nominal_steps": steps,
@@ -271,8 +277,9 @@ def main() -> None:
       else {}
     ),
     "chosen": best,
+    "shipped": next((r for r in rows if own.items() <= r.items()), None),
     "plain": plain,
-    "frontier": sorted(good, key=finds, reverse=True)[:20],
+    "frontier": sorted(good, key=finds, reverse=True)[:5],
     "wall_s": round(time.time() - begin),
     **runtime.provenance(),
   }
@@ -295,7 +302,7 @@ def main() -> None:
     print(json.dumps(out))
   else:
     print("affected", int(affected.sum()), "of", len(affected), "\nplain ", plain, "\nchosen", best)
-    for r in value["frontier"][:8]:
+    for r in value["frontier"]:
       print(r)
 
 

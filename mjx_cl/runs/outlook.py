@@ -25,20 +25,20 @@ from mjx_cl.runs.work import Spell
 # PROMPT, LATENCY [control steps] and LATE [per control step] of the published runs (results/*/
 # runs.parquet, events.parquet), by robot at the start; tests check them against these files
 NOTICES = {
-  "walker": (0.60, 270, 6.9e-6),
-  "quadruped": (0.72, 226, 26e-6),
-  "car": (0.64, 61, 16e-6),
+  "walker": (0.60, 266, 6.9e-6),
+  "quadruped": (0.72, 212, 27e-6),
+  "car": (0.66, 57, 14e-6),
 }
 ANY = (0.65, 200, 14e-6)  # of any other robot
 # control steps that a finetuning with a stop rule lasts, of the robot that it goes on with: mean,
 # and the middle of each tenth
-ADAPTS = {"walker": 8_200, "quadruped": 9_000, "car": 7_300, "car_real": 13_600}
+ADAPTS = {"walker": 8_000, "quadruped": 9_200, "car": 7_200, "car_real": 13_400}
 ADAPT = 9_000  # of any other robot
 LENGTHS = {
   "walker": (5900, 6000, 6000, 6100, 6200, 6700, 7500, 12_000, 12_000, 13_800),
-  "quadruped": (3800, 6000, 6300, 6800, 7400, 8300, 10_600, 12_000, 12_900, 14_800),
-  "car": (6000, 6100, 6500, 6700, 6800, 6900, 7400, 7900, 8900, 10_100),
-  "car_real": (4400, 7100, 7700, 8700, 9900, 11_200, 13_400, 18_500, 25_700, 29_200),
+  "quadruped": (3900, 6000, 6300, 6800, 7500, 8600, 11_400, 12_000, 13_000, 15_400),
+  "car": (6000, 6100, 6300, 6600, 6700, 6900, 7100, 7700, 8500, 10_100),
+  "car_real": (4700, 7100, 7700, 8900, 9900, 11_000, 13_300, 17_600, 24_500, 29_200),
 }
 
 
