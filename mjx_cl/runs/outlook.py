@@ -25,7 +25,7 @@ from mjx_cl.runs.work import Spell
 # PROMPT, LATENCY [control steps] and LATE [per control step] of the published runs (results/*/
 # runs.parquet, events.parquet), by robot at the start; tests check them against these files
 NOTICES = {
-  "walker": (0.60, 266, 6.9e-6),
+  "walker": (0.60, 270, 6.9e-6),
   "quadruped": (0.72, 212, 27e-6),
   "car": (0.66, 57, 14e-6),
 }
