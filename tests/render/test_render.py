@@ -465,7 +465,7 @@ def test_side_by_side_by_command(mjx, refused, tmp_path, monkeypatch):  # noqa: 
   assert "--overwrite replaces it" in refused(2, "render", "walker", *size, "--out", out)
   other = str(tmp_path / "b.gif")
   say = lambda *flags: refused(2, "render", "walker", "--out", other, *size, *flags)
-  assert "--fault" in say("--compare")
+  assert "got no value" in say("--compare")
   assert "--skip goes with --compare" in say("--skip", "3")
   assert "2 to 6 robots" in say("--fault", "gear", "--compare", *["walker"] * 5)
 
