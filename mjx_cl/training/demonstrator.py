@@ -70,7 +70,6 @@ def load(path: str | os.PathLike) -> Policy:
     layers = tuple((z[f"kernel{i}"], z[f"bias{i}"]) for i in range(count))
     policy = Policy(z["mean"], z["std"], layers)
     jax.eval_shape(policy.__call__, policy.mean + policy.std)
-    policy.sizes  # noqa: B018
     return policy
   except (FileError, IndexError, KeyError, TypeError, ValueError) as e:
     raise FileError(f"cannot read demonstrator {path}: {e}") from None

@@ -116,7 +116,7 @@ class Trainer:
     self._programs(env, fault)
     self.state = self._place(self._begun(env, fault, seed))
     self.returns = episodes.Returns((seeds, config.envs))
-    self.shown = self._drive()  # robots whose running episode the demonstrator drove, if in part
+    self.driven = self._drive()  # robots whose running episode the demonstrator drove, if in part
     self._add = jax.jit(jax.vmap(replay_lib.add), donate_argnums=0)
     self._redraw = jax.jit(nest(self._new_fault, 0, 0))
     self.checkpoints = checkpoints.Checkpoints(self.out / "checkpoints")
@@ -261,14 +261,14 @@ class Trainer:
     drive, shake = self._drive(), self._shake()
     rows = self._collect(drive, shake)
     counts = ~drive if shake is None else ~drive & (shake == 0)  # those that act as the agent would
-    self.shown |= drive
+    self.driven |= drive
     expert_returns, own = [], []
     for at, value in self.returns.add(rows):
       if drive[at]:
         expert_returns.append(value)
-      elif counts[at] and not self.shown[at]:
+      elif counts[at] and not self.driven[at]:
         own.append((at[0], value))
-      self.shown[at] = drive[at]  # of the episode that begins
+      self.driven[at] = drive[at]  # of the episode that begins
     returns = [value for _, value in own]
     self.own = (self.own + returns)[-200:]
     if expert_returns:
@@ -366,7 +366,7 @@ class Trainer:
     if self.checkpoints.latest() != self.chunks:
       meta = {name: getattr(self, name) for name in COUNTERS} | {
         "sums": self.returns.sums.tolist(),
-        "shown": self.shown.tolist(),
+        "driven": self.driven.tolist(),
         "failed": {str(g): why for g, why in self.failed.items()},
       }
       self.checkpoints.save(self.chunks, self.state, meta)
@@ -386,9 +386,9 @@ class Trainer:
       failed = {int(g): str(why) for g, why in meta.get("failed", {}).items()}
       counters = {name: read(meta[name]) for name, read in COUNTERS.items()}
       sums = np.asarray(meta["sums"], float)
-      shown = np.asarray(meta.get("shown", self.shown), bool)
+      driven = np.asarray(meta.get("driven", self.driven), bool)
       robots = self.returns.sums.shape
-      if counters["phase"] not in self.collect or not robots == sums.shape == shown.shape:
+      if counters["phase"] not in self.collect or not robots == sums.shape == driven.shape:
         raise ValueError(f"phase {counters['phase']!r}, returns of {sums.shape}")
     except (AttributeError, KeyError, TypeError, ValueError) as e:
       why = f"no {e}" if isinstance(e, KeyError) else e
@@ -397,7 +397,7 @@ class Trainer:
         "--overwrite begins anew"
       ) from None
     vars(self).update(counters, chunks=chunks, rows=rows[:chunks], failed=failed)
-    self.state, self.returns.sums, self.shown = self._place(state), sums, shown.copy()
+    self.state, self.returns.sums, self.driven = self._place(state), sums, driven.copy()
 
 
 def run(

@@ -685,11 +685,11 @@ def test_a_return_that_the_demonstrator_began_is_not_the_agents(
   again.resume()
   driven = np.arange(ENVS) < 2
   for one in (trainer, again):
-    assert (one.shown == driven).all()
+    assert (one.driven == driven).all()
     row = one.step()
     # of episodes of 12 steps: the driven robots' first is left out
     ended = (np.asarray(one.state.streams.t)[0] // 12) - ((one.chunks - 1) * train.CHUNK // 12)
-    assert row["episodes"] == int((ended - driven).sum()) and not one.shown.any()
+    assert row["episodes"] == int((ended - driven).sum()) and not one.driven.any()
 
 
 def test_at_least_pure_updates_are_pure(short_walker, tmp_path, expert_path):
