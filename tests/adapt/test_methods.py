@@ -52,14 +52,8 @@ NAMES = [*methods.METHODS, "example"]
 NAMES += [name for name in ARMS if name not in ARMS.own and methods.of(ARMS[name]) != methods.PAPER]
 
 
-@pytest.fixture
-def arm(request, example):
-  """Name of an arm of the method, started by alarms."""
-  own = {"paper": "detector", "example": example}
-  return own.get(request.param, request.param)
-
-
-each = pytest.mark.parametrize("arm", NAMES, indirect=True)
+OWN = {"paper": "detector"}  # name of the arm of a method, started by alarms, where it differs
+each = pytest.mark.parametrize("g", range(len(NAMES)), ids=NAMES)
 
 
 def begin(loop, arms, train):
@@ -103,10 +97,15 @@ def live(arms, at=0, state=None):
 
 
 @pytest.fixture(scope="module")
-def lived():
-  """lived(arm): a life of it beside the paper's method and one that never learns."""
-  kept = {}
-  return lambda arm: kept[arm] if arm in kept else kept.setdefault(arm, live(three(arm)))
+def arms(example):
+  """Each method's arm and, as the last, one that never learns: streams of one program."""
+  return (*(example if name == "example" else OWN.get(name, name) for name in NAMES), "none")
+
+
+@pytest.fixture(scope="module")
+def lived(arms):
+  """Their lives side by side."""
+  return live(arms)
 
 
 def three(arm):
@@ -120,60 +119,60 @@ def stream(tree, g):
 
 
 @each
-def test_shapes_are_right(arm):
-  methods.check(arm, methods.of(ARMS[arm]), AGENT)
+def test_shapes_are_right(arms, g):
+  methods.check(arms[g], methods.of(ARMS[arms[g]]), AGENT)
 
 
 @each
-def test_it_is_frozen_until_the_alarm(lived, arm, same):
-  states, digests = lived(arm)
-  first = next(c for c, d in enumerate(digests) if d.decision[0] == decide.START)
+def test_it_is_frozen_until_the_alarm(lived, g, same):
+  states, digests = lived
+  first = next(c for c, d in enumerate(digests) if d.decision[g] == decide.START)
   assert first == ALARMED // STEPS
   for state in states[: first + 1]:
     for tree in ("acting", "train"):
-      assert same(stream(getattr(state, tree), 0), stream(getattr(states[0], tree), 0))
-  assert (digests[-1].updates[0] > 0) == (arm != "still")
-  changed = lambda tree: not same(stream(tree(states[-1]), 0), stream(tree(states[0]), 0))
-  assert changed(lambda s: s.acting) and changed(lambda s: s.train.params) == (arm != "still")
+      assert same(stream(getattr(state, tree), g), stream(getattr(states[0], tree), g))
+  learns = NAMES[g] != "still"
+  assert (digests[-1].updates[g] > 0) == learns
+  changed = lambda tree: not same(stream(tree(states[-1]), g), stream(tree(states[0]), g))
+  assert changed(lambda s: s.acting) and changed(lambda s: s.train.params) == learns
 
 
 @each
-def test_it_learns_from_what_came_after_the_alarm_alone(lived, arm):
-  states, digests = lived(arm)
-  rows = states[-1].replay.data.obs[0, 0, :, 0]
-  count = int(states[-1].replay.count[0, 0])
+def test_it_learns_from_what_came_after_the_alarm_alone(lived, g):
+  states, digests = lived
+  rows = states[-1].replay.data.obs[g, 0, :, 0]
+  count = int(states[-1].replay.count[g, 0])
   assert count > 5 * STEPS and (rows[:count] > ALARMED).all()
 
 
-@each
-def test_others_are_untouched(lived, arm, same):
-  """The stream that never learns to the last bit; the paper's as without the method beside it, up
-  to rounding: it is another program.
+def test_others_are_untouched(lived, same):
+  """The stream that never learns to the last bit; the paper's as without the methods beside it,
+  up to rounding: it is another program.
   """
-  states, digests = lived(arm)
+  states, digests = lived
   for tree in ("acting", "train"):
-    assert same(stream(getattr(states[-1], tree), 2), stream(getattr(states[0], tree), 2))
-  alone, _ = lived("detector")
-  flat = lambda state: np.concatenate([x[1].ravel() for x in jax.tree.leaves(state.acting)])
-  moved = np.linalg.norm(flat(alone[8]) - flat(alone[0]))
-  assert moved > 0 and np.linalg.norm(flat(states[8]) - flat(alone[8])) < 0.05 * moved
+    assert same(stream(getattr(states[-1], tree), -1), stream(getattr(states[0], tree), -1))
+  alone, _ = live(("detector", "none"))
+  flat = lambda state, g: np.concatenate([x[g].ravel() for x in jax.tree.leaves(state.acting)])
+  moved = np.linalg.norm(flat(alone[8], 0) - flat(alone[0], 0))
+  beside = flat(states[8], NAMES.index("paper"))
+  assert moved > 0 and np.linalg.norm(beside - flat(alone[8], 0)) < 0.05 * moved
 
 
 @each
-def test_what_acts_when_it_is_over_is_learnt_on_from(lived, arm, same):
-  states, digests = lived(arm)
-  over = next(c for c, d in enumerate(digests) if d.decision[0] == decide.ABORT_BUDGET)
+def test_what_acts_when_it_is_over_is_learnt_on_from(lived, g, same):
+  states, digests = lived
+  over = next(c for c, d in enumerate(digests) if d.decision[g] == decide.ABORT_BUDGET)
   for state in states[over + 1 :]:
-    acts, learns = stream(state.acting, 0), stream(state.train.params, 0)
+    acts, learns = stream(state.acting, g), stream(state.train.params, g)
     own = {**acts["pol"], "std": learns["pol"]["std"]}  # a robot may be quieter than its dreams
     assert same({**acts, "pol": own}, learns)
-    assert same(acts, stream(states[over + 1].acting, 0))
+    assert same(acts, stream(states[over + 1].acting, g))
 
 
-@each
-def test_it_goes_on_from_a_checkpoint(lived, arm, same):
-  states, _ = lived(arm)
-  again, _ = live(three(arm), 6, states[6])
+def test_they_go_on_from_a_checkpoint(lived, arms, same):
+  states, _ = lived
+  again, _ = live(arms, 6, states[6])
   assert same(again[-1], states[-1])
 
 
@@ -219,11 +218,12 @@ def test_a_residual_is_linear_and_bounded_by_hand(same):
 
 
 def test_a_calm_robot_explores_in_dreams_alone(lived):
-  states, digests = lived("calm")
+  states, digests = lived
+  g = NAMES.index("calm")
   deter = jax.random.normal(jax.random.key(1), (5, AGENT.size.deter))
   stoch = AGENT.hot(jnp.zeros((5, AGENT.size.stoch), int))
-  spread = lambda params: np.asarray(AGENT._policy(stream(params, 0), deter, stoch)[1])
-  learning = [c for c, d in enumerate(digests) if d.phase[0] == decide.ADAPTING and d.updates[0]]
+  spread = lambda params: np.asarray(AGENT._policy(stream(params, g), deter, stoch)[1])
+  learning = [c for c, d in enumerate(digests) if d.phase[g] == decide.ADAPTING and d.updates[g]]
   least, _ = AGENT.deviations
   for c, state in enumerate(states[1:]):
     assert (spread(state.train.params) > 2 * least).all()  # what dreams
@@ -236,15 +236,16 @@ def test_a_quiet_robot_explores_in_dreams_alone(lived, same):
   least, _ = AGENT.deviations
   deter = jax.random.normal(jax.random.key(1), (5, AGENT.size.deter))
   stoch = AGENT.hot(jnp.zeros((5, AGENT.size.stoch), int))
-  spread = lambda params: np.asarray(AGENT._policy(stream(params, 0), deter, stoch)[1])
+  states, digests = lived
   for arm in ("quiet", "quiet-guarded", "still"):
-    states, digests = lived(arm)
-    first = next(c for c, d in enumerate(digests) if d.decision[0] == decide.START)
+    g = NAMES.index(arm)
+    spread = lambda params: np.asarray(AGENT._policy(stream(params, g), deter, stoch)[1])
+    first = next(c for c, d in enumerate(digests) if d.decision[g] == decide.START)
     for c, state in enumerate(states):
       assert (spread(state.train.params) > 2 * least).all()
       assert (spread(state.acting).max() < 1.001 * least) == (c > first)
-  still = states[-1]  # but for its deviations as it was
-  acts, was = stream(still.acting, 0), stream(states[0].acting, 0)
+  # `still`: but for its deviations as it was
+  acts, was = stream(states[-1].acting, g), stream(states[0].acting, g)
   assert same({**acts, "pol": {**acts["pol"], "std": was["pol"]["std"]}}, was)
 
 
