@@ -40,10 +40,7 @@ def build(
   """
   out, dreamer = pathlib.Path(out), scaled(env, dreamer)
   config = shown(config, out, demonstrator_name)
-  if demonstrator_name == "ppo":
-    _demonstrate(env, out / "demonstrator", seed)
-  trainer = Trainer(env, dreamer, config, out, seed, seeds)
-  trainer.about = {
+  about = {
     "env": env.spec.name,
     "preset": preset,
     "command": command,
@@ -53,7 +50,12 @@ def build(
     "train": dataclasses.asdict(config),
     "started_from": agent_name,
   }
-  values = {"command": "train", "seeds": seeds, **trainer.about, **runtime.provenance()}
+  values = {"command": "train", "seeds": seeds, **about, **runtime.provenance()}
+  if demonstrator_name == "ppo":
+    tables.write_json(out / "config.json", values)  # by which it goes on if it is cut off
+    _demonstrate(env, out / "demonstrator", seed, resume)
+  trainer = Trainer(env, dreamer, config, out, seed, seeds)
+  trainer.about = about
   if resume and trainer.checkpoints.latest() is not None:
     trainer.resume()
   elif agent_name:  # one that was cut off before its first checkpoint begins anew
@@ -67,7 +69,7 @@ def build(
   return trainer
 
 
-def _demonstrate(env: Any, folder: pathlib.Path, seed: int) -> None:
+def _demonstrate(env: Any, folder: pathlib.Path, seed: int, resume: bool) -> None:
   """Trains the demonstrator of a training unless its policy lies there."""
   if (folder / "policy.npz").exists():
     return
@@ -81,6 +83,7 @@ def _demonstrate(env: Any, folder: pathlib.Path, seed: int) -> None:
       file=sys.stderr,
       flush=True,
     ),
+    resume=resume and (folder / "latest.msgpack").exists(),
   )
   os.replace(max(folder.glob("policy_*.npz")), folder / "policy.npz")
 

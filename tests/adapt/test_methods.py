@@ -96,21 +96,64 @@ def live(arms, at=0, state=None):
   return states, digests
 
 
+def _update(agent, memory, state, batch, key):
+  """A gradient step of the method's own: the policy stays."""
+  learnt, metrics, latents = agent.update(state, batch, key)
+  return learnt._replace(params={**learnt.params, "pol": state.params["pol"]}), metrics, latents
+
+
+COUNTS = Method(
+  init=lambda params: (jnp.int32(0), params["pol"]["std"]["bias"]),
+  act=lambda memory, view: Acts(quiet.still(view.acted), (memory[0] + 1, memory[1])),
+  learns=False,
+)
+TRIED = {  # arms of methods that this file alone has
+  "own": Arm("", ALARM, RULE, method=Method(update=_update)),
+  "part": Arm(  # the dynamics alone are taken up
+    "",
+    ALARM,
+    RULE,
+    method=Method(
+      keep=lambda memory, before, after: before._replace(
+        params={**before.params, "dyn": after.params["dyn"]}
+      )
+    ),
+  ),
+  "later": Arm("", ALARM, RULE, method=COUNTS),
+  "never": Arm("", NEVER, NO_END, method=COUNTS),
+  "hiding": Arm(
+    "",
+    ALARM,
+    RULE,
+    method=Method(
+      init=lambda params: jnp.int32(0),
+      act=lambda chunk, view: methods.average(chunk + 1, view),
+      hides=lambda chunk: chunk % 3 == 1,
+    ),
+  ),
+  "eager": Arm(
+    "", ALARM, RULE, method=Method(settings=Settings(average=1.0, start_windows=10_000))
+  ),
+}
+
+
 @pytest.fixture(scope="module")
 def arms(example):
-  """Each method's arm and, as the last, one that never learns: streams of one program."""
-  return (*(example if name == "example" else OWN.get(name, name) for name in NAMES), "none")
+  """Each method's arm, those of this file alone and one that never learns: streams of one program,
+  since an update takes long to compile.
+  """
+  contract = (example if name == "example" else OWN.get(name, name) for name in NAMES)
+  for name, arm in TRIED.items():
+    ARMS.members[name] = lambda arm=arm: arm
+  yield (*contract, *TRIED, "none")
+  for name in TRIED:
+    del ARMS.members[name]
 
 
 @pytest.fixture(scope="module")
 def lived(arms):
   """Their lives side by side."""
   return live(arms)
-
-
-def three(arm):
-  """It, the paper's and one that never learns."""
-  return arm, "detector", "none"
 
 
 def stream(tree, g):
@@ -249,60 +292,36 @@ def test_a_quiet_robot_explores_in_dreams_alone(lived, same):
   assert same({**acts, "pol": {**acts["pol"], "std": was["pol"]["std"]}}, was)
 
 
-def test_an_update_of_ones_own_takes_the_place_of_dreamers(same):
+def test_an_update_of_ones_own_takes_the_place_of_dreamers(lived, arms, same):
   """A gradient step of the method's own, in a stream beside another."""
-
-  def update(agent, memory, state, batch, key):
-    learnt, metrics, latents = agent.update(state, batch, key)
-    return learnt._replace(params={**learnt.params, "pol": state.params["pol"]}), metrics, latents
-
-  ARMS.members["own"] = lambda: Arm("", ALARM, RULE, method=Method(update=update))
-  try:
-    states, digests = live(three("own"))
-  finally:
-    del ARMS.members["own"]
-  own, paper = stream(states[-1].train, 0), stream(states[-1].train, 1)
-  assert same(own.params["pol"], stream(states[0].train.params["pol"], 0))
-  assert not same(paper.params["pol"], stream(states[0].train.params["pol"], 1))
-  assert digests[-1].updates[0] == digests[-1].updates[1] > 0
+  states, digests = lived
+  g, paper = arms.index("own"), arms.index("detector")
+  policy = lambda state, at: stream(state.train.params["pol"], at)
+  assert same(policy(states[-1], g), policy(states[0], g))
+  assert not same(policy(states[-1], paper), policy(states[0], paper))
+  assert digests[-1].updates[g] == digests[-1].updates[paper] > 0
 
 
-def test_an_update_counts_whatever_of_it_is_taken_up():
+def test_an_update_counts_whatever_of_it_is_taken_up(lived, arms):
   """From the state before, the dynamics alone replaced: the counter is the loop's."""
-  part = lambda before, after: before._replace(params={**before.params, "dyn": after.params["dyn"]})
-  method = Method(keep=lambda memory, before, after: part(before, after))
-  ARMS.members["part"] = lambda: Arm("", ALARM, RULE, method=method)
-  try:
-    _, digests = live(three("part"))
-  finally:
-    del ARMS.members["part"]
-  for digest in digests:
-    assert digest.updates[0] == digest.updates[1]
-  assert digests[-1].updates[0] > 0
+  g, paper = arms.index("part"), arms.index("detector")
+  for digest in lived[1]:
+    assert digest.updates[g] == digest.updates[paper]
+  assert digest.updates[g] > 0
 
 
-def test_a_method_waits_for_the_first_adaptation(same):
+def test_a_method_waits_for_the_first_adaptation(lived, arms, same):
   """Where all streams share a program, as on an accelerator: one that never adapts acts by what it
   came with, and its method remembers nothing; another's begins with what acted then.
   """
-  counts = Method(
-    init=lambda params: (jnp.int32(0), params["pol"]["std"]["bias"]),
-    act=lambda memory, view: Acts(quiet.still(view.acted), (memory[0] + 1, memory[1])),
-    learns=False,
-  )
-  ARMS.members["never"] = lambda: Arm("", NEVER, NO_END, method=counts)
-  ARMS.members["later"] = lambda: Arm("", ALARM, RULE, method=counts)
-  try:
-    states, digests = live(("later", "never", "none"))
-    own = methods.used(("later", "never", "none")).index(counts)
-  finally:
-    del ARMS.members["never"], ARMS.members["later"]
-  number, bias = states[-1].memory[own]
-  first = next(c for c, d in enumerate(digests) if d.decision[0] == decide.START)
-  assert number.tolist() == [len(digests) - first, 0, 0]
-  assert same(stream(states[-1].acting, 1), stream(states[0].acting, 1))
-  assert (stream(states[-1].acting, 0)["pol"]["std"]["bias"] == quiet.LOW).all()
-  assert (bias[0] == states[0].acting["pol"]["std"]["bias"][0]).all()
+  states, digests = lived
+  later, never = arms.index("later"), arms.index("never")
+  number, bias = states[-1].memory[methods.used(arms).index(COUNTS)]
+  first = next(c for c, d in enumerate(digests) if d.decision[later] == decide.START)
+  assert number[[later, never, -1]].tolist() == [len(digests) - first, 0, 0]
+  assert same(stream(states[-1].acting, never), stream(states[0].acting, never))
+  assert (stream(states[-1].acting, later)["pol"]["std"]["bias"] == quiet.LOW).all()
+  assert (bias[later] == states[0].acting["pol"]["std"]["bias"][later]).all()
 
 
 def test_a_quiet_robot_of_new_weights_has_their_deviations():
@@ -326,24 +345,15 @@ def test_a_quiet_robot_of_new_weights_has_their_deviations():
   assert (after(quiet.still(new)) == own["pol"]["std"]["bias"]).all()
 
 
-def test_the_rule_reads_nothing_of_a_chunk_that_a_method_hides():
-  counts = Method(
-    init=lambda params: jnp.int32(0),
-    act=lambda chunk, view: methods.average(chunk + 1, view),
-    hides=lambda chunk: chunk % 3 == 1,
-  )
-  ARMS.members["hiding"] = lambda: Arm("", ALARM, RULE, method=counts)
-  try:
-    states, digests = live(three("hiding"))
-  finally:
-    del ARMS.members["hiding"]
+def test_the_rule_reads_nothing_of_a_chunk_that_a_method_hides(lived, arms):
+  states, digests = lived
   phase = states[-1].phase
-  for g, want in ((0, True), (1, False)):
+  for g, want in ((arms.index("hiding"), True), (arms.index("detector"), False)):
     lived = slice(phase.count[g])
     hidden = np.isnan(phase.posture[g, lived])
     assert lived.stop > 4 and hidden.any() == want and not hidden.all()
     assert (np.isnan(phase.ring[g, lived]).all(1) == hidden).all()
-  assert np.isfinite(digests[-1].signals[0]).all()  # what is written down hides nothing
+    assert np.isfinite(digests[-1].signals[g]).all()  # what is written down hides nothing
 
 
 def test_who_is_told_its_stop_keeps_the_weights_of_that_snapshot(same):
@@ -483,21 +493,17 @@ def test_settings_of_a_method_stand_above_defaults_alone():
     Settings(start_windows=0)
 
 
-def test_a_loop_lives_by_the_settings_of_a_method():
+def test_a_loop_lives_by_the_settings_of_a_method(lived, arms):
   """Its own rate of the moving average; the run's `start_windows`, which is no default, stands."""
-  settings = Settings(average=1.0, start_windows=10_000)
-  ARMS.members["eager"] = lambda: Arm("", ALARM, RULE, method=Method(settings=settings))
-  try:
-    states, digests = live(three("eager"))
-  finally:
-    del ARMS.members["eager"]
+  states, digests = lived
+  eager, paper = arms.index("eager"), arms.index("detector")
   before = states[END - 1]  # still adapting
   apart = lambda g: max(
     np.abs(x[g] - y[g]).max()
     for x, y in zip(jax.tree.leaves(before.acting), jax.tree.leaves(before.train.params))
   )
-  assert apart(0) < 1e-6 < 1e-4 < apart(1)  # a + (p - a) is p but for rounding
-  assert digests[-1].updates[0] == digests[-1].updates[1] > 0
+  assert apart(eager) < 1e-6 < 1e-4 < apart(paper)  # a + (p - a) is p but for rounding
+  assert digests[-1].updates[eager] == digests[-1].updates[paper] > 0
 
 
 def test_what_must_be_back_by_hand():

@@ -297,6 +297,26 @@ def test_overwrite_of_the_folder_that_the_agent_lies_in_is_refused(begun, capsys
   )
 
 
+def test_a_demonstrator_that_was_cut_off_goes_on(tmp_path, monkeypatch, capsys):
+  asked = []
+
+  def cut(env, folder, steps, seed, progress, resume):
+    asked.append((seed, resume))
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "latest.msgpack").write_bytes(b"networks")
+    interrupt.note(signal.SIGINT)
+    raise KeyboardInterrupt
+
+  monkeypatch.setattr(demonstrator, "train", cut)
+  argv = ["train", "walker", "--preset", "tiny", "--demonstrator", "ppo", "--out", str(tmp_path)]
+  argv += ["--set", "clone=10", "fade=10", "pure=10"]
+  for more in ([], ["--resume"], ["--overwrite"]):
+    assert app.main([*argv, *more]) == 130, capsys.readouterr().err
+  assert asked == [(0, False), (0, True), (0, False)]
+  capsys.readouterr()
+  assert app.main([*argv, "--seed", "1", "--resume"]) == 2 and "seed" in capsys.readouterr().err
+
+
 def test_what_a_demonstrator_asks_for_is_said_before_an_earlier_training_is_gone(begun, capsys):
   argv, out = begun
   before = (out / "config.json").read_text()
