@@ -117,6 +117,10 @@ def chosen(args: Train) -> tuple[DreamerConfig, TrainConfig]:
     choose("setting", name, dict.fromkeys(names | known))
   field_kinds("--set", DreamerConfig, rest)
   dreamer = replace(preset.dreamer, **rest)
+  require(
+    not args.agent or "warmup" not in rest,
+    "--set warmup does nothing with --agent, whose optimiser is past it; leave it out, lr acts",
+  )
   require(args.seeds >= 1, f"seeds must be above 0; got {args.seeds}")
   check_seeds(args.seed)
   every = args.save_every_s

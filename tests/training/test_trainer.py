@@ -333,6 +333,7 @@ def test_what_a_demonstrator_asks_for_is_said_before_an_earlier_training_is_gone
     (["anchor=0.1", "shake=0.1"], "shake puts random ones"),
     (["shaping=1"], "has no shaping terms"),
     (["severity=0.5"], "severity is of a fault"),
+    (["warmup=10", "--agent", "walker"], "warmup does nothing with --agent"),
     (["demonstrator=ppo", "clone=10", "fade=10", "pure=10"], "cannot read demonstrator"),
   ],
 )
