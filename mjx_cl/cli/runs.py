@@ -194,24 +194,25 @@ def live(
   """Runs what is left of a suite's parts and returns bench.json's value; arguments as of `planned`,
   jobs: parts side by side, None: as many as this machine takes, on: a cluster.
   """
-  done, found, estimates, lines = planned(plan, parts, out, others)
-  folders.make(out)
-  bench.take(out, parts, found)
-  for name in found:
-    say(f"{name}: taken over")
-  needs = [estimates[p.name].bytes for p in parts if p.name not in done]
-  most, space = max(needs, default=0), int(memory.MARGIN * memory.free())
-  require(
-    most <= space or on is not None,
-    f"a part needs {most / 2**30:.1f} GiB, {space / 2**30:.1f} GiB may be used; fewer "
-    "--seeds would fit",
-  )
-  jobs = workers.number(jobs, needs, space) if on is None else 1
-  for line in lines:
-    say(line)
-  return bench.execute(
-    plan, out, parts, estimates, say, RunDisplay, jobs=jobs, worker=WORKER, on=on
-  )
+  with folders.alone(out):
+    done, found, estimates, lines = planned(plan, parts, out, others)
+    folders.make(out)
+    bench.take(out, parts, found)
+    for name in found:
+      say(f"{name}: taken over")
+    needs = [estimates[p.name].bytes for p in parts if p.name not in done]
+    most, space = max(needs, default=0), int(memory.MARGIN * memory.free())
+    require(
+      most <= space or on is not None,
+      f"a part needs {most / 2**30:.1f} GiB, {space / 2**30:.1f} GiB may be used; fewer "
+      "--seeds would fit",
+    )
+    jobs = workers.number(jobs, needs, space) if on is None else 1
+    for line in lines:
+      say(line)
+    return bench.execute(
+      plan, out, parts, estimates, say, RunDisplay, jobs=jobs, worker=WORKER, on=on
+    )
 
 
 def asked(args: Bench) -> tuple[Suite, list[Part]]:

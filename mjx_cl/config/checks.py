@@ -83,7 +83,8 @@ def kinds(where: str, annotations: dict[str, str], values: dict, before: str = "
 
 def field_kinds(where: str, of: type, values: dict, before: str = "") -> None:
   """`kinds` of the fields of the dataclass `of`."""
-  kinds(where, {field.name: str(field.type) for field in dataclasses.fields(of)}, values, before)
+  written = lambda kind: kind.__name__ if isinstance(kind, type) else str(kind)
+  kinds(where, {f.name: written(f.type) for f in dataclasses.fields(of)}, values, before)
 
 
 def check_seeds(first: int, count: int = 1, name: str = "seed") -> None:

@@ -152,7 +152,8 @@ def describe(
   """Spec of a robot by what its MuJoCo model says; arguments as the attributes of `Robot`."""
   scales = np.broadcast_to(np.asarray(scale, np.float32), (len(names),))
   motors = tuple(_motor(host, i) for i in range(host.nu))
-  bodies = [b for b in range(1, host.nbody) if host.body_mass[b] > 0]
+  # what is welded to the world is ground
+  bodies = [b for b in range(1, host.nbody) if host.body_mass[b] > 0 and host.body_weldid[b]]
   ids = (
     _feet(host)
     if feet is None
@@ -179,7 +180,7 @@ def _feet(host: mujoco.MjModel) -> dict[str, tuple[int, ...]]:
   for geom in range(host.ngeom):
     body = int(host.geom_bodyid[geom])
     touches = host.geom_contype[geom] or host.geom_conaffinity[geom]
-    if body > 0 and body not in parents and touches:
+    if host.body_weldid[body] and body not in parents and touches:
       out[_body(host, body)] = (*out.get(_body(host, body), ()), geom)
   return out
 

@@ -37,7 +37,12 @@ def dofs(env: Any, name: str) -> Float[np.ndarray, "act nv"]:
       f"fault {name!r} needs motors that act on joints, not on tendons, sites or bodies as in "
       f"robot {env.spec.name!r}"
     )
-  return np.eye(model.nv, dtype=np.float32)[model.jnt_dofadr[model.actuator_trnid[:, 0]]]
+  driven = model.actuator_trnid[:, 0]
+  if len(set(driven.tolist())) < model.nu:
+    raise UserError(
+      f"fault {name!r} needs one motor per joint; robot {env.spec.name!r} has a joint with several"
+    )
+  return np.eye(model.nv, dtype=np.float32)[model.jnt_dofadr[driven]]
 
 
 def check_motors(env: Any, name: str) -> None:

@@ -129,10 +129,11 @@ def joint_friction(env: Any) -> Fault:
       "fault 'joint_friction' needs motors with a greatest torque (ctrlrange of a motor, or "
       f"forcerange), which robot {env.spec.name!r} does not state"
     )
-  if env.physics.name == "mjx" and not (model.dof_frictionloss > 0).any():
+  physics = getattr(getattr(env, "physics", None), "name", None)  # a robot in pure JAX has none
+  if physics == "mjx" and not (model.dof_frictionloss[which.any(0)] > 0).all():
     raise UserError(
-      "fault 'joint_friction': MJX builds no friction constraint for a model whose joints have "
-      "none, so it would do nothing; choose physics native"
+      "fault 'joint_friction': MJX builds no friction constraint for a joint that has none, so it "
+      "would do nothing there; choose physics native"
     )
   return leafwise(
     "joint_friction",

@@ -89,7 +89,7 @@ def factor(plan: Plan, walk: Float[Array, "*f"], t: Step) -> Float[Array, "*f"]:
   phase = jnp.mod(since, plan.period).astype(jnp.float32)
   period = plan.period.astype(jnp.float32)
   ramp = jnp.minimum(1.0, (since + 1).astype(jnp.float32) / period)
-  on = (phase < plan.share * period).astype(jnp.float32)
+  on = (phase < plan.share * period * (1 - 1e-6)).astype(jnp.float32)  # 0.3f 100 is above 30
   wave = 0.5 - 0.5 * jnp.cos(2 * jnp.pi * (phase + 1) / period)
   kinds = jnp.stack([jnp.ones_like(ramp), ramp, on, wave, jnp.broadcast_to(walk, ramp.shape)])
   chosen = jnp.take_along_axis(kinds, plan.kind[None], 0)[0]

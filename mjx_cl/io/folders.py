@@ -98,12 +98,16 @@ def usable(out: str | os.PathLike) -> pathlib.Path:
 
 
 @contextlib.contextmanager
-def alone(out: str | os.PathLike) -> Iterator[None]:
+def alone(out: str | os.PathLike, wait: bool = False) -> Iterator[None]:
   """No other process of this machine and user that asks likewise writes into `out` meanwhile. A
   lock ends with its process, however that ends; where the system has none, nothing is asked.
 
+  Args:
+    out: the folder.
+    wait: for another process that does.
+
   Raises:
-    UserError: one does.
+    UserError: one does, without `wait`.
   """
   path = str(usable(out).resolve())
   if fcntl is None or path in _HELD:
@@ -121,7 +125,7 @@ def alone(out: str | os.PathLike) -> Iterator[None]:
     return
   try:
     try:
-      fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+      fcntl.flock(fd, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:
       who = os.read(fd, 20).decode(errors="replace").strip()
       raise UserError(
@@ -179,13 +183,13 @@ def differing(
   return found
 
 
-# what a run or training leaves beside config.json
+# what a run or training leaves beside config.json; first what says that it is finished
 RESULTS = (
+  "summary.json",
   "trace.parquet",
   "events.parquet",
   "runs.parquet",
   "residuals.parquet",
-  "summary.json",
   "figure.png",
   "metrics.parquet",
   "signals.parquet",

@@ -75,6 +75,7 @@ class Mjx:
       a free or ball joint
     body_invweight0_b  = mean diagonal of J M^-1 J^T, J (3, nv) of b's centre of mass, for
     translation and rotation
+    tendon_invweight0  = diagonal of J M^-1 J^T, J (tendons, nv)
     """
     m, host = model, self.mj_model
     data = mjx.com_pos(m, mjx.kinematics(m, self._data.replace(qpos=m.qpos0)))
@@ -96,11 +97,15 @@ class Mjx:
       else:
         jacobians = mjx.jac(m, data, data.xipos[b], b)  # (nv, 3) each
         weights.append(jnp.stack([jnp.trace(j.T @ inverse @ j) / 3 for j in jacobians]))
-    return {
+    out = {
       "body_subtreemass": jnp.asarray(below) @ m.body_mass,
       "dof_invweight0": dof,
       "body_invweight0": jnp.stack(weights),
     }
+    if host.ntendon:
+      moments = mjx.tendon(m, data)._impl.ten_J
+      out["tendon_invweight0"] = jnp.diag(moments @ inverse @ moments.T)
+    return out
 
   def step(
     self,

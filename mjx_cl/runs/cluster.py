@@ -148,7 +148,8 @@ def run_part(
   out, shared = folder_of(given)
   if not shared:
     folders.make(out)
-    folders.atomic(out / "suite.json", lambda file: file.write(given.suite.encode()))
+    with folders.alone(out, wait=True):  # other tasks of this machine begin at the same moment
+      folders.atomic(out / "suite.json", lambda file: file.write(given.suite.encode()))
   with own_core() as cores:
     told = _process(name, given, out, cores, tell, stopped)
   if told.code or shared:

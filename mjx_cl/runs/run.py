@@ -151,18 +151,23 @@ def live(
   """
   saved, last = time.monotonic(), None
   with Interruptible() as interrupt:
-    while not runner.done:
-      last = runner.step()
-      progress(last)
+
+    def heed() -> None:
+      """Between two chunks; a second signal, within one, leaves nothing whole to save."""
       try:
         interrupt.check()
       except KeyboardInterrupt:
-        # between two chunks; a second signal, in the middle of one, leaves nothing whole to save
         runner.save()
         raise
+
+    while not runner.done:
+      last = runner.step()
+      progress(last)
+      heed()
       if time.monotonic() - saved > save_every_s:
         runner.save()
         saved = time.monotonic()
+        heed()  # a signal during the last save too
   return last
 
 

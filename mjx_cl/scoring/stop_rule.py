@@ -90,11 +90,16 @@ def spans(happened: list[dict]) -> list[dict]:
     if e["kind"] == "start":
       unknown = {"stop": None, "outcome": "adapting", "reason": None}
       out.append({k: e[k] for k in ("stream", "arm", "seed", "since")} | unknown)
-    elif e["kind"] in ("stop", "abort"):
+    # a numeric failure aborts a stream that adapts or not
+    elif e["kind"] in ("stop", "abort") and out and _open(out[-1], e["stream"]):
       stopped = "converged" if ARMS[e["arm"]].end.rule else "ended"
       outcome = stopped if e["kind"] == "stop" else "aborted"
       out[-1] |= {"stop": e["step"], "outcome": outcome, "reason": e["reason"]}
   return out
+
+
+def _open(span: dict, stream: int) -> bool:
+  return span["stream"] == stream and span["stop"] is None
 
 
 def unrecoverable(runs: list[dict]) -> dict[int, bool | None]:

@@ -328,6 +328,33 @@ def test_wrong_calls_are_refused(short_walker, vector):
     adapters.gymnasium_env(short_walker).reset(options={"height": 2})
 
 
+def test_settings_of_a_fault_may_be_numpys(short_walker):
+  settings = {"severity": np.float32(0.5), "onset": np.int64(3), "duration": np.int32(5)}
+  assert adapters.gymnasium_env(short_walker, fault="gear", **settings)
+
+
+def test_a_copy_shares_environment_and_programs(vector):
+  robots = vector.robots
+  for other in (copy.copy(robots), copy.deepcopy(robots)):
+    assert other is not robots and other.env is robots.env and other._step is robots._step
+
+
+@pytest.mark.parametrize(
+  "given, said",
+  [
+    ({"severity": 0.9}, "severity and target are of a fault"),
+    ({"target": "trunk"}, "severity and target are of a fault"),
+    ({"fault": "gear", "onset": 10.7}, "onset takes int; got 10.7"),
+    ({"fault": "gear", "severity": "0.5"}, "severity takes float; got '0.5'"),
+    ({"fault": "gear", "onset": float("nan")}, "onset takes int; got nan"),
+  ],
+)
+def test_settings_of_a_fault_are_refused_in_a_line(short_walker, given, said):
+  with pytest.raises(UserError, match=said) as refused:
+    adapters.gymnasium_env(short_walker, **given)
+  assert "\n" not in str(refused.value)
+
+
 @pytest.mark.parametrize(
   "package, call",
   [

@@ -433,6 +433,9 @@ def test_schedules_against_loops():
   np.testing.assert_allclose(
     follow("intermittent", share=0.25), np.where(after & (since % 8 < 2), 1.0, 0), atol=1e-6
   )
+  for share, on in ((0.3, 30), (0.6, 60), (0.54, 54), (1.0, 100)):  # 0.3f x 100 is above 30
+    acts = follow("intermittent", onset=0, period=100, share=share, steps=100)
+    assert acts.tolist() == [1.0] * on + [0.0] * (100 - on)
   np.testing.assert_allclose(
     follow("cyclic"),
     np.where(after, 0.5 - 0.5 * np.cos(2 * np.pi * (since % 8 + 1) / 8), 0),

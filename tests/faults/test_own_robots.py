@@ -91,3 +91,49 @@ def test_wind_blows_along_the_world_where_the_trunk_is_turned():
   force = {name: float(driven(env, "wind", name).force[0]) for name in ("left", "right")}
   assert force["left"] == pytest.approx(-force["right"]) and abs(force["left"]) > 0
   assert np.isclose(force["left"], abs(force["left"]))  # left is the world's y, as the slide is
+
+
+def test_what_is_welded_to_the_world_is_neither_trunk_nor_foot():
+  xml = f"""<mujoco><worldbody><body name="ramp"><geom type="box" size="1 1 .1" pos="0 0 -.2"
+    mass="200"/></body><body name="block" pos="0 0 .1"><freejoint/><geom type="box"
+    size=".1 .1 .1" mass="1"/><body name="leg" pos="0 0 -.1"><joint name="h" type="hinge"
+    axis="0 1 0"/><geom name="toe" type="sphere" size=".02" mass=".1" priority="1"/></body></body>
+    </worldbody><actuator><motor name="h" joint="h" {LIMITED}/></actuator></mujoco>"""
+  env = robot(xml)
+  assert [name for name, _ in env.spec.bodies] == ["block", "leg"]
+  assert [name for name, _ in env.spec.feet] == ["leg"]
+  mass = driven(env, "payload", "trunk").mj["body_mass"] - env.model.mj["body_mass"]
+  assert (np.asarray(mass) > 0).tolist() == [False, False, True, False]
+  assert {"com", "wind", "push", "friction"} <= faults.available(env).keys()
+
+
+def test_a_joint_of_two_motors_is_no_motors_joint():
+  """A position and a velocity servo: what breaks one of them alone would break both or none."""
+  xml = f"""<mujoco><worldbody><body name="cart"><joint name="slide" type="slide" axis="1 0 0"
+    limited="true" range="-2 2"/>{LINK}</body></worldbody><actuator><position name="p" joint="slide"
+    {LIMITED}/><velocity name="v" joint="slide" {LIMITED}/></actuator></mujoco>"""
+  env = robot(xml)
+  for name in ("joint_damping", "joint_friction", "range_loss", "joint_lock"):
+    with pytest.raises(UserError, match="has a joint with several"):
+      faults.make(name, env)
+  assert "noise" in faults.available(env)
+
+
+def test_mjx_takes_dry_friction_where_every_joint_has_some():
+  xml = f"""<mujoco><worldbody><body name="a"><joint name="j" type="hinge" axis="0 1 0"
+    frictionloss=".1"/>{LINK}<body name="b" pos=".4 0 0"><joint name="k" type="hinge" axis="0 1 0"
+    FRICTION/>{LINK}</body></body></worldbody><actuator><motor name="j" joint="j" {LIMITED}/><motor
+    name="k" joint="k" {LIMITED}/></actuator></mujoco>"""
+  own = lambda friction, on: type(robot(xml.replace("FRICTION", friction)))(on)
+  for friction, on in (("", "native"), ('frictionloss=".1"', "mjx")):
+    assert faults.make("joint_friction", own(friction, on))
+  with pytest.raises(
+    UserError, match="MJX builds no friction constraint for a joint that has none"
+  ):
+    faults.make("joint_friction", own("", "mjx"))
+
+
+def test_a_robot_that_names_no_physics_has_faults(monkeypatch):
+  env = robot(ARM.replace("MOTOR", SERVO.replace("FORCE", STRONG)))
+  monkeypatch.delattr(env, "physics")
+  assert "joint_friction" in faults.available(env)

@@ -522,6 +522,26 @@ def test_mjx_derives_the_constants_that_mujoco_does(walker):
       np.testing.assert_allclose(got, want, rtol=5e-5, atol=1e-6 * np.abs(want).max(), err_msg=name)
 
 
+def test_mjx_derives_the_weight_of_a_tendon():
+  """Of a fixed and a spatial one, as mj_setConst does; float32."""
+  model = mujoco.MjModel.from_xml_string("""<mujoco><worldbody><site name="a" pos="0 0 1"/><body>
+    <joint name="j" type="hinge" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 .4 0 0" size=".03"
+    mass="1"/><body pos=".4 0 0"><joint name="k" type="hinge" axis="0 1 0"/><geom type="capsule"
+    fromto="0 0 0 .4 0 0" size=".03" mass="1"/><site name="b" pos=".3 0 0"/></body></body></worldbody>
+    <tendon><fixed limited="true" range="-1 1"><joint joint="j" coef="1"/><joint joint="k"
+    coef="-.5"/></fixed><spatial limited="true" range="0 2"><site site="a"/><site site="b"/></spatial>
+    </tendon></mujoco>""")
+  mjx = physics.make("mjx", model, substeps=1)
+  before = model.tendon_invweight0.copy()
+  own = {"body_mass": 3 * model.body_mass, "body_inertia": 3 * model.body_inertia}
+  got = mjx.model({k: v.astype(np.float32) for k, v in own.items()}).tendon_invweight0
+  for name, value in own.items():
+    getattr(model, name)[...] = value
+  mujoco.mj_setConst(model, mujoco.MjData(model))
+  np.testing.assert_allclose(got, model.tendon_invweight0, rtol=5e-5)
+  assert (model.tendon_invweight0 < 0.4 * before).all()
+
+
 def test_mjx_refuses_a_field_without_effect(walker):
   with pytest.raises(UserError, match="dof_frictionloss.*choose physics native"):
     physics.make("mjx", walker, substeps=1).model({"dof_frictionloss": np.ones(9, np.float32)})

@@ -3,6 +3,7 @@
 import dataclasses
 import pathlib
 import shutil
+import signal
 import types
 from typing import NamedTuple
 
@@ -58,6 +59,44 @@ def life(tmp_path, monkeypatch):
     return begun
 
   return live
+
+
+def test_a_signal_during_the_last_save_ends_the_run(monkeypatch):
+  """Else the next part of a suite would begin."""
+  saved = []
+
+  class Short:
+    done = False
+
+    def step(self):
+      self.done = True
+
+    def save(self):
+      saved.append(1)
+      if len(saved) == 1:
+        signal.raise_signal(signal.SIGINT)
+
+  with pytest.raises(KeyboardInterrupt):
+    run.live(Short(), lambda progress: None, save_every_s=0.0)
+  assert len(saved) == 2
+
+
+def test_what_says_that_a_run_is_finished_goes_first(tmp_path, monkeypatch):
+  """A kill while an earlier run is removed leaves one that is not finished."""
+  tables.write_json(tmp_path / "config.json", {})
+  for name in folders.RESULTS:
+    (tmp_path / name).write_text("x")
+  real, gone = pathlib.Path.unlink, []
+
+  def kill(path, missing_ok=False):
+    real(path, missing_ok=missing_ok)
+    gone.append(path.name)
+    raise KeyboardInterrupt
+
+  monkeypatch.setattr(pathlib.Path, "unlink", kill)
+  with pytest.raises(KeyboardInterrupt):
+    run.clear(tmp_path)
+  assert len(gone) == 1 and folders.claim_folder(tmp_path, True, False) == "resume"
 
 
 def test_traces_of_saves_that_failed_displace_none(life):

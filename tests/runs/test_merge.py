@@ -293,6 +293,20 @@ def test_of_another_version_or_in_use_is_not_taken(tmp_path):
   assert (busy / "summary.json").exists() and not (busy / "mine").exists()
 
 
+def test_a_suite_is_one_processs_alone(refused, tmp_path):  # noqa: F811
+  """Parts are run by settings that the folder holds, which another suite would replace."""
+  code = "import sys; from mjx_cl.io import folders\nwith folders.alone(sys.argv[1]):\n"
+  code += "  print('in', flush=True); sys.stdin.read()"
+  with subprocess.Popen(
+    [sys.executable, "-c", code, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+  ) as other:
+    assert other.stdout.readline() == b"in\n"
+    for command in (["bench", "quick"], ["run", "walker", "--fault", "gear", "bias"]):
+      assert "is being written by another" in refused(2, *command, "--out", tmp_path)
+    other.communicate(b"")
+  assert not list(tmp_path.iterdir())
+
+
 def test_bench_joins_and_publishes(mjx, refused, tmp_path):  # noqa: F811
   """`bench --merge` of folders with other seeds, as a user calls it; files of an earlier
   publication that no longer exist go.

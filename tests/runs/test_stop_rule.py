@@ -36,6 +36,20 @@ def test_which_arms_are_scored_and_on_which():
   assert [name for name, arm in ARMS.items() if stops(arm)] == ["detector", "oracle"]
 
 
+def test_an_abort_without_a_start_is_no_adaptation():
+  """A numeric failure aborts a nominal stream too: the span of another stream is not its."""
+  of = lambda stream, kind, step: {
+    **{"stream": stream, "arm": "detector", "seed": stream, "since": step},
+    **{"kind": kind, "step": step, "reason": kind},
+  }
+  assert stop_rule.spans([of(1, "abort", 6000)]) == []
+  begun, ended = of(0, "start", 100), of(0, "stop", 900)
+  (span,) = stop_rule.spans([begun, of(1, "abort", 6000)])
+  assert (span["stop"], span["outcome"]) == (None, "adapting")
+  (span,) = stop_rule.spans([begun, ended, of(0, "abort", 6000)])
+  assert (span["stop"], span["outcome"]) == (900, "converged")
+
+
 def test_the_oracle_stop_is_the_earliest_that_is_good_enough():
   age = [64, 1088, 2112, 3136, 4096]
   assert stop_rule.oracle(age, [0.2, 0.5, 0.76, 0.7, 0.8]) == 2  # 0.76 is 95 % of 0.8

@@ -2,7 +2,6 @@
 adapter holds.
 """
 
-import copy
 import dataclasses
 import types
 from collections.abc import Callable, Sequence
@@ -13,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_cl import envs, faults
+from mjx_cl.config.checks import field_kinds
 from mjx_cl.dreamer.agent import Carry
 from mjx_cl.errors import UserError
 from mjx_cl.faults import presets
@@ -78,30 +78,35 @@ class FaultSettings:
     """What `faults.build` gives for them on `env`.
 
     Raises:
-      UserError for what `presets.resolve` refuses, and for a preset that turns the robot into
-      another one.
+      UserError for what `presets.resolve` refuses, for a value of another kind, for a severity or
+      target without a fault, and for a preset that turns the robot into another one.
     """
     robot = env.spec.name
+    plain = {k: v.item() if isinstance(v, np.generic) else v for k, v in vars(self).items()}
+    field_kinds("fault", FaultSettings, plain)
+    own = FaultSettings(**plain)
+    if own.fault == "none" and (own.severity or own.target is not None):
+      raise UserError("severity and target are of a fault; give fault=NAME too, or leave them out")
     changes = presets.resolve(
       robot,
-      self.fault,
-      None if self.target == "random" else self.target,
-      self.severity,
-      self.duration,
-      self.schedule,
-      self.period,
-      self.share,
+      own.fault,
+      None if own.target == "random" else own.target,
+      own.severity,
+      own.duration,
+      own.schedule,
+      own.period,
+      own.share,
     )
-    if presets.named(self.fault) and (other := presets.find(self.fault, robot).becomes):
+    if presets.named(own.fault) and (other := presets.find(own.fault, robot).becomes):
       raise UserError(
-        f"preset {self.fault!r} turns the robot into {other!r}, which only `mjx-cl run` does; take "
+        f"preset {own.fault!r} turns the robot into {other!r}, which only `mjx-cl run` does; take "
         f"{other!r} itself"
       )
-    if self.onset < 0:
-      raise UserError(f"onset must be at least 0; got {self.onset}")
-    if self.onset >= (last := faults.FOREVER - max(c.after for c in changes)):
-      raise UserError(f"onset must be below {last:,}; got {self.onset}")
-    return faults.build(changes, env, self.onset)
+    if own.onset < 0:
+      raise UserError(f"onset must be at least 0; got {own.onset}")
+    if own.onset >= (last := faults.FOREVER - max(c.after for c in changes)):
+      raise UserError(f"onset must be below {last:,}; got {own.onset}")
+    return faults.build(changes, env, own.onset)
 
 
 def join(
@@ -168,9 +173,15 @@ class Robots:
     self._reset, self._step = jax.jit(self._reset_where), jax.jit(self._step_where)
     self.streams, self.untouched = None, np.ones(num, bool)
 
-  def __deepcopy__(self, memo: dict) -> "Robots":
+  def __copy__(self) -> "Robots":
     """Robots whose lives part from here; environment and compiled programs are shared."""
-    return copy.copy(self)  # arrays are replaced, never written
+    new = object.__new__(type(self))  # `copy.copy` would go through __setstate__
+    new.__dict__.update(self.__dict__)  # arrays are replaced, never written
+    return new
+
+  def __deepcopy__(self, memo: dict) -> "Robots":
+    """As a shallow copy."""
+    return self.__copy__()
 
   def __getstate__(self) -> dict[str, Any]:
     return {
