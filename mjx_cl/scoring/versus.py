@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mjx_cl.config import own_agent
-from mjx_cl.errors import UserError, require
+from mjx_cl.errors import FileError, UserError, require
 from mjx_cl.io import tables
 from mjx_cl.scoring import intervals, stop_rule
 
@@ -28,6 +28,7 @@ MEASURES: dict[str, tuple[str, bool]] = {
 }
 ALL = tuple(MEASURES)[:5]  # of a comparison that names none
 SHARES = ("alarmed", "recovered")
+NEEDED = frozenset({"arm", "seed", "reward_pre", "reward_final"})  # columns of runs.parquet
 MUST_AGREE = (*stop_rule.SAME, "steps", "seeds", "first_seed")
 
 
@@ -148,6 +149,7 @@ def variants(words: list[str], change: int = 0) -> list[Variant]:
 
   Raises:
     UserError: no run there, no such arm or change, other robots, fewer than two variants.
+    FileError: files that are no run's.
   """
   found: list[Variant] = []
   seen: set[tuple[pathlib.Path, str]] = set()
@@ -155,7 +157,9 @@ def variants(words: list[str], change: int = 0) -> list[Variant]:
     if not (home / "runs.parquet").is_file() or not (home / "config.json").is_file():
       board = "; it holds a board: `mjx-cl query`" if (home / "methods.json").is_file() else ""
       raise UserError(f"{home} holds no finished run (no runs.parquet){board}")
-    rows = tables.read_rows(home / "runs.parquet")
+    rows, config = tables.read_rows(home / "runs.parquet"), tables.read_json(home / "config.json")
+    if not rows or NEEDED - rows[0].keys() or not isinstance(config.get("steps"), int):
+      raise FileError(f"{home}: not a run's files")
     arms = list(dict.fromkeys(str(row["arm"]) for row in rows))
     chosen = [arm] if arm else arms if len(words) == 1 or len(arms) == 1 else ["detector"]
     for name in chosen:
@@ -164,7 +168,6 @@ def variants(words: list[str], change: int = 0) -> list[Variant]:
       of = lambda row: int(row.get("change", 0))  # which the first runs did not write
       last = max(map(of, rows))
       require(0 <= change <= last, f"{home}: --change must lie in 0..{last}; got {change}")
-      config = tables.read_json(home / "config.json")
       ends = {r.get("stream"): r.get("onset") for r in rows if of(r) == change + 1}
       lived = lambda r: (ends.get(r.get("stream")) or config["steps"]) - (r.get("onset") or 0)
       mine = [r for r in rows if r["arm"] == name and of(r) == change]
@@ -203,27 +206,29 @@ def value(row: dict[str, Any], measure: str) -> float:
     return after / before if before and before > 0 and after is not None else np.nan
   if measure in ("alarmed", "latency_steps") and row.get("adapting_at_onset"):
     return np.nan  # it was finetuning when the change came
-  if measure == "alarmed":
+  if measure == "alarmed" and "latency_steps" in row:
     return float(row["latency_steps"] is not None)
-  if measure == "recovered":
+  if measure == "recovered" and "recovery_step" in row:
     return float(row["recovery_step"] is not None) if row.get("affected") else np.nan
   return np.nan if row.get(measure) is None else float(row[measure])
 
 
 def _beside(row: dict[str, Any], first: dict[str, Any], measure: str) -> float:
-  """A measure of one stream, as it is compared with the first variant's of the same seed: return is
-  lost against one reward before the change, that of the first, as a false alarm cuts a stream's own
-  short.
+  """A measure of one stream, as it is compared with the first variant's of the same seed: after the
+  first change return is lost against one reward before it, that of the first, as a false alarm cuts
+  a stream's own short; later each has another reward to lose.
   """
   found = value(row, measure)
+  if row.get("change"):
+    return found
   if measure == "return_lost" and None not in (row["reward_pre"], first["reward_pre"]):
     found += (first["reward_pre"] - row["reward_pre"]) * row["lived"]
   return found
 
 
 def against(one: Variant, first: Variant, measure: str) -> dict[str, Any]:
-  """A variant's measure and its difference from the first variant's, of `return_lost` that of the
-  return earned.
+  """A variant's measure and its difference from the first variant's, of `return_lost` after the
+  first change that of the return earned.
 
   Returns:
     streams (one a seed), iqm and iqm_ci of the variant, of SHARES mean and mean_ci; pairs (of the

@@ -4,6 +4,7 @@ import json
 import pathlib
 
 import numpy as np
+import pyarrow.parquet
 import pytest
 from scipy import stats
 
@@ -12,7 +13,8 @@ from mjx_cl.io import tables
 from mjx_cl.scoring import versus
 
 PRE = 2.0
-LOOP = pathlib.Path(__file__).parents[2] / "results" / "loop"
+RESULTS = pathlib.Path(__file__).parents[2] / "results"
+LOOP, AGAIN = RESULTS / "loop", RESULTS / "again/walker"
 
 
 def run_of(folder, arms, env="walker", steps=25_000):
@@ -69,6 +71,29 @@ def test_a_false_alarm_before_the_change_lowers_no_loss():
   cut = [k for k in one.rows if one.rows[k]["reward_pre"] != first.rows[k]["reward_pre"]]
   assert len(cut) == 2 and {one.rows[k]["false_alarms"] for k in cut} == {1}
   assert {r["lived"] for r in one.rows.values()} == {20_000}
+
+
+def test_after_a_later_change_losses_are_compared_as_they_stand():
+  """Each arm has another reward before the repair: the difference is that of what is printed."""
+  first, one = versus.variants([f"{AGAIN}:none", f"{AGAIN}:detector"], 1)
+  row = versus.against(one, first, "return_lost")
+  lost = lambda r: r["return_lost"]
+  want = np.mean([lost(one.rows[k]) - lost(first.rows[k]) for k in sorted(first.rows)])
+  assert row["difference"] == pytest.approx(want)
+  assert any(one.rows[k]["reward_pre"] != first.rows[k]["reward_pre"] for k in first.rows)
+
+
+@pytest.mark.parametrize("broken", ["config", "column", "empty"])
+def test_files_that_are_no_runs_are_a_line(tmp_path, mjx, broken):
+  run = run_of(tmp_path / "a", {"detector": [1.0, 1.2], "none": [1.0, 1.0]})
+  table = pyarrow.parquet.read_table(run / "runs.parquet")
+  if broken == "config":
+    tables.write_json(run / "config.json", {"a": 1})
+  else:
+    table = table.drop_columns("reward_pre") if broken == "column" else table.slice(0, 0)
+    pyarrow.parquet.write_table(table, run / "runs.parquet")
+  code, _, err = mjx(run)
+  assert code == 1 and "not a run's files" in err and err.count("\n") == 1
 
 
 def test_versions_of_the_benchmark_are_not_mixed(tmp_path, mjx):
