@@ -85,8 +85,6 @@ class FaultSettings:
     plain = {k: v.item() if isinstance(v, np.generic) else v for k, v in vars(self).items()}
     field_kinds("fault", FaultSettings, plain)
     own = FaultSettings(**plain)
-    if own.fault == "none" and (own.severity or own.target is not None):
-      raise UserError("severity and target are of a fault; give fault=NAME too, or leave them out")
     changes = presets.resolve(
       robot,
       own.fault,
@@ -97,6 +95,8 @@ class FaultSettings:
       own.period,
       own.share,
     )
+    if own.fault == "none" and (own.severity or own.target is not None):
+      raise UserError("severity and target are of a fault; name one too, or leave them out")
     if presets.named(own.fault) and (other := presets.find(own.fault, robot).becomes):
       raise UserError(
         f"preset {own.fault!r} turns the robot into {other!r}, which only `mjx-cl run` does; take "
