@@ -160,7 +160,7 @@ def test_spec_and_model(env):
   assert {(v.low, v.high) for v in spec.obs[:64]} == {(0, 1)} and (
     spec.obs[66].low,
     spec.obs[66].high,
-  ) == (-0.4189, 0.4189)
+  ) == pytest.approx((-1.05 * 0.4189, 1.05 * 0.4189))
   assert [v.name for v in spec.act] == list(spec.targets) == ["steering", "motor"] and {
     (v.low, v.high) for v in spec.act
   } == {(-1, 1)}
