@@ -527,10 +527,11 @@ def test_mjx_derives_the_weight_of_a_tendon():
   model = mujoco.MjModel.from_xml_string("""<mujoco><worldbody><site name="a" pos="0 0 1"/><body>
     <joint name="j" type="hinge" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 .4 0 0" size=".03"
     mass="1"/><body pos=".4 0 0"><joint name="k" type="hinge" axis="0 1 0"/><geom type="capsule"
-    fromto="0 0 0 .4 0 0" size=".03" mass="1"/><site name="b" pos=".3 0 0"/></body></body></worldbody>
-    <tendon><fixed limited="true" range="-1 1"><joint joint="j" coef="1"/><joint joint="k"
-    coef="-.5"/></fixed><spatial limited="true" range="0 2"><site site="a"/><site site="b"/></spatial>
-    </tendon></mujoco>""")
+    fromto="0 0 0 .4 0 0" size=".03" mass="1"/><site name="b" pos=".3 0 0"/></body></body>
+    </worldbody><tendon><fixed limited="true" range="-1 1"><joint joint="j" coef="1"/><joint
+    joint="k"
+    coef="-.5"/></fixed><spatial limited="true" range="0 2"><site site="a"/><site site="b"/>
+    </spatial></tendon></mujoco>""")
   mjx = physics.make("mjx", model, substeps=1)
   before = model.tendon_invweight0.copy()
   own = {"body_mass": 3 * model.body_mass, "body_inertia": 3 * model.body_inertia}

@@ -2,6 +2,7 @@
 was.
 """
 
+import contextlib
 import dataclasses
 import json
 import pathlib
@@ -267,6 +268,19 @@ def test_pieces_that_do_not_fit_are_one_line(tmp_path):
   assert not (tmp_path / "all/summary.json").exists()  # no finished run
 
 
+@contextlib.contextmanager
+def held(folder):
+  """Another process writes into the folder meanwhile."""
+  code = "import sys; from mjx_cl.io import folders\nwith folders.alone(sys.argv[1]):\n"
+  code += "  print('in', flush=True); sys.stdin.read()"
+  with subprocess.Popen(
+    [sys.executable, "-c", code, str(folder)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+  ) as other:
+    assert other.stdout.readline() == b"in\n"
+    yield
+    other.communicate(b"")
+
+
 def test_of_another_version_or_in_use_is_not_taken(tmp_path):
   """A part that another process is living stays its own."""
   part = part_of("stop", "damping")
@@ -279,15 +293,8 @@ def test_of_another_version_or_in_use_is_not_taken(tmp_path):
   busy = tmp_path / "out/damping"
   busy.mkdir(parents=True)
   (busy / "mine").write_text("x")
-  code = "import sys; from mjx_cl.io import folders\nwith folders.alone(sys.argv[1]):\n"
-  code += "  print('in', flush=True); sys.stdin.read()"
-  with subprocess.Popen(
-    [sys.executable, "-c", code, str(busy)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
-  ) as other:
-    assert other.stdout.readline() == b"in\n"
-    with pytest.raises(UserError, match="is being written by another"):
-      bench.take(tmp_path / "out", [part._replace(name="damping")], {"damping": [folder]})
-    other.communicate(b"")
+  with held(busy), pytest.raises(UserError, match="is being written by another"):
+    bench.take(tmp_path / "out", [part._replace(name="damping")], {"damping": [folder]})
   assert (busy / "mine").exists()
   bench.take(tmp_path / "out", [part._replace(name="damping")], {"damping": [folder]})
   assert (busy / "summary.json").exists() and not (busy / "mine").exists()
@@ -295,15 +302,9 @@ def test_of_another_version_or_in_use_is_not_taken(tmp_path):
 
 def test_a_suite_is_one_processs_alone(refused, tmp_path):  # noqa: F811
   """Parts are run by settings that the folder holds, which another suite would replace."""
-  code = "import sys; from mjx_cl.io import folders\nwith folders.alone(sys.argv[1]):\n"
-  code += "  print('in', flush=True); sys.stdin.read()"
-  with subprocess.Popen(
-    [sys.executable, "-c", code, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
-  ) as other:
-    assert other.stdout.readline() == b"in\n"
+  with held(tmp_path):
     for command in (["bench", "quick"], ["run", "walker", "--fault", "gear", "bias"]):
       assert "is being written by another" in refused(2, *command, "--out", tmp_path)
-    other.communicate(b"")
   assert not list(tmp_path.iterdir())
 
 
